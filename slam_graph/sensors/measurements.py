@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What sensors measure: IMU samples, camera frames, and the feature frames of a front end.
+
+Time is an integer in nanoseconds (`stamp_ns`) on the clock of the IMU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuData:
+    """A block of consecutive IMU samples, in the body frame.
+
+    Attributes:
+        stamps_ns: (N,) int64, strictly increasing.
+        gyro: (N, 3) angular rate in rad/s.
+        accel: (N, 3) specific force in m/s² (at rest it points up: +9.81 along world z).
+    """
+
+    stamps_ns: IntArray
+    gyro: FloatArray
+    accel: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @staticmethod
+    def empty() -> ImuData:
+        """A block without samples."""
+        return ImuData(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    @staticmethod
+    def concatenate(blocks: PySequence[ImuData]) -> ImuData:
+        """Join blocks that follow one another in time."""
+        if not blocks:
+            return ImuData.empty()
+        return ImuData(
+            np.concatenate([b.stamps_ns for b in blocks]),
+            np.concatenate([b.gyro for b in blocks]),
+            np.concatenate([b.accel for b in blocks]),
+        )
+
+    def __getitem__(self, index: slice) -> ImuData:
+        return ImuData(self.stamps_ns[index], self.gyro[index], self.accel[index])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFrame:
+    """The images that all cameras of a rig took at one time.
+
+    Attributes:
+        stamp_ns: time of the exposure of the first camera that has an image.
+        images: one (height, width) uint8 grey image per camera; None where that camera has none.
+    """
+
+    stamp_ns: int
+    images: tuple[NDArray[np.uint8] | None, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureObservations:
+    """The features that one camera sees in one frame.
+
+    Attributes:
+        ids: (N,) int64, unique within the camera; the same id in another frame or camera is the
+            same point of the world.
+        pixels: (N, 2) raw (distorted) pixel coordinates (u, v).
+        normalized: (N, 2) undistorted coordinates on the plane z = 1 of the camera frame.
+    """
+
+    ids: IntArray
+    pixels: FloatArray
+    normalized: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @staticmethod
+    def empty() -> FeatureObservations:
+        """No features."""
+        return FeatureObservations(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureFrame:
+    """All that the back end knows of the images taken at one time.
+
+    Attributes:
+        stamp_ns: time of the frame.
+        cameras: the observations of each camera of the rig, in the rig's order; empty where a
+            camera has no image.
+    """
+
+    stamp_ns: int
+    cameras: tuple[FeatureObservations, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Packet:
+    """What a sequence hands over at a time: a frame and the IMU samples that lead up to it.
+
+    Attributes:
+        imu: the samples since the previous packet, up to and including the first one at or after
+            `frame.stamp_ns` (where there is one), so that consecutive packets partition the IMU
+            stream and the IMU can be interpolated at the time of the frame.
+        frame: images, or the features that a front end found in them earlier.
+    """
+
+    imu: ImuData
+    frame: CameraFrame | FeatureFrame
