@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Factor-graph SLAM: every back end as cost construction, Gauss-Newton steps, marginalization.
+
+The names below are all that most programs need; each is imported when it is first used, so that
+importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from slam_graph.version import __version__
+
+if TYPE_CHECKING:
+    from slam_graph.backend.estimator import Estimator
+    from slam_graph.config import RunConfig, load_config
+    from slam_graph.datasets.registry import open_dataset
+    from slam_graph.errors import SlamGraphError
+    from slam_graph.evaluation.ape import ape
+    from slam_graph.evaluation.rpe import rpe
+    from slam_graph.geometry.trajectory import NavState, Trajectory
+    from slam_graph.geometry.trajectory_files import read_trajectory
+    from slam_graph.pipeline import RunResult, run
+
+__all__ = [
+    "Estimator",
+    "NavState",
+    "RunConfig",
+    "RunResult",
+    "SlamGraphError",
+    "Trajectory",
+    "__version__",
+    "ape",
+    "load_config",
+    "open_dataset",
+    "read_trajectory",
+    "rpe",
+    "run",
+]
+
+_HOME = {
+    "Estimator": "slam_graph.backend.estimator",
+    "NavState": "slam_graph.geometry.trajectory",
+    "RunConfig": "slam_graph.config",
+    "RunResult": "slam_graph.pipeline",
+    "SlamGraphError": "slam_graph.errors",
+    "Trajectory": "slam_graph.geometry.trajectory",
+    "ape": "slam_graph.evaluation.ape",
+    "load_config": "slam_graph.config",
+    "open_dataset": "slam_graph.datasets.registry",
+    "read_trajectory": "slam_graph.geometry.trajectory_files",
+    "rpe": "slam_graph.evaluation.rpe",
+    "run": "slam_graph.pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home on first use (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not."""
+    return sorted(__all__)
