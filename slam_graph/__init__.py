@@ -16,12 +16,12 @@ from slam_graph.version import __version__
 if TYPE_CHECKING:
     from slam_graph.backend.estimator import Estimator
     from slam_graph.config import RunConfig, load_config
+    from slam_graph.datasets.groundtruth import read_groundtruth
     from slam_graph.datasets.registry import open_dataset
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
-    from slam_graph.geometry.trajectory_files import read_trajectory
     from slam_graph.pipeline import RunResult, run
 
 __all__ = [
@@ -35,7 +35,7 @@ __all__ = [
     "ape",
     "load_config",
     "open_dataset",
-    "read_trajectory",
+    "read_groundtruth",
     "rpe",
     "run",
 ]
@@ -50,7 +50,7 @@ _HOME = {
     "ape": "slam_graph.evaluation.ape",
     "load_config": "slam_graph.config",
     "open_dataset": "slam_graph.datasets.registry",
-    "read_trajectory": "slam_graph.geometry.trajectory_files",
+    "read_groundtruth": "slam_graph.datasets.groundtruth",
     "rpe": "slam_graph.evaluation.rpe",
     "run": "slam_graph.pipeline",
 }

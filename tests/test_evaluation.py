@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import associate, nearest
 from slam_graph.evaluation.rpe import rpe
 from slam_graph.geometry.alignment import Similarity, align, align_first_pose, umeyama
+from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_files import (
-    nanoseconds,
-    read_trajectory,
-    seconds_text,
-    tum_lines,
-)
+from slam_graph.geometry.tum import seconds_text, tum_lines
 
 MODES = ("yaw", "se3", "sim3")
 
@@ -129,59 +126,44 @@ def test_trajectories_of_different_times_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("stamp_ns", "text"),
     [
-        ("1403636580.838555648", 1403636580838555648),
-        ("1403636580.8", 1403636580800000000),
-        ("12", 12_000_000_000),
-        ("1.403636580838555648e+09", 1403636580838555648),
-        ("-0.5", -500_000_000),
-        ("0.0000000004", 0),
+        (1403636580838555648, "1403636580.838555648"),
+        (5, "0.000000005"),
+        (-500_000_000, "-0.500000000"),
     ],
 )
-def test_seconds_are_read_exactly(text: str, expected: int) -> None:
-    assert nanoseconds(text) == expected
-    assert nanoseconds(seconds_text(expected)) == expected
-
-
-@pytest.mark.parametrize("text", ["", "nan", "inf", "abc", "1.2.3"])
-def test_what_is_not_a_time_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="not a time"):
-        nanoseconds(text)
+def test_seconds_keep_every_nanosecond(stamp_ns: int, text: str) -> None:
+    assert seconds_text(stamp_ns) == text
 
 
 def test_tum_file_keeps_stamps_and_nine_decimals(tmp_path: Path) -> None:
     path = tmp_path / "t.tum"
     trajectory = random_trajectory(4)
     path.write_text("# comment\n" + "".join(tum_lines(trajectory)))
-    back = read_trajectory(path)
+    back = read_groundtruth(path)
     np.testing.assert_array_equal(back.stamps_ns, trajectory.stamps_ns)
     np.testing.assert_allclose(back.positions, trajectory.positions, atol=5.1e-10)
     np.testing.assert_allclose(back.quaternions, trajectory.quaternions, atol=2e-9)
 
 
-GOOD = "1.0 0 0 0 0 0 0 1\n"
+def test_interpolation_keeps_the_poses_and_follows_a_steady_motion() -> None:
+    stamps = np.arange(0, 10**9, 10**8, dtype=np.int64)
+    seconds = stamps * 1e-9
+    turn = Rotation.from_euler("x", 0.3) * Rotation.from_rotvec(np.outer(seconds, (0, 0.5, 1.0)))
+    steady = Trajectory(stamps, np.outer(seconds, (1.0, 2.0, 3.0)), turn.as_quat())
+    fine = np.arange(-(10**8), 11 * 10**8, 25 * 10**6, dtype=np.int64)
+    found, valid = interpolate(steady, fine)
+    np.testing.assert_array_equal(valid, (fine >= 0) & (fine <= stamps[-1]))
+    np.testing.assert_allclose(found.positions, np.outer(fine[valid] * 1e-9, (1.0, 2.0, 3.0)))
+    expected = Rotation.from_euler("x", 0.3) * Rotation.from_rotvec(
+        np.outer(fine[valid] * 1e-9, (0, 0.5, 1.0))
+    )
+    assert (expected.inv() * Rotation.from_quat(found.quaternions)).magnitude().max() < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "no poses"),
-        ("# only a comment\n", "no poses"),
-        (GOOD + "2.0 0 0 0 0 0 1\n", ":2: 7 columns, expected 8"),
-        (GOOD + "2.0 0 x 0 0 0 0 1\n", ":2: not a row of numbers"),
-        (GOOD + "2.0 0 nan 0 0 0 0 1\n", ":2: a value is not finite"),
-        (GOOD + "2.0 0 0 0 0 0 0 0\n", ":2: the quaternion is not of unit length"),
-        ("\n" + GOOD + GOOD, ":3: the time does not increase"),
-        ("1,2,3\n", ":1: 3 columns, expected 8 or 11 or 17"),
-    ],
-)
-def test_malformed_files_are_refused_with_their_line(
-    tmp_path: Path, text: str, message: str
-) -> None:
-    path = tmp_path / "bad.tum"
-    path.write_text(text)
-    with pytest.raises(DataError, match=message) as caught:
-        read_trajectory(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+def test_nothing_is_made_up_inside_a_gap() -> None:
+    stamps = np.array([0, 10**8, 10**9], dtype=np.int64)
+    gappy = Trajectory(stamps, np.zeros((3, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
+    _, valid = interpolate(gappy, np.array([0, 5 * 10**7, 5 * 10**8, 10**9]), max_gap_s=0.2)
+    assert valid.tolist() == [True, True, False, True]

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.rpe import rpe
-from slam_graph.geometry.trajectory_files import read_trajectory
 
 RELATIVE_TOLERANCE = 1e-9
 PEERS = ["openvins_stereo", "okvis2_slam_causal"]
@@ -81,5 +81,5 @@ def test_numbers_are_those_of_evo(
     estimate = recording / "peers" / f"{peer}.tum"
     expected = evo(metric, tmp_path, truth, estimate, options)
     function = ape if metric == "ape" else rpe
-    ours = function(read_trajectory(truth), read_trajectory(estimate), **arguments)
+    ours = function(read_groundtruth(truth), read_groundtruth(estimate), **arguments)
     assert asdict(ours.statistics) == pytest.approx(expected, rel=RELATIVE_TOLERANCE, abs=1e-15)

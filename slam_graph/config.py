@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Configuration of a run: typed, closed and complete, so that a result can name all its settings.
+
+Defaults are laid under a YAML file, and the file under `key=value` overrides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, Field
+
+from slam_graph.backend.config import BackendConfig, Settings
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.config_tree import ConfigTree, closest, override, read_tree, validate
+from slam_graph.errors import ConfigError
+from slam_graph.frontend.config import FrontendConfig
+
+DEFAULT_ALGORITHM = "msckf"
+
+CAMERA_WORDS = {"mono": 1, "stereo": 2, "all": None}
+
+
+def config_folder() -> Path:
+    """The folder `configs`: inside the installed package, or at the top of a source checkout."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / "algorithms").is_dir():
+            return folder
+    raise ConfigError(f"no configs/algorithms beside or in {package}; reinstall slam-graph")
+
+
+def algorithm_names() -> list[str]:
+    """Names of the algorithms that come with the package."""
+    return sorted(path.stem for path in (config_folder() / "algorithms").glob("*.yaml"))
+
+
+def algorithm_tree(name: str) -> ConfigTree:
+    """The policy table of an algorithm by its name, or from a YAML file by its path.
+
+    Raises:
+        ConfigError: if there is no such algorithm or file.
+    """
+    if Path(name).suffix in (".yaml", ".yml"):
+        return read_tree(Path(name))
+    if name not in algorithm_names():
+        raise ConfigError(f"unknown algorithm '{name}'; {closest(name, algorithm_names())}")
+    return read_tree(config_folder() / "algorithms" / f"{name}.yaml")
+
+
+def _named_algorithm(value: Any) -> Any:
+    """Read the table of an algorithm that is given by its name."""
+    return validate(AlgorithmConfig, algorithm_tree(value)) if isinstance(value, str) else value
+
+
+def _counted_cameras(value: Any) -> Any:
+    """Read `mono`, `stereo` and `all` as numbers of cameras."""
+    return CAMERA_WORDS.get(value, value) if isinstance(value, str) else value
+
+
+class LimitsConfig(Settings):
+    """Beyond what an estimate counts as diverged."""
+
+    max_speed: float = Field(default=100.0, gt=0)
+    """Largest sane speed, m/s."""
+    max_position_sigma_m: float = Field(default=100.0, gt=0)
+    """Largest standard deviation of the position on any axis."""
+    max_gyro_bias: float = Field(default=2.0, gt=0)
+    """Largest sane gyroscope bias, rad/s."""
+    max_accel_bias: float = Field(default=10.0, gt=0)
+    """Largest sane accelerometer bias, m/s²."""
+
+
+class RunConfig(Settings):
+    """All settings of a run."""
+
+    algorithm: Annotated[
+        AlgorithmConfig,
+        BeforeValidator(_named_algorithm, json_schema_input_type=str | AlgorithmConfig),
+    ] = Field(default_factory=lambda: _named_algorithm(DEFAULT_ALGORITHM))
+    """Name of an algorithm, path of its YAML file, or its table of policies."""
+    cameras: Annotated[
+        int | None, BeforeValidator(_counted_cameras, json_schema_input_type=int | str | None)
+    ] = Field(default=None, ge=1)
+    """How many cameras to use: mono, stereo, a number; all that the recording has if not said."""
+    start_s: float = Field(default=0.0, ge=0)
+    """Where to start, in seconds after the first frame."""
+    duration_s: float | None = Field(default=None, gt=0)
+    """How many seconds to run; to the end if not said."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of all random numbers."""
+    min_coverage: float = Field(default=0.5, ge=0, le=1)
+    """Smallest part of the time asked for that the estimate must cover for a run to succeed."""
+    frontend: FrontendConfig = FrontendConfig()
+    """From images to features."""
+    backend: BackendConfig = BackendConfig()
+    """From features and IMU to states."""
+    limits: LimitsConfig = LimitsConfig()
+    """Beyond what an estimate counts as diverged."""
+
+
+def load_config(
+    file: Path | str | None = None,
+    overrides: Iterable[str] = (),
+    algorithm: str | None = None,
+) -> RunConfig:
+    """The settings of a run.
+
+    Args:
+        file: YAML file laid over the defaults.
+        overrides: `a.b=value` laid over the file, in their order.
+        algorithm: name or file of an algorithm, laid over the file and under the overrides.
+
+    Raises:
+        ConfigError: one line that names the file and line, or the override, at fault.
+    """
+    tree = ConfigTree({"algorithm": DEFAULT_ALGORITHM})
+    if file is not None:
+        tree.merge(read_tree(Path(file)))
+    if algorithm is not None:
+        tree.merge(ConfigTree({"algorithm": algorithm}, {("algorithm",): "--algorithm"}))
+    for text in overrides:
+        tree.merge(override(text) if text.startswith("algorithm=") else ConfigTree())
+    _expand_algorithm(tree)
+    for text in overrides:
+        tree.merge(ConfigTree() if text.startswith("algorithm=") else override(text))
+    return validate(RunConfig, tree)
+
+
+def dump_yaml(config: BaseModel) -> str:
+    """The settings as YAML that `load_config` reads back, with what each means as a comment."""
+    return "\n".join(_yaml_lines(config, "")) + "\n"
+
+
+def _expand_algorithm(tree: ConfigTree) -> None:
+    """Replace the name of an algorithm by its table, so that overrides can reach into it."""
+    name = tree.values["algorithm"]
+    if not isinstance(name, str):
+        return
+    try:
+        table = algorithm_tree(name)
+    except ConfigError as error:
+        where = tree.where.get(("algorithm",))
+        raise ConfigError(f"{where}: {error}" if where else str(error)) from error
+    tree.values["algorithm"] = table.values
+    tree.where |= {("algorithm", *path): place for path, place in table.where.items()}
+
+
+def _yaml_lines(config: BaseModel, indent: str) -> Iterator[str]:
+    """The lines of one table."""
+    plain = config.model_dump(mode="json")
+    for name, info in type(config).model_fields.items():
+        if info.description:
+            yield f"{indent}# {' '.join(info.description.split())}"
+        value = getattr(config, name)
+        if isinstance(value, BaseModel):
+            yield f"{indent}{name}:"
+            yield from _yaml_lines(value, indent + "  ")
+        else:
+            text = yaml.safe_dump(plain[name], default_flow_style=True, width=10_000)
+            yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()}"

@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Configuration trees: YAML files and `key=value` overrides that remember where each value stands.
+
+A fault found later, when the tree is checked against the schema, can then name file and line.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from slam_graph.errors import ConfigError
+
+KeyPath = tuple[str | int, ...]
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+@dataclass
+class ConfigTree:
+    """Nested settings, and where each was said.
+
+    Attributes:
+        values: nested dictionaries as YAML gives them.
+        where: for each path of keys the file and line (or the option) that set it.
+    """
+
+    values: dict[str, Any] = field(default_factory=dict)
+    where: dict[KeyPath, str] = field(default_factory=dict)
+
+    def merge(self, other: ConfigTree) -> None:
+        """Lay another tree over this one: tables are merged, other values are replaced."""
+        _merge(self.values, other.values)
+        self.where.update(other.where)
+
+    def locate(self, path: KeyPath) -> str:
+        """Where the value at `path`, or the nearest table around it, was said."""
+        for length in range(len(path), 0, -1):
+            if path[:length] in self.where:
+                return self.where[path[:length]]
+        return self.where.get((), "configuration")
+
+
+def read_tree(path: Path) -> ConfigTree:
+    """Read a YAML file whose top level is a table.
+
+    Raises:
+        ConfigError: if it is missing, not YAML, not a table, or has a key twice.
+    """
+    try:
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        node = loader.get_single_node()
+        values = loader.construct_document(node) if node is not None else {}
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read configuration: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: configuration is not UTF-8 text") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(_yaml_fault(path, error)) from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}:1: expected a table of settings, got {type(values).__name__}")
+    where: dict[KeyPath, str] = {(): str(path)}
+    if node is not None:
+        _record_lines(node, path, (), where)
+    return ConfigTree(values, where)
+
+
+def override(text: str) -> ConfigTree:
+    """The tree of one `a.b=value`; the value is read as YAML, so it has its type.
+
+    Raises:
+        ConfigError: if there is no `=`, a key is empty, or the value is not YAML.
+    """
+    name, separator, value_text = text.partition("=")
+    keys = name.strip().split(".")
+    where = f"--set {text}"
+    if not separator or not all(keys):
+        raise ConfigError(f"{where}: expected key=value, e.g. backend.noise.pixel_sigma=1.5")
+    try:
+        value = yaml.safe_load(value_text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where}: the value is not YAML; put it in quotes") from error
+    for key in reversed(keys):
+        value = {key: value}
+    paths: dict[KeyPath, str] = {tuple(keys[:n]): where for n in range(1, len(keys) + 1)}
+    return ConfigTree(value, paths)
+
+
+def validate(model: type[ModelT], tree: ConfigTree) -> ModelT:
+    """The typed settings of a tree.
+
+    Raises:
+        ConfigError: naming the first fault, where it stands, and the closest known key if a key
+            is unknown.
+    """
+    try:
+        return model.model_validate(tree.values)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+        more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+        raise ConfigError(f"{_describe(model, tree, dict(faults[0]))}{more}") from error
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """A hint at the known name most like `name`, or the list of all if none is."""
+    known = list(known)
+    similar = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f"did you mean '{similar[0]}'?" if similar else f"known: {', '.join(known)}"
+
+
+def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]) -> str:
+    """One line about one fault that the schema found."""
+    path: KeyPath = fault["loc"]
+    where, dotted = tree.locate(path), ".".join(str(part) for part in path)
+    if fault["type"] == "extra_forbidden":
+        return f"{where}: unknown key '{dotted}'; {closest(str(path[-1]), _keys(model, path[:-1]))}"
+    if fault["type"] == "missing":
+        return f"{where}: key '{dotted}' is missing"
+    message = str(fault["msg"]).removeprefix("Value error, ")
+    return f"{where}: {dotted}: {message[:1].lower()}{message[1:]}, got {fault['input']!r}"
+
+
+def _keys(model: type[BaseModel], path: KeyPath) -> list[str]:
+    """The known keys of the table at `path`."""
+    for part in path:
+        info = model.model_fields.get(str(part))
+        if info is None or not (
+            isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
+        ):
+            return []
+        model = info.annotation
+    return list(model.model_fields)
+
+
+def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
+    """Lay `top` over `base` in place."""
+    for key, value in top.items():
+        if isinstance(value, dict):
+            below = base.get(key)
+            base[key] = dict(below) if isinstance(below, dict) else {}
+            _merge(base[key], value)
+        else:
+            base[key] = value
+
+
+def _record_lines(node: yaml.Node, file: Path, path: KeyPath, where: dict[KeyPath, str]) -> None:
+    """Note the line of every key and item below a node, refusing keys that are there twice."""
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key_node, value_node in node.value:
+            key, line = str(key_node.value), key_node.start_mark.line + 1
+            if key in seen:
+                raise ConfigError(f"{file}:{line}: key '{key}' is there twice")
+            seen.add(key)
+            where[(*path, key)] = f"{file}:{line}"
+            _record_lines(value_node, file, (*path, key), where)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            where[(*path, index)] = f"{file}:{item.start_mark.line + 1}"
+            _record_lines(item, file, (*path, index), where)
+
+
+def _yaml_fault(path: Path, error: yaml.YAMLError) -> str:
+    """One line about a syntax error."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{path}:{error.problem_mark.line + 1}: not YAML: {error.problem}"
+    return f"{path}: not YAML: {' '.join(str(error).split())}"

@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Is an estimator as sure as it should be? Normalised estimation error squared (NEES).
+
+The NEES of an error e with covariance P is eᵀ P⁻¹ e. If P is right it follows a χ² distribution
+with as many degrees of freedom as e has, so its mean over independent runs is that number: 3 for
+an orientation or a position, 6 for a pose. More means too sure, less too careful. Over the frames
+of one run the values are correlated, so that their mean scatters more than `mean_bounds` says.
+
+Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navigation", sec. 5.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from slam_graph.geometry.alignment import Similarity
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Nees:
+    """NEES of the N states that have a covariance and a true pose at their time.
+
+    Attributes:
+        stamps_ns: (N,) their times.
+        orientation: (N,) with 3 degrees of freedom.
+        position: (N,) with 3.
+        pose: (N,) with 6.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    orientation: FloatArray
+    position: FloatArray
+    pose: FloatArray
+
+    def series(self) -> dict[str, tuple[FloatArray, int]]:
+        """Each series by its name, with its degrees of freedom."""
+        return {
+            "orientation": (self.orientation, 3),
+            "position": (self.position, 3),
+            "pose": (self.pose, 6),
+        }
+
+
+def nees(
+    estimate: Trajectory,
+    pose_covariances: FloatArray,
+    truth: Trajectory,
+    similarity: Similarity | None = None,
+) -> Nees:
+    """NEES of the poses of an estimate.
+
+    The error is the tangent from the estimated to the true pose, in the estimated body frame, as
+    GTSAM's `Pose3.Logmap(estimate⁻¹ truth)` gives it; for the position alone it is
+    R_estimateᵀ (p_truth - p_estimate). A rigid map of the world leaves body-frame covariances as
+    they are, so only the poses are mapped.
+
+    Args:
+        estimate: N estimated poses.
+        pose_covariances: (N, 6, 6) rotation before position, body frame; NaN where unknown.
+        truth: interpolated at the times of the estimate; states outside it are left out.
+        similarity: rigid map from the estimate's world to that of the truth.
+    """
+    estimate = (similarity or Similarity.identity()).apply(estimate)
+    true, valid = interpolate(truth, estimate.stamps_ns)
+    valid &= np.isfinite(pose_covariances).all(axis=(1, 2))
+    true = interpolate(truth, estimate.stamps_ns[valid])[0]
+    P = pose_covariances[valid]
+    rotations = Rotation.from_quat(estimate.quaternions[valid])
+    e_rotation = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
+    e_position = rotations.inv().apply(true.positions - estimate.positions[valid])
+    e_pose = [
+        gtsam.Pose3.Logmap(gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift))
+        for turn, shift in zip(e_rotation, e_position, strict=True)
+    ]
+    return Nees(
+        true.stamps_ns,
+        orientation=_normalized_square(e_rotation, P[:, :3, :3]),
+        position=_normalized_square(e_position, P[:, 3:, 3:]),
+        pose=_normalized_square(np.reshape(e_pose, (-1, 6)), P),
+    )
+
+
+def mean_bounds(dof: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Between what the mean of `count` independent NEES values lies with a given probability."""
+    tail = (1.0 - confidence) / 2.0
+    low, high = chi2.ppf([tail, 1.0 - tail], dof * count) / count
+    return float(low), float(high)
+
+
+def _normalized_square(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Σ eᵀ P⁻¹ e of N errors (N, d) with covariances (N, d, d)."""
+    if len(errors) == 0:
+        return np.zeros(0)
+    solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(errors * solved, axis=1))

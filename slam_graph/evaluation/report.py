@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What ground truth says about an estimate, as plain tables for a file or a printer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from slam_graph.errors import DataError
+from slam_graph.evaluation.ape import ErrorSeries, ape
+from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
+from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees
+from slam_graph.evaluation.rpe import rpe
+from slam_graph.geometry.alignment import AlignmentMode, Similarity, align_first_pose
+from slam_graph.geometry.history import StateHistory
+from slam_graph.geometry.trajectory import Trajectory
+
+REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
+
+RPE_DELTA_M = 1.0
+"""Relative errors are taken over all pairs of poses about one metre of path apart."""
+
+Table = dict[str, Any]
+
+
+def accuracy_report(
+    reference: Trajectory,
+    estimate: Trajectory,
+    max_difference_s: float = DEFAULT_MAX_DIFFERENCE_S,
+) -> Table:
+    """Absolute and relative errors, translation (m) and rotation (deg), under each alignment.
+
+    Returns:
+        For each alignment `{"scale", "poses", "ate": {"translation_m", "rotation_deg"}, "rpe":
+        …}` with the statistics of each; a table of the form `{"unavailable": reason}` stands
+        where the trajectories do not allow it.
+    """
+    return {
+        mode: _or_reason(partial(_errors_under, reference, estimate, mode, max_difference_s))
+        for mode in REPORTED_ALIGNMENTS
+    }
+
+
+def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) -> Table | None:
+    """NEES of orientation, position and pose, or None without covariances.
+
+    Args:
+        truth: the true trajectory.
+        history: estimated states.
+        aligned: whether the estimate already lives in the world of the truth (the start was
+            given); otherwise its first pose is laid on the true one in yaw and position.
+    """
+    estimate = history.trajectory()
+    similarity = Similarity.identity()
+    if not aligned:
+        true_start, own_start = synchronize(truth, estimate)
+        similarity = align_first_pose(true_start, own_start)
+    result = nees(estimate, history.pose_covariances(), truth, similarity)
+    if len(result.stamps_ns) == 0:
+        return None
+    table: Table = {"alignment": "none" if aligned else "first_pose", "states": len(result.pose)}
+    for name, (values, dof) in result.series().items():
+        low, high = mean_bounds(dof, 1)
+        table[name] = {
+            "mean": float(values.mean()),
+            "median": float(np.median(values)),
+            "ideal_mean": dof,
+            "chi2_bounds": [low, high],
+            "confidence": CONFIDENCE,
+            "inside_bounds": float(np.mean((values >= low) & (values <= high))),
+        }
+    return table
+
+
+def _errors_under(
+    reference: Trajectory, estimate: Trajectory, mode: AlignmentMode, max_difference_s: float
+) -> Table:
+    """The errors under one alignment."""
+    options: Table = {"alignment": mode, "max_difference_s": max_difference_s}
+    steps: Table = {**options, "delta": RPE_DELTA_M, "unit": "m", "all_pairs": True}
+    translation = ape(reference, estimate, "trans_part", **options)
+    return {
+        "poses": translation.poses,
+        "scale": translation.similarity.scale,
+        "ate": {
+            "translation_m": _statistics(translation),
+            "rotation_deg": _statistics(ape(reference, estimate, "angle_deg", **options)),
+        },
+        "rpe": _or_reason(
+            lambda: {
+                "delta_m": RPE_DELTA_M,
+                "translation_m": _statistics(rpe(reference, estimate, "trans_part", **steps)),
+                "rotation_deg": _statistics(rpe(reference, estimate, "angle_deg", **steps)),
+            }
+        ),
+    }
+
+
+def _or_reason(compute: Callable[[], Table]) -> Table:
+    """The table, or why there is none."""
+    try:
+        return compute()
+    except DataError as error:
+        return {"unavailable": str(error)}
+
+
+def _statistics(series: ErrorSeries) -> Table:
+    """Statistics as a table."""
+    return asdict(series.statistics)

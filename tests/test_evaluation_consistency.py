@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""NEES follows its χ² distribution when, and only when, covariances are right."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam_graph.evaluation.consistency import mean_bounds, nees
+from slam_graph.evaluation.report import consistency_report
+from slam_graph.geometry.alignment import Similarity
+from slam_graph.geometry.history import StateHistory
+from slam_graph.geometry.trajectory import NavState, Trajectory
+
+COUNT = 2000
+START_NS = 1_403_636_580_838_555_648
+
+
+def true_poses(rng: np.random.Generator) -> list[gtsam.Pose3]:
+    return [
+        gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3) * 5)
+        for _ in range(COUNT)
+    ]
+
+
+def as_trajectory(poses: list[gtsam.Pose3]) -> Trajectory:
+    return Trajectory(
+        START_NS + 50_000_000 * np.arange(len(poses), dtype=np.int64),
+        np.array([pose.translation() for pose in poses]),
+        np.array([pose.rotation().toQuaternion().coeffs() for pose in poses]),
+    )
+
+
+def noisy_history(
+    poses: list[gtsam.Pose3], rng: np.random.Generator, claimed: float
+) -> StateHistory:
+    """Estimates with errors of random covariances, which claim `claimed` times the sigmas."""
+    history = StateHistory()
+    for index, pose in enumerate(poses):
+        A = rng.normal(size=(6, 6)) * 0.01
+        P = A @ A.T + 1e-6 * np.eye(6)
+        error = rng.multivariate_normal(np.zeros(6), P)
+        covariance = np.eye(15)
+        covariance[:6, :6] = P * claimed**2
+        history.append(
+            NavState(
+                START_NS + 50_000_000 * index,
+                # the truth is at `error` from the estimate: truth = estimate ⊕ error
+                pose.compose(gtsam.Pose3.Expmap(error).inverse()),
+                np.zeros(3),
+                np.zeros(3),
+                np.zeros(3),
+                covariance,
+            )
+        )
+    return history
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_right_covariances_give_a_mean_within_the_bounds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = true_poses(rng)
+    history = noisy_history(poses, rng, claimed=1.0)
+    result = nees(history.trajectory(), history.pose_covariances(), as_trajectory(poses))
+    for values, dof in result.series().values():
+        assert len(values) == COUNT
+        low, high = mean_bounds(dof, COUNT, confidence=0.9999)
+        assert low < values.mean() < high
+
+
+def test_overconfidence_scales_the_mean() -> None:
+    rng = np.random.default_rng(7)
+    poses = true_poses(rng)
+    history = noisy_history(poses, rng, claimed=0.5)
+    result = nees(history.trajectory(), history.pose_covariances(), as_trajectory(poses))
+    low, high = mean_bounds(6, COUNT, confidence=0.9999)
+    assert low < result.pose.mean() * 0.25 < high
+
+
+def test_a_rigid_map_of_the_world_changes_nothing() -> None:
+    rng = np.random.default_rng(3)
+    poses = true_poses(rng)[:50]
+    history = noisy_history(poses, rng, claimed=1.0)
+    move = gtsam.Pose3(gtsam.Rot3.Rz(1.0), np.array([1.0, -2.0, 3.0]))
+    moved_truth = as_trajectory([move.compose(pose) for pose in poses])
+    same = nees(history.trajectory(), history.pose_covariances(), as_trajectory(poses))
+    mapped = nees(
+        history.trajectory(),
+        history.pose_covariances(),
+        moved_truth,
+        Similarity(move.rotation().matrix(), move.translation()),
+    )
+    np.testing.assert_allclose(mapped.pose, same.pose, rtol=1e-6)
+
+
+def test_states_without_covariance_or_truth_are_left_out() -> None:
+    rng = np.random.default_rng(4)
+    poses = true_poses(rng)[:20]
+    truth = as_trajectory(poses[:15])
+    history = noisy_history(poses, rng, claimed=1.0)
+    covariances = history.pose_covariances()
+    covariances[0] = np.nan
+    assert len(nees(history.trajectory(), covariances, truth).pose) == 14
+    report = consistency_report(truth, history, aligned=True)
+    assert report is not None
+    assert report["states"] == 15
+    assert report["pose"]["ideal_mean"] == 6
+
+
+def test_history_gives_back_what_it_was_given() -> None:
+    rng = np.random.default_rng(1)
+    state = NavState(
+        START_NS,
+        gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)),
+        *rng.normal(size=(3, 3)),
+    )
+    history = StateHistory()
+    history.append(state)
+    trajectory = history.trajectory()
+    assert trajectory.stamps_ns.tolist() == [START_NS]
+    assert trajectory.pose(0).equals(state.world_T_body, 1e-12)
+    np.testing.assert_array_equal(trajectory.velocities[0], state.velocity)
+    np.testing.assert_array_equal(trajectory.gyro_biases[0], state.gyro_bias)
+    np.testing.assert_array_equal(trajectory.accel_biases[0], state.accel_bias)
+    assert np.isnan(history.sigmas()).all()
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_mean_bounds_close_in_on_the_degrees_of_freedom(dof: int) -> None:
+    widths = []
+    for count in (1, 10, 1000):
+        low, high = mean_bounds(dof, count)
+        assert low < dof < high
+        widths.append(high - low)
+    assert widths == sorted(widths, reverse=True)
