@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the back end that all algorithms share: noise, gating, triangulation, start-up."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Settings(BaseModel):
+    """Base of all settings: frozen, and closed to unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class NoiseConfig(Settings):
+    """Noise of the sensors, where the calibration does not say it."""
+
+    pixel_sigma: float = Field(1.0, gt=0)
+    """Standard deviation of a feature observation, in pixels."""
+    imu_scale: float = Field(1.0, gt=0)
+    """Factor on all IMU noise densities of the calibration."""
+    gravity: float = Field(9.81, gt=0)
+    """Magnitude of gravity in m/s²."""
+
+
+class TriangulationConfig(Settings):
+    """When a triangulated feature can be trusted."""
+
+    iterations: int = Field(5, ge=1)
+    """Gauss-Newton steps that refine the linear solution."""
+    min_depth_m: float = Field(0.1, gt=0)
+    """Nearest accepted depth in any camera."""
+    max_depth_m: float = Field(75.0, gt=0)
+    """Farthest accepted depth in the first camera."""
+    min_parallax_rad: float = Field(0.01, ge=0)
+    """Smallest accepted angle between two rays to a feature."""
+
+
+class GatingConfig(Settings):
+    """Outlier rejection inside the back end."""
+
+    confidence: float = Field(0.95, gt=0, lt=1)
+    """Quantile of the χ² distribution beyond which a feature is rejected (Mahalanobis gate)."""
+    robust_loss: Literal["none", "huber", "cauchy"] = "huber"
+    """Loss that weighs down large reprojection residuals."""
+    robust_width: float = Field(2.45, gt=0)
+    """Width of the robust loss on the length of a whitened residual (2.45: the 95 % circle)."""
+
+
+class ZeroVelocityConfig(Settings):
+    """Zero-velocity updates while the platform stands still."""
+
+    enabled: bool = True
+    """Whether standing still is detected and used."""
+    window_s: float = Field(0.5, gt=0)
+    """Length of the IMU window that is examined."""
+    max_gyro_std: float = Field(0.01, gt=0)
+    """Largest standard deviation of the angular rate, rad/s."""
+    max_accel_std: float = Field(0.15, gt=0)
+    """Largest standard deviation of the specific force, m/s²."""
+    max_disparity_px: float = Field(0.5, gt=0)
+    """Largest median motion of the features between two frames."""
+    velocity_sigma: float = Field(0.01, gt=0)
+    """How still a still platform is: standard deviation of its velocity, m/s."""
+    position_sigma: float = Field(1e-3, gt=0)
+    """Standard deviation of its motion between two frames, m."""
+    rotation_sigma: float = Field(1e-3, gt=0)
+    """Standard deviation of its rotation between two frames, rad."""
+
+
+class PriorConfig(Settings):
+    """How uncertain the first state is where nothing better is known (standard deviations)."""
+
+    attitude_rad: float = Field(0.05, gt=0)
+    """Roll and pitch."""
+    yaw_rad: float = Field(1e-3, gt=0)
+    """Yaw, which is free to choose."""
+    position_m: float = Field(1e-3, gt=0)
+    """Position, which is free to choose."""
+    velocity: float = Field(0.05, gt=0)
+    """Velocity, m/s."""
+    gyro_bias: float = Field(0.01, gt=0)
+    """Gyroscope bias, rad/s."""
+    accel_bias: float = Field(0.1, gt=0)
+    """Accelerometer bias, m/s²."""
+
+
+class InitializationConfig(Settings):
+    """How the first state is found."""
+
+    mode: Literal["auto", "static", "motion", "given", "groundtruth"] = "auto"
+    """auto: from the state that the data brings, else from standing still, else in motion."""
+    static_window_s: float = Field(1.0, gt=0)
+    """How long the platform must stand still for a static start."""
+    motion_window_s: float = Field(1.5, gt=0)
+    """Length of the visual-inertial alignment of a start in motion."""
+    prior: PriorConfig = PriorConfig()
+    """Uncertainty of the first state of a static start."""
+
+
+class BackendConfig(Settings):
+    """Settings of the back end that do not depend on the algorithm."""
+
+    noise: NoiseConfig = NoiseConfig()
+    """Noise of the sensors."""
+    triangulation: TriangulationConfig = TriangulationConfig()
+    """When a triangulated feature can be trusted."""
+    gating: GatingConfig = GatingConfig()
+    """Outlier rejection."""
+    zero_velocity: ZeroVelocityConfig = ZeroVelocityConfig()
+    """Standing still."""
+    initialization: InitializationConfig = InitializationConfig()
+    """Start-up."""

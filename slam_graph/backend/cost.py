@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Module 1, cost construction: the variables and residuals that are in the cost now.
+
+The cost is the sum of the marginal prior, factors of GTSAM (IMU, zero velocity), single
+observations of features that are in the state, and whole tracks of features that enter it now. A
+new feature either becomes a variable of the state or is used once, that is, marginalised as soon as
+it is linearised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.feature_factors import (
+    ReducedFeatures,
+    WhitenedObservations,
+    reduce_features,
+    whiten,
+)
+from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.state import POINT_DIM, State, dims_of, stacked_points, stacked_poses
+from slam_graph.backend.tracks import Observations
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewFeatures:
+    """Features that enter the cost in this step with all of their observations.
+
+    Attributes:
+        obs: their tracks.
+        points: (J, 3) triangulated positions; moved by every Gauss-Newton step.
+        in_state: (J,) whether the feature stays as a variable or is used once.
+    """
+
+    obs: Observations
+    points: FloatArray
+    in_state: BoolArray
+
+    def subset(self, keep: BoolArray) -> NewFeatures:
+        """The features where `keep` (J,) holds."""
+        return NewFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearization:
+    """The cost, linear in an increment of the tangents.
+
+    Attributes:
+        tracked: observations of the features of the state.
+        fresh: new features, reduced.
+    """
+
+    tracked: WhitenedObservations | None
+    fresh: ReducedFeatures | None
+
+    def subset(self, tracked: BoolArray, fresh: BoolArray) -> Linearization:
+        """The tracked observations (N,) and new features (J,) that are kept."""
+        return Linearization(
+            self.tracked.subset(tracked) if self.tracked is not None else None,
+            self.fresh.subset(fresh) if self.fresh is not None else None,
+        )
+
+
+@dataclass(eq=False)
+class Cost:
+    """All residuals of one step, as a function of the variables in `state`.
+
+    Attributes:
+        state: estimates and linearisation points.
+        rig: projection into the cameras.
+        config: noise and gating.
+        prior: what was marginalised before, over the offsets from the first estimates.
+        factors: GTSAM's factors between the variables.
+        tracked: observations of features that are in the state already.
+        fresh: features that enter now.
+    """
+
+    state: State
+    rig: RigProjection
+    config: BackendConfig
+    prior: SquareRootInformation
+    factors: Sequence[gtsam.NonlinearFactor] = field(default_factory=list)
+    tracked: Observations | None = None
+    fresh: NewFeatures | None = None
+
+    def layout(self) -> Layout:
+        """Columns of the variables: those of the prior, then the new ones."""
+        keys = [key for factor in self.factors for key in factor.keys()]
+        if self.fresh is not None:
+            keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
+        return self.prior.layout.extended(
+            dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
+        )
+
+    def prior_at_estimate(self) -> SquareRootInformation:
+        """The prior as a function of an increment of the current estimates."""
+        prior = self.prior.shifted(self.state.offset(self.prior.layout))
+        layout = self.layout()
+        return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
+
+    def error(self) -> float:
+        """Half the squared norm of all whitened residuals at the current estimates."""
+        total = 0.5 * float(np.sum(self.prior_at_estimate().Rd[:, -1] ** 2))
+        total += sum(factor.error(self.state.estimate) for factor in self.factors)
+        linear = self.linearize()
+        if linear.tracked is not None:
+            total += 0.5 * float(np.sum(linear.tracked.r**2))
+        if linear.fresh is not None:
+            total += 0.5 * float(np.sum(linear.fresh.r_2**2) + np.sum(linear.fresh.r_1**2))
+        return total
+
+    # --- linearisation -------------------------------------------------------------------------
+
+    def linearize(self) -> Linearization:
+        """Linearise all observations."""
+        self.state.relinearize()
+        tracked = fresh = None
+        if self.tracked is not None and len(self.tracked):
+            tracked = self._whitened(self.tracked, None)
+        if self.fresh is not None and len(self.fresh.obs):
+            whitened = self._whitened(self.fresh.obs, self.fresh.points)
+            fresh = reduce_features(self.fresh.obs, whitened)
+        return Linearization(tracked, fresh)
+
+    def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
+        first, estimate = (
+            Geometry(
+                *stacked_poses(values, obs.frames),
+                stacked_points(values, obs.ids.tolist()) if points is None else points,
+            )
+            for values in (self.state.first, self.state.estimate)
+        )
+        return whiten(
+            obs, self.rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating
+        )
+
+    def factor_rows(self, layout: Layout) -> FloatArray:
+        """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
+        rows = []
+        for factor in self.factors:
+            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first))
+            A, _ = jacobian.jacobian()
+            b = gtsam.JacobianFactor(factor.linearize(self.state.estimate)).jacobian()[1]
+            Ab = np.zeros((len(b), layout.size + 1))
+            Ab[:, layout.indices(jacobian.keys())] = A
+            Ab[:, -1] = b
+            rows.append(Ab)
+        return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
+
+    def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
+        """Rows [A b] (m, n + 1) of all observations."""
+        parts = [np.zeros((0, layout.size + 1))]
+        if linear.tracked is not None and self.tracked is not None:
+            parts.append(_tracked_rows(self.tracked, linear.tracked, layout))
+        if linear.fresh is not None and self.fresh is not None:
+            parts.append(_null_space_rows(self.fresh, linear.fresh, layout))
+            parts.append(_new_variable_rows(self.fresh, linear.fresh, layout))
+        return np.concatenate(parts)
+
+    # --- moving --------------------------------------------------------------------------------
+
+    def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
+        """Move the estimates by an increment (n,), and the new features with them."""
+        if self.fresh is not None and linear.fresh is not None:
+            poses = layout.indices(X(i) for i in self.fresh.obs.frames)
+            step = linear.fresh.point_increments(delta[poses])
+            self.fresh = replace(self.fresh, points=self.fresh.points + step)
+        self.state.update(layout, delta)
+
+    # --- gating --------------------------------------------------------------------------------
+
+    def gate(
+        self, linear: Linearization, covariance: FloatArray, layout: Layout
+    ) -> tuple[BoolArray, BoolArray]:
+        """Which tracked observations (N,) and new features (J,) pass the χ² test.
+
+        Args:
+            linear: of this cost.
+            covariance: (n, n) predicted covariance of the variables of `layout`; what it does not
+                cover is not gated.
+            layout: its columns.
+        """
+        tracked = np.zeros(0, np.bool_)
+        fresh = np.zeros(0, np.bool_)
+        confidence = self.config.gating.confidence
+        if linear.tracked is not None and self.tracked is not None:
+            columns = _tracked_columns(self.tracked, layout)
+            H = np.concatenate([linear.tracked.by_pose, linear.tracked.by_point], axis=2)
+            P = covariance[columns[:, :, None], columns[:, None, :]]
+            distance = squared_mahalanobis(linear.tracked.r, H, P)
+            tracked = distance < threshold(np.array([2]), confidence)[0]
+        if linear.fresh is not None and self.fresh is not None:
+            poses = layout.indices(X(i) for i in self.fresh.obs.frames)
+            P = covariance[np.ix_(poses, poses)]
+            distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
+            fresh = distance < threshold(linear.fresh.dof, confidence)
+        return tracked, fresh
+
+
+def _tracked_columns(obs: Observations, layout: Layout) -> NDArray[np.intp]:
+    """Columns (N, 9) of the pose and the feature of each observation."""
+    poses = np.array([layout.columns[X(i)].start for i in obs.frames])
+    points = np.array([layout.columns[L(j)].start for j in obs.ids.tolist()])
+    return np.concatenate(
+        [
+            poses[obs.frame][:, None] + np.arange(6),
+            points[obs.feature][:, None] + np.arange(POINT_DIM),
+        ],
+        axis=1,
+    )
+
+
+def _tracked_rows(obs: Observations, linear: WhitenedObservations, layout: Layout) -> FloatArray:
+    Ab = np.zeros((len(obs), 2, layout.size + 1))
+    columns = _tracked_columns(obs, layout)
+    rows = np.arange(len(obs))[:, None]
+    Ab[rows, :, columns[:, :6]] = linear.by_pose.transpose(0, 2, 1)
+    Ab[rows, :, columns[:, 6:]] = linear.by_point.transpose(0, 2, 1)
+    Ab[:, :, -1] = linear.r
+    return Ab.reshape(-1, layout.size + 1)
+
+
+def _null_space_rows(fresh: NewFeatures, linear: ReducedFeatures, layout: Layout) -> FloatArray:
+    """What new features say of the poses, compressed to at most 6 F + 1 rows."""
+    poses = layout.indices(X(i) for i in fresh.obs.frames)
+    compact = linear.null_space_rows()
+    if len(compact) > len(poses):
+        compact = triangularize(compact)
+    Ab = np.zeros((len(compact), layout.size + 1))
+    Ab[:, poses] = compact[:, :-1]
+    Ab[:, -1] = compact[:, -1]
+    return Ab
+
+
+def _new_variable_rows(fresh: NewFeatures, linear: ReducedFeatures, layout: Layout) -> FloatArray:
+    """The three rows that determine each feature that stays in the state."""
+    poses = layout.indices(X(i) for i in fresh.obs.frames)
+    features = np.flatnonzero(fresh.in_state)
+    Ab = np.zeros((len(features), POINT_DIM, layout.size + 1))
+    for row, j in enumerate(features):
+        Ab[row][:, layout.columns[L(int(fresh.obs.ids[j]))]] = linear.R_f[j]
+    Ab[:, :, poses] = linear.T[features]
+    Ab[:, :, -1] = linear.r_1[features]
+    return Ab.reshape(-1, layout.size + 1)

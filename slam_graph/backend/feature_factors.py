@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reprojection factors of whole features, linearised and reduced together.
+
+For a feature f seen from several poses x, the linearised residuals r = H_x δx + H_f δf are rotated
+by the orthogonal factor of a QR of H_f into three rows that determine δf,
+
+    r₁ = T δx + R_f δf,
+
+and the others, r₂ = N δx, which no longer contain f: the projection onto the left null space of H_f
+(Mourikis & Roumeliotis 2007, eq. 23-24). Leaving the first three out is marginalising the feature;
+keeping them makes it a variable of the state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import GatingConfig
+from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.tracks import Observations
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhitenedObservations:
+    """Linearised residuals of single observations, in standard deviations.
+
+    Attributes:
+        r: (N, 2) residuals.
+        by_pose: (N, 2, 6) derivatives of the projection.
+        by_point: (N, 2, 3).
+    """
+
+    r: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+
+    def subset(self, keep: NDArray[np.bool_]) -> WhitenedObservations:
+        """The observations where `keep` (N,) holds."""
+        return WhitenedObservations(self.r[keep], self.by_pose[keep], self.by_point[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReducedFeatures:
+    """J features after the rotation by QR, over the poses of F frames.
+
+    Attributes:
+        R_f: (J, 3, 3) upper triangular.
+        T: (J, 3, 6 F).
+        r_1: (J, 3).
+        N: (J, K, 6 F); rows beyond `dof` are zero.
+        r_2: (J, K).
+        dof: (J,) number of rows of N that are in use.
+    """
+
+    R_f: FloatArray
+    T: FloatArray
+    r_1: FloatArray
+    N: FloatArray
+    r_2: FloatArray
+    dof: NDArray[np.int64]
+
+    def subset(self, keep: NDArray[np.bool_]) -> ReducedFeatures:
+        """The features where `keep` (J,) holds."""
+        return ReducedFeatures(
+            self.R_f[keep],
+            self.T[keep],
+            self.r_1[keep],
+            self.N[keep],
+            self.r_2[keep],
+            self.dof[keep],
+        )
+
+    def null_space_rows(self) -> FloatArray:
+        """The rows [N r₂] of all features, (rows, 6 F + 1)."""
+        rows = np.arange(self.N.shape[1]) < self.dof[:, None]
+        return np.concatenate([self.N[rows], self.r_2[rows][:, None]], axis=1)
+
+    def point_increments(self, delta_poses: FloatArray) -> FloatArray:
+        """The δf (J, 3) that go with an increment of the poses (6 F,)."""
+        rest = self.r_1 - self.T @ delta_poses
+        return np.linalg.solve(self.R_f, rest[:, :, None])[:, :, 0]
+
+
+def whiten(
+    obs: Observations,
+    rig: RigProjection,
+    first: Geometry,
+    estimate: Geometry,
+    sigma_px: float,
+    gating: GatingConfig,
+) -> WhitenedObservations:
+    """Linearise observations: Jacobians at the first estimates, residuals at the current ones."""
+    residuals, _ = rig.residuals(obs, estimate)
+    by_pose, by_point = rig.jacobians(obs, first)
+    r = residuals / sigma_px
+    weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=1), gating)) / sigma_px
+    return WhitenedObservations(
+        residuals * weight[:, None],
+        by_pose * weight[:, None, None],
+        by_point * weight[:, None, None],
+    )
+
+
+def robust_weights(error: FloatArray, gating: GatingConfig) -> FloatArray:
+    """Weights of iteratively reweighted least squares for errors (N,) in standard deviations."""
+    width = gating.robust_width
+    if gating.robust_loss == "huber":
+        return width / np.maximum(error, width)
+    if gating.robust_loss == "cauchy":
+        return 1.0 / (1.0 + (error / width) ** 2)
+    return np.ones_like(error)
+
+
+def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:
+    """Stack the observations of each feature and eliminate its position by Householder QR."""
+    J, F = len(obs.ids), len(obs.frames)
+    counts, slots = obs.counts, obs.slots
+    M = int(counts.max(initial=2))
+    H_f, H_x, r = np.zeros((J, M, 2, 3)), np.zeros((J, M, 2, F, 6)), np.zeros((J, M, 2))
+    H_f[obs.feature, slots] = linear.by_point
+    H_x[obs.feature, slots, :, obs.frame] = linear.by_pose
+    r[obs.feature, slots] = linear.r
+    A, B = H_f.reshape(J, 2 * M, 3), H_x.reshape(J, 2 * M, 6 * F)
+    b = r.reshape(J, 2 * M, 1)
+    _householder(A, (B, b))
+    b = b[:, :, 0]
+    return ReducedFeatures(
+        np.triu(A[:, :3]), B[:, :3], b[:, :3], B[:, 3:], b[:, 3:], 2 * counts - 3
+    )
+
+
+def _householder(A: FloatArray, others: tuple[FloatArray, ...]) -> None:
+    """Triangularise A (J, m, 3) in place and apply the same reflections to others (J, m, n)."""
+    for column in range(3):
+        x = A[:, column:, column]
+        norm = np.linalg.norm(x, axis=1)
+        v = x.copy()
+        v[:, 0] += np.where(x[:, 0] >= 0, norm, -norm)
+        scale = np.einsum("ji,ji->j", v, v)
+        beta = 2.0 / np.where(scale > 0, scale, np.inf)
+        for target in (A, *others):
+            part = target[:, column:]
+            projection = (v[:, None, :] @ part) * beta[:, None, None]
+            part -= v[:, :, None] * projection

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The dynamics model: IMU samples preintegrated between frames (GTSAM's `CombinedImuFactor`).
+
+The residual x_{t+1} - g(x_t) of the dynamics is the preintegrated IMU factor of Forster et al. 2017
+with the random walk of the biases. Samples are taken as instantaneous values of a signal that is
+linear between them, so the mean of two neighbours is integrated over the time between them.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
+
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import ImuNoise
+
+FloatArray = NDArray[np.float64]
+
+NS_PER_S = 1_000_000_000
+INTEGRATION_SIGMA = 1e-5
+"""Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
+
+
+def preintegration_params(
+    noise: ImuNoise, gravity: float, scale: float = 1.0
+) -> gtsam.PreintegrationCombinedParams:
+    """GTSAM's parameters for an IMU.
+
+    Args:
+        noise: continuous-time densities.
+        gravity: magnitude in m/s²; the world's z axis points up.
+        scale: factor on all densities.
+    """
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+    eye = np.eye(3)
+    params.setGyroscopeCovariance(eye * (scale * noise.gyro_noise_density) ** 2)
+    params.setAccelerometerCovariance(eye * (scale * noise.accel_noise_density) ** 2)
+    params.setBiasOmegaCovariance(eye * (scale * noise.gyro_random_walk) ** 2)
+    params.setBiasAccCovariance(eye * (scale * noise.accel_random_walk) ** 2)
+    params.setIntegrationCovariance(eye * INTEGRATION_SIGMA**2)
+    return params
+
+
+class ImuBuffer:
+    """The recent IMU samples, kept as long as a frame may still need them."""
+
+    def __init__(self) -> None:
+        self.data = ImuData.empty()
+
+    def add(self, imu: ImuData) -> None:
+        """Append samples that follow those already there."""
+        if len(imu):
+            self.data = ImuData.concatenate([self.data, imu])
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop the samples before the last one at or before `stamp_ns`."""
+        first = int(np.searchsorted(self.data.stamps_ns, stamp_ns, side="right")) - 1
+        if first > 0:
+            self.data = self.data[first:]
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether there is a sample at or before `stamp_ns`."""
+        return len(self.data) > 0 and int(self.data.stamps_ns[0]) <= stamp_ns
+
+    def between(self, start_ns: int, end_ns: int) -> ImuData:
+        """Samples at both ends (interpolated, or the nearest held) and all in between."""
+        t = self.data.stamps_ns
+        inside = slice(
+            int(np.searchsorted(t, start_ns, side="right")), int(np.searchsorted(t, end_ns))
+        )
+        stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
+        seconds = (t - start_ns) * 1e-9
+        at = (stamps - start_ns) * 1e-9
+        gyro, accel = (
+            np.stack([np.interp(at, seconds, values[:, axis]) for axis in range(3)], axis=1)
+            for values in (self.data.gyro, self.data.accel)
+        )
+        return ImuData(stamps, gyro, accel)
+
+
+def preintegrate(
+    samples: ImuData,
+    bias: gtsam.imuBias.ConstantBias,
+    params: gtsam.PreintegrationCombinedParams,
+) -> gtsam.PreintegratedCombinedMeasurements:
+    """Preintegrate from the first to the last sample.
+
+    Args:
+        samples: at least two; `ImuBuffer.between` gives them with the ends in place.
+        bias: at which the integration is linearised.
+        params: noise of the IMU.
+    """
+    pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
+    gyro = 0.5 * (samples.gyro[1:] + samples.gyro[:-1])
+    accel = 0.5 * (samples.accel[1:] + samples.accel[:-1])
+    dts = np.diff(samples.stamps_ns) * 1e-9
+    for a, w, dt in zip(accel, gyro, dts.tolist(), strict=True):
+        pim.integrateMeasurement(a, w, dt)
+    return pim
+
+
+def predict(
+    state: NavState, pim: gtsam.PreintegratedCombinedMeasurements, stamp_ns: int
+) -> NavState:
+    """The state at the end of a preintegration that began at `state`: g(x_t)."""
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    there = pim.predict(gtsam.NavState(state.world_T_body, state.velocity), bias)
+    return NavState(
+        stamp_ns, there.pose(), np.asarray(there.velocity()), state.gyro_bias, state.accel_bias
+    )
+
+
+def imu_factor(
+    i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements
+) -> gtsam.CombinedImuFactor:
+    """The dynamics residual between frames i and j."""
+    return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)

@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The measurement model: reprojection residuals of many observations at once, with Jacobians.
+
+An observation z of the feature f by camera c at pose i has the residual z - π_c(p) with
+p = (body_T_camera)⁻¹ (world_T_body_i)⁻¹ f, in pixels. Jacobians are with respect to the pose's
+tangent (rotation, translation; body frame) and the world position of the feature; they agree with
+GTSAM's `GenericProjectionFactor`, but come for all observations in one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.tracks import Observations
+from slam_graph.sensors.rig import Rig
+
+FloatArray = NDArray[np.float64]
+
+MIN_DEPTH = 1e-3
+"""Points nearer than this (m) are projected at this depth; depth checks reject them elsewhere."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Geometry:
+    """Values of the variables that observations depend on.
+
+    Attributes:
+        rotations: (F, 3, 3) world_R_body of each frame.
+        positions: (F, 3) of the body in the world.
+        points: (J, 3) features in the world.
+    """
+
+    rotations: FloatArray
+    positions: FloatArray
+    points: FloatArray
+
+
+class RigProjection:
+    """Projects world points into the cameras of a rig.
+
+    Attributes:
+        body_R_camera: (C, 3, 3).
+        body_p_camera: (C, 3).
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.cameras = [mounted.camera for mounted in rig.cameras]
+        matrices = np.array([mounted.body_T_camera.matrix() for mounted in rig.cameras])
+        self.body_R_camera = matrices[:, :3, :3]
+        self.body_p_camera = matrices[:, :3, 3]
+
+    def in_body(self, obs: Observations, at: Geometry) -> FloatArray:
+        """The observed features (N, 3) in the body frame of the observing pose."""
+        difference = at.points[obs.feature] - at.positions[obs.frame]
+        return np.einsum("nji,nj->ni", at.rotations[obs.frame], difference)
+
+    def in_camera(self, obs: Observations, in_body: FloatArray) -> FloatArray:
+        """Points (N, 3) of the body frame in the frame of the observing camera."""
+        difference = in_body - self.body_p_camera[obs.camera]
+        return np.einsum("nji,nj->ni", self.body_R_camera[obs.camera], difference)
+
+    def pixels(
+        self, obs: Observations, in_camera: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""
+        depth = np.maximum(in_camera[:, 2:3], MIN_DEPTH)
+        normalized = in_camera[:, :2] / depth
+        if len(self.cameras) == 1:
+            return self.cameras[0].distort(normalized)
+        pixels, slope = np.empty((len(obs), 2)), np.empty((len(obs), 2, 2))
+        for number, camera in enumerate(self.cameras):
+            rows = obs.camera == number
+            pixels[rows], slope[rows] = camera.distort(normalized[rows])
+        return pixels, slope
+
+    def residuals(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
+        """Residuals z - π(f) (N, 2) in pixels, and depths (N,) in metres."""
+        in_camera = self.in_camera(obs, self.in_body(obs, at))
+        return obs.pixels - self.pixels(obs, in_camera)[0], in_camera[:, 2]
+
+    def jacobians(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of π, not of the residual.
+
+        Returns:
+            by_pose: (N, 2, 6).
+            by_point: (N, 2, 3).
+        """
+        in_body = self.in_body(obs, at)
+        in_camera = self.in_camera(obs, in_body)
+        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
+        _, slope = self.pixels(obs, in_camera)
+        by_camera_point = np.empty((len(obs), 2, 3))
+        by_camera_point[:, :, :2] = slope / depth[:, None, None]
+        ratio = in_camera[:, :2] / depth[:, None] ** 2
+        by_camera_point[:, :, 2] = -np.einsum("nij,nj->ni", slope, ratio)
+        by_body_point = by_camera_point @ self.body_R_camera[obs.camera].transpose(0, 2, 1)
+        by_pose = np.empty((len(obs), 2, 6))
+        # rotating the body by θ moves the point by p × θ in the body frame
+        by_pose[:, :, :3] = np.cross(by_body_point, in_body[:, None, :])
+        by_pose[:, :, 3:] = -by_body_point
+        by_point = by_body_point @ at.rotations[obs.frame].transpose(0, 2, 1)
+        return by_pose, by_point

@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians in square-root information form, updated and reduced by QR.
+
+A Gaussian over a stacked vector δ is kept as the upper triangular R and the vector d of the
+least-squares cost ‖R δ - d‖². New measurement rows ‖A δ - b‖² are folded in by a triangular QR,
+and variables are marginalised out by a QR whose columns begin with them: the rows that no longer
+touch them are the marginal over the others (Kaess et al. 2008; Dellaert & Kaess 2017, ch. 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+FloatArray = NDArray[np.float64]
+
+BLOCK_SIZE = 32
+"""Width of the blocks of LAPACK's triangular-pentagonal QR."""
+
+
+class Layout:
+    """Where each variable stands in a stacked tangent vector.
+
+    Attributes:
+        dims: dimension of each key, in the order of the columns.
+        columns: the slice of each key.
+        size: length of the stacked vector.
+    """
+
+    def __init__(self, dims: Mapping[int, int]) -> None:
+        self.dims = dict(dims)
+        self.columns: dict[int, slice] = {}
+        self.size = 0
+        for key, dim in self.dims.items():
+            self.columns[key] = slice(self.size, self.size + dim)
+            self.size += dim
+
+    def __contains__(self, key: int) -> bool:
+        return key in self.dims
+
+    def extended(self, dims: Mapping[int, int]) -> Layout:
+        """The layout with further keys appended."""
+        return Layout({**self.dims, **dims})
+
+    def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
+        """Column numbers of the keys, in the order given."""
+        parts = [np.arange(self.columns[k].start, self.columns[k].stop) for k in keys]
+        return np.concatenate(parts) if parts else np.zeros(0, np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SquareRootInformation:
+    """The Gaussian ‖R δ - d‖² over the variables of a layout.
+
+    Attributes:
+        layout: columns of the variables, `n` in all.
+        Rd: (n + 1, n + 1) upper triangular: R with d as its last column; the corner is the root of
+            the part of the cost that no δ can remove.
+    """
+
+    layout: Layout
+    Rd: FloatArray
+
+    @staticmethod
+    def empty() -> SquareRootInformation:
+        """A Gaussian over nothing."""
+        return SquareRootInformation(Layout({}), np.zeros((1, 1), order="F"))
+
+    @property
+    def R(self) -> FloatArray:
+        """(n, n) upper triangular root of the information."""
+        return self.Rd[:-1, :-1]
+
+    @property
+    def d(self) -> FloatArray:
+        """(n,) right-hand side."""
+        return self.Rd[:-1, -1]
+
+    def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
+        """The same Gaussian with further variables of which nothing is known."""
+        if not dims:
+            return self
+        layout = self.layout.extended(dims)
+        n, m = self.layout.size, layout.size
+        Rd = np.zeros((m + 1, m + 1), order="F")
+        Rd[:n, :n] = self.R
+        Rd[:n, m] = self.d
+        Rd[m, m] = self.Rd[n, n]
+        return SquareRootInformation(layout, Rd)
+
+    def shifted(self, delta: FloatArray) -> SquareRootInformation:
+        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖²."""
+        Rd = self.Rd.copy(order="F")
+        Rd[:-1, -1] -= self.R @ delta
+        return SquareRootInformation(self.layout, Rd)
+
+    def updated(self, Ab: FloatArray) -> SquareRootInformation:
+        """Fold in measurement rows.
+
+        Args:
+            Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
+        """
+        if len(Ab) == 0:
+            return self
+        if len(Ab) > 2 * self.layout.size:
+            Ab = triangularize(Ab)
+        block = min(BLOCK_SIZE, self.layout.size + 1)
+        Rd, _, _, info = lapack.dtpqrt(0, block, self.Rd, np.asfortranarray(Ab))
+        if info != 0:
+            raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
+        return SquareRootInformation(self.layout, Rd)
+
+    def solution(self) -> FloatArray:
+        """The δ (n,) of least cost.
+
+        Raises:
+            numpy.linalg.LinAlgError: if some direction is not determined.
+        """
+        x, info = lapack.dtrtrs(self.R, self.d)
+        if info != 0 or not np.all(np.isfinite(x)):
+            raise np.linalg.LinAlgError("the cost does not determine all of its variables")
+        return np.asarray(x, dtype=np.float64)
+
+    def covariance(self) -> FloatArray:
+        """The (n, n) covariance R⁻¹ R⁻ᵀ."""
+        inverse = self.root_covariance()
+        return np.asarray(inverse @ inverse.T, dtype=np.float64)
+
+    def root_covariance(self) -> FloatArray:
+        """The (n, n) upper triangular R⁻¹, a root of the covariance."""
+        inverse, info = lapack.dtrtri(self.R)
+        if info != 0:
+            raise np.linalg.LinAlgError("the information is singular")
+        return np.asarray(np.triu(inverse), dtype=np.float64)
+
+    def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
+        """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
+        gone = [k for k in self.layout.dims if k not in set(keep)]
+        order = self.layout.indices([*gone, *keep])
+        width = self.layout.size - sum(self.layout.dims[k] for k in keep)
+        layout = Layout({k: self.layout.dims[k] for k in keep})
+        permuted = np.empty_like(self.Rd)
+        permuted[:, :-1] = self.Rd[:, order]
+        permuted[:, -1] = self.Rd[:, -1]
+        return SquareRootInformation(layout, triangularize(permuted)[width:, width:])
+
+
+def triangularize(Ab: FloatArray) -> FloatArray:
+    """The upper triangular factor of a QR decomposition of (m, n) rows, always (n, n)."""
+    m, n = Ab.shape
+    if m < n:
+        Ab = np.vstack([Ab, np.zeros((n - m, n))])
+    qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
+    if info != 0:
+        raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
+    return np.asfortranarray(np.triu(qr[:n]))
