@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The files of an ASL folder (``mav0``): which sensors are there, their calibration and indices."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.rows import read_rows
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors.calibration import read_euroc_rig, read_imu_noise
+from slam_graph.sensors.kalibr import read_kalibr
+from slam_graph.sensors.rig import Rig
+from slam_graph.sensors.yaml_source import read_yaml
+
+
+def find_mav0(path: Path) -> Path:
+    """The folder of sensors that a path stands for."""
+    for folder in (path / "mav0", path):
+        if (folder / "imu0").is_dir():
+            return folder.resolve()
+    if not path.is_dir():
+        raise DataError(f"{path}: no such folder")
+    folder = path / "mav0" if (path / "mav0").is_dir() else path
+    raise DataError(f"{folder}: no folder 'imu0' here; an EuRoC recording has mav0/imu0, mav0/cam0")
+
+
+def name_of(mav0: Path) -> str:
+    """Name of the recording: that of the folder around ``mav0``."""
+    return mav0.parent.name if mav0.name == "mav0" else mav0.name
+
+
+def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[Rig, list[Path]]:
+    """The calibration, and the folder of each of its cameras.
+
+    Args:
+        mav0: folder of sensors.
+        count: number of cameras to use, the first ones; None for all.
+        calibration: Kalibr camera chain to use instead of the ``sensor.yaml`` files.
+    """
+    found = [(int(m[1]), p) for p in mav0.iterdir() if (m := re.fullmatch(r"cam(\d+)", p.name))]
+    folders = [folder for _, folder in sorted(found)]
+    if not folders:
+        raise DataError(f"{mav0}: no camera folder (cam0, cam1, …) here")
+    if calibration is None:
+        if count is not None and 1 <= count <= len(folders):
+            folders = folders[:count]
+        rig = read_euroc_rig(mav0, [folder.name for folder in folders])
+    else:
+        imu = mav0 / "imu0" / "sensor.yaml"
+        noise = read_imu_noise(read_yaml(imu)) if imu.is_file() else None
+        rig = read_kalibr(calibration, fallback=noise)
+        if len(rig.cameras) > len(folders):
+            raise DataError(
+                f"{calibration}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "
+                f"choose fewer cameras"
+            )
+    rig = rig if count is None else rig.select(count)
+    return rig, folders[: len(rig.cameras)]
+
+
+def list_images(folder: Path, diagnostics: Diagnostics) -> tuple[NDArray[np.int64], list[str]]:
+    """Stamps and file names of a camera; none if its folder holds no images at all."""
+    index = folder / "data.csv"
+    if not index.is_file():
+        if (folder / "data").exists():
+            raise DataError(f"{index}: missing, but there are images beside it")
+        return np.zeros(0, np.int64), []
+    stamps: list[int] = []
+    names: list[str] = []
+    for rows in read_rows(index):
+        for k, line in enumerate(rows.lines):
+            stamp, name = _parse_image_row(line, partial(rows.where, k))
+            if stamps and stamp <= stamps[-1]:
+                diagnostics.warn("camera_out_of_order", f"{rows.where(k)}: image dropped")
+                continue
+            stamps.append(stamp)
+            names.append(name)
+    if not stamps:
+        raise DataError(f"{index}: no images listed in this file")
+    return np.array(stamps, np.int64), names
+
+
+def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:
+    stamp, _, name = line.partition(",")
+    try:
+        parsed = int(stamp)
+    except ValueError:
+        parsed = -1
+    if parsed < 0 or not name.strip():
+        raise DataError(f"{where()}: cannot read '{line.strip()[:100]}' as stamp [ns], file name")
+    return parsed, name.strip()

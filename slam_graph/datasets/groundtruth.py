@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ground truth from EuRoC's CSV, a TUM file, or an EuRoC folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.rows import STAMP_TEXT, Rows, parse, read_rows, stamps_from_seconds
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.calibration import read_body_T_sensor
+
+FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
+"""Where EuRoC and its kin keep poses, in the order of preference."""
+
+EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
+"""Values after the time stamp of an EuRoC ground truth: p, q (w x y z), v, gyro and accel bias."""
+
+SMALLEST_QUATERNION = 0.5
+"""A quaternion shorter than this is not a rounded unit quaternion but a missing value."""
+
+
+def find_groundtruth(mav0: Path) -> Path | None:
+    """The ground truth file of an EuRoC folder, or None."""
+    for name in FOLDERS:
+        if (mav0 / name / "data.csv").is_file():
+            return mav0 / name / "data.csv"
+    return None
+
+
+def resolve_groundtruth(path: Path) -> Path:
+    """The ground truth file that a file, an EuRoC folder or its parent stands for."""
+    if path.is_file():
+        return path
+    for folder in (path / "mav0", path):
+        found = find_groundtruth(folder)
+        if found is not None:
+            return found
+    if (path / "data.csv").is_file():
+        return path / "data.csv"
+    looked = ", ".join(f"{name}/data.csv" for name in FOLDERS)
+    raise DataError(f"{path}: no ground truth here; expected a CSV or TUM file, or {looked}")
+
+
+def check_groundtruth(path: Path) -> None:
+    """Fail early: refuse a file without data rows or with an unknown number of columns."""
+    for rows in read_rows(path, 1):
+        _layout(rows)
+        return
+    raise DataError(f"{path}: no ground truth rows in this file")
+
+
+def read_groundtruth(path: Path, diagnostics: Diagnostics | None = None) -> Trajectory:
+    """Read poses of the body (IMU) in the world.
+
+    A comma-separated file is read as EuRoC's (time in ns, p, q as w x y z, and then nothing, the
+    velocity, or velocity, gyroscope and accelerometer bias); one separated by white space as TUM's
+    (time in seconds, p, q as x y z w). Where an EuRoC ``sensor.yaml`` lies beside the file, its
+    `T_BS` takes the poses from the tracked frame to the body.
+
+    Args:
+        path: file, or folder as in `resolve_groundtruth`.
+        diagnostics: counts `groundtruth_not_finite` and `groundtruth_out_of_order` rows, which are
+            dropped.
+
+    Raises:
+        DataError: if the file is missing, empty, or a row cannot be read.
+    """
+    path = resolve_groundtruth(path)
+    check_groundtruth(path)
+    diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+    blocks = []
+    latest_ns = np.iinfo(np.int64).min
+    for rows in read_rows(path):
+        stamps, values = _parse_block(rows)
+        kept = _usable(rows, stamps, values, latest_ns, diagnostics)
+        blocks.append((stamps[kept], values[kept]))
+        latest_ns = int(stamps[kept[-1]]) if len(kept) else latest_ns
+    stamps = np.concatenate([b[0] for b in blocks])
+    if len(stamps) == 0:
+        raise DataError(f"{path}: no usable ground truth row in this file")
+    return _to_body(_trajectory(stamps, np.concatenate([b[1] for b in blocks])), path)
+
+
+def _layout(rows: Rows) -> tuple[str | None, int]:
+    """Delimiter and number of values after the stamp, from the first row."""
+    line = rows.lines[0].strip().rstrip(",")
+    if "," in line:
+        values = line.count(",")
+        if values not in EUROC_COLUMNS:
+            known = ", ".join(f"{n} ({what})" for n, what in EUROC_COLUMNS.items())
+            raise DataError(
+                f"{rows.where(0)}: {values} values after the time stamp; ground truth has {known}"
+            )
+        return ",", values
+    if len(line.split()) != 8:
+        raise DataError(
+            f"{rows.where(0)}: {len(line.split())} columns; a TUM trajectory has 8 "
+            "(time, position xyz, quaternion xyzw)"
+        )
+    return None, 7
+
+
+def _parse_block(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (N,) and values (N, 7, 10 or 16) with the quaternion as x y z w."""
+    delimiter, count = _layout(rows)
+    columns = tuple(range(count + 1))
+    if delimiter is None:
+        dtype: list[tuple[Any, ...]] = [("stamp", STAMP_TEXT), ("values", "f8", (count,))]
+        table = parse(rows, dtype, "time [s], position, quaternion xyzw", columns, None)
+        return stamps_from_seconds(rows, table["stamp"]), table["values"]
+    dtype = [("stamp", "i8"), ("values", "f8", (count,))]
+    table = parse(rows, dtype, f"stamp [ns] and {count} numbers", columns)
+    values = table["values"].copy()
+    values[:, 3:7] = table["values"][:, [4, 5, 6, 3]]
+    return table["stamp"], values
+
+
+def _usable(
+    rows: Rows,
+    stamps: NDArray[np.int64],
+    values: NDArray[np.float64],
+    latest_ns: int,
+    diagnostics: Diagnostics,
+) -> NDArray[np.intp]:
+    """Indices of the rows that are finite, have a rotation, and follow the rows before them."""
+    whole = np.isfinite(values).all(axis=1)
+    whole &= np.linalg.norm(values[:, 3:7], axis=1) > SMALLEST_QUATERNION
+    for k in np.flatnonzero(~whole):
+        diagnostics.warn("groundtruth_not_finite", f"{rows.where(int(k))}: row dropped")
+    kept = []
+    for k in np.flatnonzero(whole):
+        if stamps[k] <= latest_ns:
+            diagnostics.warn("groundtruth_out_of_order", f"{rows.where(int(k))}: row dropped")
+            continue
+        latest_ns = int(stamps[k])
+        kept.append(k)
+    return np.array(kept, np.intp)
+
+
+def _trajectory(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> Trajectory:
+    quaternions = values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True)
+    full = values.shape[1] == 16
+    return Trajectory(
+        stamps,
+        values[:, :3].copy(),
+        quaternions,
+        values[:, 7:10].copy() if values.shape[1] >= 10 else None,
+        values[:, 10:13].copy() if full else None,
+        values[:, 13:16].copy() if full else None,
+    )
+
+
+def _to_body(trajectory: Trajectory, path: Path) -> Trajectory:
+    """Poses of the IMU, where calibration files say how the tracked frame sits on the platform.
+
+    The velocities and biases of another frame are dropped; EuRoC's files that have them all track
+    the body itself.
+    """
+    sensor, imu = path.parent / "sensor.yaml", path.parent.parent / "imu0" / "sensor.yaml"
+    if path.name != "data.csv" or not sensor.is_file():
+        return trajectory
+    sensor_T_body = read_body_T_sensor(sensor).inverse()
+    if imu.is_file():
+        sensor_T_body = sensor_T_body.compose(read_body_T_sensor(imu))
+    if sensor_T_body.equals(gtsam.Pose3(), 1e-9):
+        return trajectory
+    poses = [trajectory.pose(k).compose(sensor_T_body) for k in range(len(trajectory))]
+    return Trajectory(
+        trajectory.stamps_ns,
+        np.array([pose.translation() for pose in poses]),
+        np.array([_xyzw(pose.rotation()) for pose in poses]),
+    )
+
+
+def _xyzw(rotation: gtsam.Rot3) -> list[float]:
+    quaternion: Any = rotation.toQuaternion()  # an Eigen type that the stubs do not know
+    return [quaternion.x(), quaternion.y(), quaternion.z(), quaternion.w()]

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Grey images from files: damaged ones refused, the next ones decoded ahead of time."""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+T = TypeVar("T")
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+FRAMES_AHEAD = 3
+"""How many frames are decoded ahead: enough to hide decoding, little enough to not cost memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong with a file, as `Diagnostics.warn` takes it."""
+
+    kind: str
+    message: str
+
+
+def read_grey(path: Path, width: int, height: int) -> NDArray[np.uint8] | Fault:
+    """Read an image of a known size as 8 bit grey.
+
+    A damaged file is found before it is decoded: decoders fill the rows that they cannot read with
+    anything, and complain on stderr.
+
+    Returns:
+        (height, width) uint8, or a fault of kind `image_unreadable` or `image_wrong_size`.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        return Fault("image_unreadable", f"{path}: {error.strerror}")
+    damage = find_damage(data)
+    if damage is not None:
+        return Fault("image_unreadable", f"{path}: {damage}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error as error:
+        return Fault("image_unreadable", f"{path}: {error.err}")
+    if image is None:
+        return Fault("image_unreadable", f"{path}: not an image that OpenCV can read")
+    if image.shape != (height, width):
+        got = f"{image.shape[1]}x{image.shape[0]}"
+        return Fault("image_wrong_size", f"{path}: {got}, the calibration says {width}x{height}")
+    return image.astype(np.uint8, copy=False)
+
+
+def find_damage(data: bytes) -> str | None:
+    """What is wrong with the bytes of an image file, as far as can be told without decoding it."""
+    if not data:
+        return "empty file"
+    if data.startswith(PNG_SIGNATURE):
+        return _find_png_damage(data)
+    if data.startswith(JPEG_SIGNATURE) and JPEG_END not in data[-1024:]:
+        return "truncated JPEG"
+    return None
+
+
+def _find_png_damage(data: bytes) -> str | None:
+    """Walk over the chunks of a PNG file and compare their checksums (0.1 ms for EuRoC's)."""
+    view = memoryview(data)
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        end = position + 12 + int.from_bytes(view[position : position + 4], "big")
+        if end > len(data):
+            break
+        if zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+            return f"damaged PNG (checksum at byte {position})"
+        if data[position + 4 : position + 8] == b"IEND":
+            return None
+        position = end
+    return "truncated PNG"
+
+
+def prefetch(
+    jobs: Iterable[Callable[[], T]], ahead: int = FRAMES_AHEAD
+) -> Generator[T, None, None]:
+    """Results of jobs in their order, the next ones computed in a thread meanwhile.
+
+    Closing the generator cancels what has not begun, and waits for what has.
+
+    Args:
+        jobs: taken from as needed, never more than `ahead` in advance.
+        ahead: how many results to have ready at most.
+    """
+    pending: deque[Future[T]] = deque()
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slam_graph-images")
+    try:
+        for job in jobs:
+            pending.append(pool.submit(job))
+            if len(pending) > ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

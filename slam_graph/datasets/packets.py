@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames and IMU samples brought together: the packets that a sequence delivers."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import closing
+
+import numpy as np
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
+
+HISTORY_NS = 1_000_000_000
+"""How much of the IMU before a chosen start the first packet carries."""
+
+FrameStream = Generator[CameraFrame | FeatureFrame, None, None]
+
+
+class ImuFeed:
+    """Hands out a stream of IMU blocks in pieces that end at given times.
+
+    Attributes:
+        latest_ns: stamp of the last sample handed out, None before the first.
+    """
+
+    def __init__(self, blocks: Iterator[ImuData]) -> None:
+        self.latest_ns: int | None = None
+        self._blocks = blocks
+        self._buffer = ImuData.empty()
+
+    def up_to(self, stamp_ns: int) -> ImuData:
+        """All samples not yet handed out, up to and including the first at or after `stamp_ns`."""
+        if self.latest_ns is not None and self.latest_ns >= stamp_ns:
+            return ImuData.empty()
+        pending = [self._buffer]
+        while not len(pending[-1]) or pending[-1].stamps_ns[-1] < stamp_ns:
+            block = next(self._blocks, None)
+            if block is None:
+                break
+            pending.append(block)
+        data = ImuData.concatenate(pending) if len(pending) > 1 else self._buffer
+        end = int(np.searchsorted(data.stamps_ns, stamp_ns, side="left")) + 1
+        self._buffer = data[end:]
+        if len(data):
+            self.latest_ns = int(data.stamps_ns[min(end, len(data)) - 1])
+        return data[:end]
+
+
+def packetize(
+    frames: FrameStream,
+    blocks: Iterator[ImuData],
+    diagnostics: Diagnostics,
+    history_ns: int | None = None,
+) -> Iterator[Packet]:
+    """Join frames with the IMU samples that lead up to them.
+
+    A frame without any IMU sample since the frame before it (or, for the first one, at or before
+    its time) is delivered all the same and counted as `frame_without_imu`.
+
+    Args:
+        frames: with strictly increasing stamps; closed at the end.
+        blocks: of the IMU stream, with strictly increasing stamps.
+        diagnostics: where faults are counted.
+        history_ns: how much of the IMU before the first frame its packet carries; None for all.
+    """
+    feed = ImuFeed(blocks)
+    previous_ns: int | None = None
+    with closing(frames):
+        for frame in frames:
+            held_ns = feed.latest_ns
+            imu = feed.up_to(frame.stamp_ns)
+            if previous_ns is None and history_ns is not None:
+                imu = imu[int(np.searchsorted(imu.stamps_ns, frame.stamp_ns - history_ns)) :]
+            held = (
+                held_ns is not None
+                and previous_ns is not None
+                and previous_ns < held_ns <= frame.stamp_ns
+            )
+            if not held and not (len(imu) and imu.stamps_ns[0] <= frame.stamp_ns):
+                diagnostics.warn(
+                    "frame_without_imu", f"frame at {frame.stamp_ns} has no IMU samples"
+                )
+            previous_ns = frame.stamp_ns
+            yield Packet(imu, frame)

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What all recorded formats share: they give frames and IMU blocks, this makes the sequence."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.base import SequenceInfo
+from slam_graph.datasets.groundtruth import (
+    check_groundtruth,
+    read_groundtruth,
+    resolve_groundtruth,
+)
+from slam_graph.datasets.packets import HISTORY_NS, FrameStream, packetize
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.measurements import ImuData, Packet
+from slam_graph.sensors.rig import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How much a recording holds.
+
+    Attributes:
+        frames: number of frames.
+        start_ns, end_ns: times of the first and the last frame; of the IMU if there are no frames.
+        imu_samples: number of IMU samples in the file, before faulty ones are dropped.
+    """
+
+    frames: int
+    start_ns: int
+    end_ns: int
+    imu_samples: int
+
+
+class RecordedSequence(ABC):
+    """A recording in files: the part of the `Sequence` protocol that does not depend on the format.
+
+    Attributes:
+        name: of the recording.
+        rig: its calibrated sensors.
+        groundtruth_path: file or folder with the ground truth, or None.
+        diagnostics: where faults are counted.
+    """
+
+    format: ClassVar[str]
+    content: ClassVar[Literal["images", "tracks"]]
+    rig: Rig
+    diagnostics: Diagnostics
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        groundtruth_path: Path | None,
+        diagnostics: Diagnostics | None,
+    ) -> None:
+        self.name = name
+        self.rig = rig
+        self.groundtruth_path: Path | None = None
+        self.diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        if groundtruth_path is not None:
+            self.groundtruth_path = resolve_groundtruth(groundtruth_path)
+            check_groundtruth(self.groundtruth_path)
+
+    @abstractmethod
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """The frames within [start_ns, end_ns], with strictly increasing stamps."""
+
+    @abstractmethod
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on, in blocks, with strictly increasing stamps."""
+
+    @abstractmethod
+    def measure(self) -> Extent:
+        """Count what the files hold; this may read through them once."""
+
+    @cached_property
+    def _extent(self) -> Extent:
+        return self.measure()
+
+    @property
+    def has_groundtruth(self) -> bool:
+        """Whether `groundtruth()` gives one."""
+        return self.groundtruth_path is not None
+
+    def info(self) -> SequenceInfo:
+        """What the sequence holds; without any frames the times are those of the IMU."""
+        extent = self._extent
+        return SequenceInfo(
+            name=self.name,
+            format=self.format,
+            content=self.content,
+            cameras=len(self.rig.cameras),
+            frames=extent.frames,
+            start_ns=extent.start_ns,
+            end_ns=extent.end_ns,
+            imu_samples=extent.imu_samples,
+            has_groundtruth=self.has_groundtruth,
+        )
+
+    def packets(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Packet]:
+        """Frames in the order of time, each with the IMU samples that lead up to it.
+
+        Args:
+            start_ns: first frame time to deliver; the first packet then carries the IMU samples of
+                up to one second before it. Without it, it carries all samples from the start.
+            end_ns: last frame time to deliver.
+        """
+        after_ns = None if start_ns is None else start_ns - HISTORY_NS
+        return packetize(
+            self.frames(start_ns, end_ns),
+            self.imu_blocks(after_ns),
+            self.diagnostics,
+            None if start_ns is None else HISTORY_NS,
+        )
+
+    def imu(self) -> ImuData:
+        """All IMU samples at once."""
+        return ImuData.concatenate(list(self.imu_blocks()))
+
+    def groundtruth(self) -> Trajectory | None:
+        """The true trajectory of the body, where the recording has one."""
+        if self.groundtruth_path is None:
+            return None
+        return read_groundtruth(self.groundtruth_path, self.diagnostics)
+
+    def initial_state(self) -> NavState | None:
+        """The state at the start that comes with the data; None unless a format has one."""
+        return None
+
+
+def within(
+    stamps_ns: NDArray[np.int64], start_ns: int | None, end_ns: int | None
+) -> NDArray[np.bool_]:
+    """Which times (N,) lie in a range with optional ends, both included."""
+    inside = np.ones(len(stamps_ns), bool)
+    if start_ns is not None:
+        inside &= stamps_ns >= start_ns
+    if end_ns is not None:
+        inside &= stamps_ns <= end_ns
+    return inside

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The known formats, and which one a path is of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from slam_graph.datasets.eqvio_tracks import EqvioTracks, is_eqvio_file, wheel_tracks
+from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.openvins_sim import OpenvinsSimulation
+from slam_graph.datasets.recorded import RecordedSequence
+from slam_graph.datasets.recording import TrackRecordingSequence, is_recording
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+
+DEMO = "demo"
+"""The name that stands for the recording that comes with GTSAM."""
+
+
+class Opener(Protocol):
+    """How every format is opened: the arguments that their classes share."""
+
+    def __call__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+    ) -> RecordedSequence:
+        """Open the recording at `path`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format of recordings.
+
+    Attributes:
+        open: makes a sequence of a path.
+        recognises: whether a path looks like this format.
+        looks_like: what `recognises` looks for, for messages.
+    """
+
+    open: Opener
+    recognises: Callable[[Path], bool]
+    looks_like: str
+
+
+def _is_euroc(path: Path) -> bool:
+    return any((folder / "imu0").is_dir() for folder in (path, path / "mav0")) or (
+        (path / "mav0").is_dir()
+    )
+
+
+def _is_openvins_sim(path: Path) -> bool:
+    return (path / "tracks.csv").is_file() and (path / "calib.yaml").is_file()
+
+
+DATASETS: dict[str, Format] = {
+    "euroc": Format(EurocSequence, _is_euroc, "a folder with mav0/imu0 and mav0/cam0"),
+    "recording": Format(
+        TrackRecordingSequence, is_recording, "a folder with meta.yaml, as our recorder writes it"
+    ),
+    "openvins_sim": Format(
+        OpenvinsSimulation, _is_openvins_sim, "a folder with calib.yaml, tracks.csv and imu.csv"
+    ),
+    "eqvio": Format(
+        EqvioTracks, is_eqvio_file, f"a CSV file that begins with 'row_type,' (or '{DEMO}')"
+    ),
+}
+"""Every format by its name; a path is of the first one that recognises it."""
+
+
+def open_dataset(
+    path: str | Path,
+    format: str | None = None,
+    cameras: int | None = None,
+    calibration: Path | None = None,
+    groundtruth: Path | None = None,
+    diagnostics: Diagnostics | None = None,
+) -> RecordedSequence:
+    """Open a recording.
+
+    Args:
+        path: file or folder; the word ``demo`` stands for the tracks in GTSAM's wheel.
+        format: name in `DATASETS`; None to guess it from the path.
+        cameras: use only the first so many; None for all.
+        calibration: Kalibr camera chain to use instead of the recording's calibration.
+        groundtruth: EuRoC CSV, TUM file or EuRoC folder to use instead of the recording's own.
+        diagnostics: where faults are counted.
+
+    Raises:
+        DataError: if the path is not there, of no known format, or cannot be read.
+    """
+    path = Path(path)
+    if str(path) == DEMO and not path.exists():
+        path = wheel_tracks()
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder")
+    return _choose(path, format).open(
+        path,
+        cameras=cameras,
+        calibration=calibration,
+        groundtruth=groundtruth,
+        diagnostics=diagnostics,
+    )
+
+
+def _choose(path: Path, name: str | None) -> Format:
+    if name is not None:
+        if name not in DATASETS:
+            raise DataError(f"unknown data set format '{name}'; known: {', '.join(DATASETS)}")
+        return DATASETS[name]
+    for known in DATASETS.values():
+        if known.recognises(path):
+            return known
+    looked = "; ".join(f"{key}: {known.looks_like}" for key, known in DATASETS.items())
+    raise DataError(f"{path}: not a recording of a known format; looked for {looked}")

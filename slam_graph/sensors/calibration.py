@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration of a rig from the files of EuRoC (`sensor.yaml`); Kalibr's are in `kalibr`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import gtsam
+
+from slam_graph.errors import DataError
+from slam_graph.sensors.camera import COEFFICIENTS, Camera, Distortion
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.sensors.yaml_source import YamlValue, read_yaml
+
+DISTORTION_NAMES: dict[str, Distortion] = {
+    "none": "none",
+    "radtan": "radtan",
+    "radial-tangential": "radtan",
+    "equidistant": "equidistant",
+}
+"""The names that calibration files give to the distortion models of `Camera`."""
+
+
+def read_camera(entry: YamlValue) -> Camera:
+    """Intrinsics from a mapping with the keys that EuRoC and Kalibr share.
+
+    Args:
+        entry: has `camera_model`, `intrinsics` (fx, fy, cx, cy), `distortion_model`,
+            `distortion_coefficients` or `distortion_coeffs`, and `resolution` (width, height).
+
+    Raises:
+        DataError: naming file and line of what is missing or unknown.
+    """
+    model = entry.require("camera_model", "model")
+    if model.text() != "pinhole":
+        raise DataError(f"{model.where}: unknown camera model '{model.text()}'; known: pinhole")
+    name = entry.require("distortion_model", "distortion")
+    if name.text() not in DISTORTION_NAMES:
+        raise DataError(
+            f"{name.where}: unknown distortion model '{name.text()}'; "
+            f"known: {', '.join(DISTORTION_NAMES)}"
+        )
+    distortion = DISTORTION_NAMES[name.text()]
+    intrinsics = entry.require("intrinsics")
+    fx, fy, cx, cy = intrinsics.numbers(4)
+    width, height = entry.require("resolution").numbers(2)
+    coefficients: list[float] = []
+    if distortion != "none":
+        values = entry.require("distortion_coefficients", "distortion_coeffs")
+        coefficients = values.numbers(COEFFICIENTS[distortion])
+    try:
+        size = (int(width), int(height))
+        return Camera(fx, fy, cx, cy, distortion, tuple(coefficients), *size)
+    except DataError as error:
+        raise DataError(f"{intrinsics.where}: {error}") from None
+
+
+def read_imu_noise(entry: YamlValue) -> ImuNoise:
+    """IMU noise from a mapping with the keys that EuRoC and Kalibr share."""
+    return ImuNoise(
+        gyro_noise_density=entry.require("gyroscope_noise_density").number(),
+        gyro_random_walk=entry.require("gyroscope_random_walk").number(),
+        accel_noise_density=entry.require("accelerometer_noise_density").number(),
+        accel_random_walk=entry.require("accelerometer_random_walk").number(),
+        rate_hz=entry.require("rate_hz", "update_rate").number(),
+    )
+
+
+def read_body_T_sensor(path: Path) -> gtsam.Pose3:
+    """`T_BS` of an EuRoC ``sensor.yaml``: the pose of the sensor on the platform.
+
+    A file without this key describes a sensor that defines the platform's frame.
+    """
+    value = read_yaml(path).get("T_BS")
+    return gtsam.Pose3() if value is None else value.pose()
+
+
+def read_euroc_rig(mav0: Path, cameras: Iterable[str], imu: str = "imu0") -> Rig:
+    """The rig of an EuRoC folder, from the ``sensor.yaml`` of each sensor.
+
+    Args:
+        mav0: folder that holds a folder for each sensor.
+        cameras: names of the camera folders, in the order of the rig.
+        imu: name of the folder of the IMU. Its frame is the body frame of the rig; where its
+            `T_BS` is not the identity, the cameras are re-expressed in it.
+
+    Raises:
+        DataError: if a file or key is missing, or a value makes no sense; names file and line.
+    """
+    imu_entry = read_yaml(mav0 / imu / "sensor.yaml")
+    platform_T_imu = read_body_T_sensor(mav0 / imu / "sensor.yaml")
+    mounted = []
+    for name in cameras:
+        entry = read_yaml(mav0 / name / "sensor.yaml")
+        platform_T_camera = entry.require("T_BS").pose()
+        mounted.append(
+            RigCamera(read_camera(entry), platform_T_imu.between(platform_T_camera), 0.0, name)
+        )
+    return Rig(tuple(mounted), read_imu_noise(imu_entry))

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""YAML whose values know their line: calibration files with messages that say where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import yaml
+
+from slam_graph.errors import DataError
+from slam_graph.sensors.rig import pose_from_matrix
+
+
+@dataclass(frozen=True, slots=True)
+class YamlValue:
+    """One value of a YAML file.
+
+    Attributes:
+        path: of the file.
+        node: of the parsed file.
+        key: name under which the value stands.
+    """
+
+    path: Path
+    node: yaml.Node
+    key: str = ""
+
+    @property
+    def where(self) -> str:
+        """File, line and key, for messages."""
+        return f"{self.path}:{self.node.start_mark.line + 1}" + (
+            f": {self.key}" if self.key else ""
+        )
+
+    def items(self) -> Iterator[tuple[str, YamlValue]]:
+        """Keys and values of a mapping, in the order of the file."""
+        if not isinstance(self.node, yaml.MappingNode):
+            raise DataError(f"{self.where}: expected a mapping of keys to values")
+        for key, value in self.node.value:
+            yield str(key.value), YamlValue(self.path, value, str(key.value))
+
+    def get(self, key: str) -> YamlValue | None:
+        """The value of a key, or None if there is no such key."""
+        return next((value for name, value in self.items() if name == key), None)
+
+    def require(self, *keys: str) -> YamlValue:
+        """The value of the first of `keys` that is there; an error if none is."""
+        for key in keys:
+            value = self.get(key)
+            if value is not None:
+                return value
+        raise DataError(f"{self.where}: missing key '{' or '.join(keys)}'")
+
+    def text(self) -> str:
+        """A scalar as text."""
+        if not isinstance(self.node, yaml.ScalarNode):
+            raise DataError(f"{self.where}: expected a single value")
+        return str(self.node.value)
+
+    def number(self) -> float:
+        """A finite number; also such that YAML 1.1 takes for text, like ``2e-3``."""
+        try:
+            value = float(self.text())
+        except ValueError:
+            raise DataError(f"{self.where}: '{self.text()}' is not a number") from None
+        if not np.isfinite(value):
+            raise DataError(f"{self.where}: '{self.text()}' is not a finite number")
+        return value
+
+    def elements(self) -> list[YamlValue]:
+        """The elements of a list."""
+        if not isinstance(self.node, yaml.SequenceNode):
+            raise DataError(f"{self.where}: expected a list")
+        return [YamlValue(self.path, node, self.key) for node in self.node.value]
+
+    def numbers(self, count: int | None = None) -> list[float]:
+        """A list of numbers, of a given length if `count` says one."""
+        values = [element.number() for element in self.elements()]
+        if count is not None and len(values) != count:
+            raise DataError(f"{self.where}: expected {count} numbers, got {len(values)}")
+        return values
+
+    def pose(self) -> gtsam.Pose3:
+        """A homogeneous matrix: rows of rows, 16 numbers, or OpenCV's mapping with ``data``."""
+        if isinstance(self.node, yaml.MappingNode):
+            values = self.require("data").numbers(16)
+        else:
+            elements = self.elements()
+            nested = elements and isinstance(elements[0].node, yaml.SequenceNode)
+            values = [v for e in elements for v in e.numbers(4)] if nested else self.numbers()
+        if len(values) != 16:
+            raise DataError(f"{self.where}: expected a 4x4 matrix, got {len(values)} numbers")
+        return pose_from_matrix(np.reshape(values, (4, 4)), self.where)
+
+
+def read_yaml(path: Path) -> YamlValue:
+    """Read a YAML file, also one that starts with OpenCV's ``%YAML:1.0``.
+
+    Raises:
+        DataError: if the file is missing, not YAML, or not a mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not text"
+        raise DataError(f"{path}: calibration cannot be read ({reason})") from None
+    if text.startswith("%YAML"):
+        text = "#" + text
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise DataError(f"{path}:{line}: not valid YAML ({error.problem})") from None
+    except yaml.YAMLError:
+        raise DataError(f"{path}: not valid YAML") from None
+    if not isinstance(node, yaml.MappingNode):
+        raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
+    return YamlValue(path, node)
