@@ -104,30 +104,31 @@ class RunConfig(Settings):
 
 
 def load_config(
-    file: Path | str | None = None,
-    overrides: Iterable[str] = (),
-    algorithm: str | None = None,
+    file: Path | str | None = None, overrides: Iterable[str] = (), **options: Any
 ) -> RunConfig:
     """The settings of a run.
 
     Args:
         file: YAML file laid over the defaults.
-        overrides: `a.b=value` laid over the file, in their order.
-        algorithm: name or file of an algorithm, laid over the file and under the overrides.
+        overrides: `a.b=value` laid over file and options, in their order.
+        options: top-level settings by name, laid over the file; None leaves a setting as it is.
 
     Raises:
-        ConfigError: one line that names the file and line, or the override, at fault.
+        ConfigError: one line that names the file and line, the option or the override at fault.
     """
     tree = ConfigTree({"algorithm": DEFAULT_ALGORITHM})
     if file is not None:
         tree.merge(read_tree(Path(file)))
-    if algorithm is not None:
-        tree.merge(ConfigTree({"algorithm": algorithm}, {("algorithm",): "--algorithm"}))
-    for text in overrides:
-        tree.merge(override(text) if text.startswith("algorithm=") else ConfigTree())
+    said = {name: value for name, value in options.items() if value is not None}
+    tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
+    changes = [override(text) for text in overrides]
+    for change in changes:  # which algorithm comes first: other overrides may reach into it
+        if isinstance(change.values.get("algorithm"), str):
+            tree.merge(change)
     _expand_algorithm(tree)
-    for text in overrides:
-        tree.merge(ConfigTree() if text.startswith("algorithm=") else override(text))
+    for change in changes:
+        if not isinstance(change.values.get("algorithm"), str):
+            tree.merge(change)
     return validate(RunConfig, tree)
 
 

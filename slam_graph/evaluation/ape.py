@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
-from slam_graph.evaluation.relations import PoseRelation, errors, relative_poses
+from slam_graph.evaluation.choices import PoseRelation
+from slam_graph.evaluation.relations import errors, relative_poses
 from slam_graph.evaluation.statistics import Statistics
 from slam_graph.geometry.alignment import AlignmentMode, Similarity, align
 from slam_graph.geometry.trajectory import Trajectory

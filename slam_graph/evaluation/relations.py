@@ -14,24 +14,13 @@ The difference is the relative pose E = T_reference⁻¹ T_estimate, with rotati
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.evaluation.choices import PoseRelation
+
 FloatArray = NDArray[np.float64]
-
-PoseRelation = Literal["full", "trans_part", "rot_part", "angle_deg", "angle_rad"]
-POSE_RELATIONS: tuple[PoseRelation, ...] = get_args(PoseRelation)
-
-UNITS: dict[PoseRelation, str] = {
-    "full": "",
-    "trans_part": "m",
-    "rot_part": "",
-    "angle_deg": "deg",
-    "angle_rad": "rad",
-}
 
 
 def relative_poses(

@@ -7,8 +7,6 @@ Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; numbe
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -16,17 +14,14 @@ from scipy.spatial.transform import Rotation
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ErrorSeries
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
-from slam_graph.evaluation.relations import PoseRelation, errors, relative_poses
+from slam_graph.evaluation.choices import STEP_UNITS, DeltaUnit, PoseRelation
+from slam_graph.evaluation.relations import errors, relative_poses
 from slam_graph.evaluation.statistics import Statistics
 from slam_graph.geometry.alignment import AlignmentMode, align
 from slam_graph.geometry.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-DeltaUnit = Literal["f", "m", "d", "r"]
-DELTA_UNITS: tuple[DeltaUnit, ...] = get_args(DeltaUnit)
-UNIT_NAMES: dict[DeltaUnit, str] = {"f": "frames", "m": "m", "d": "deg", "r": "rad"}
 
 DEFAULT_TOLERANCE = 0.1
 
@@ -68,7 +63,7 @@ def rpe(
     )
     if len(start) == 0:
         raise DataError(
-            f"no step of {delta:g} {UNIT_NAMES[unit]} in {len(truth)} shared poses; "
+            f"no step of {delta:g} {STEP_UNITS[unit]} in {len(truth)} shared poses; "
             "choose a smaller --delta"
         )
     difference = relative_poses(*_motions(truth, start, end), *_motions(aligned, start, end))

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph ape` and `slam-graph rpe`: errors of a trajectory, with evo's flags and numbers."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, PoseRelation
+
+if TYPE_CHECKING:
+    from slam_graph.evaluation.ape import ErrorSeries
+    from slam_graph.geometry.alignment import AlignmentMode
+    from slam_graph.geometry.trajectory import Trajectory
+
+Align = Literal["none", "yaw", "se3", "sim3"]
+
+STATISTICS = ("max", "mean", "median", "min", "rmse", "sse", "std")
+
+Reference = Annotated[
+    Path, typer.Argument(help="True trajectory: TUM file, EuRoC CSV or EuRoC folder.")
+]
+Estimate = Annotated[Path, typer.Argument(help="Trajectory to judge: TUM file or EuRoC CSV.")]
+Relation = Annotated[
+    PoseRelation,
+    typer.Option("-r", "--pose_relation", help="Part of the difference of two poses that counts."),
+]
+AlignFlag = Annotated[
+    bool, typer.Option("-a", help="Align with Umeyama's method (the same as --align se3).")
+]
+ScaleFlag = Annotated[
+    bool,
+    typer.Option("-s", "--correct_scale", help="Correct the scale; with -a that is --align sim3."),
+]
+AlignOption = Annotated[
+    Align | None, typer.Option("--align", help="Align before errors are taken.")
+]
+MaxDifference = Annotated[
+    float,
+    typer.Option(
+        "--t_max_diff", min=0.0, help="How far apart in time poses may be to be compared, in s."
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def ape(
+    reference: Reference,
+    estimate: Estimate,
+    relation: Relation = "trans_part",
+    align_se3: AlignFlag = False,
+    correct_scale: ScaleFlag = False,
+    align: AlignOption = None,
+    t_max_diff: MaxDifference = 0.01,
+    as_json: Json = False,
+) -> None:
+    """Absolute pose error of ESTIMATE against REFERENCE."""
+    from slam_graph.evaluation.ape import ape as absolute_pose_error
+
+    mode = _alignment(align_se3, correct_scale, align)
+    truth, guess = _read(reference), _read(estimate)
+    result = absolute_pose_error(truth, guess, relation, mode, t_max_diff)
+    _report("APE", result, relation, mode, {}, as_json)
+
+
+def rpe(
+    reference: Reference,
+    estimate: Estimate,
+    relation: Relation = "trans_part",
+    delta: Annotated[float, typer.Option("-d", "--delta", min=0.0, help="Length of a step.")] = 1.0,
+    delta_unit: Annotated[
+        DeltaUnit,
+        typer.Option("-u", "--delta_unit", help="Frames, metres, degrees or radians."),
+    ] = "f",
+    delta_tol: Annotated[
+        float,
+        typer.Option(
+            "-t", "--delta_tol", min=0.0, help="With --all_pairs: relative tolerance of a step."
+        ),
+    ] = 0.1,
+    all_pairs: Annotated[
+        bool, typer.Option("--all_pairs", help="All pairs instead of consecutive steps.")
+    ] = False,
+    pairs_from_reference: Annotated[
+        bool, typer.Option("--pairs_from_reference", help="Measure steps along the reference.")
+    ] = False,
+    align_se3: AlignFlag = False,
+    correct_scale: ScaleFlag = False,
+    align: AlignOption = None,
+    t_max_diff: MaxDifference = 0.01,
+    as_json: Json = False,
+) -> None:
+    """Relative pose error (drift) of ESTIMATE against REFERENCE."""
+    from slam_graph.evaluation.rpe import rpe as relative_pose_error
+
+    mode = _alignment(align_se3, correct_scale, align)
+    result = relative_pose_error(
+        _read(reference),
+        _read(estimate),
+        relation,
+        mode,
+        delta,
+        delta_unit,
+        all_pairs,
+        delta_tol,
+        pairs_from_reference,
+        t_max_diff,
+    )
+    steps: dict[str, Any] = {
+        "delta": delta,
+        "delta_unit": STEP_UNITS[delta_unit],
+        "all_pairs": all_pairs,
+    }
+    _report("RPE", result, relation, mode, steps, as_json)
+
+
+def _alignment(align_se3: bool, correct_scale: bool, align: Align | None) -> AlignmentMode:
+    """The alignment that the flags ask for."""
+    if align is not None:
+        if align_se3 or correct_scale:
+            raise typer.BadParameter("--align cannot be combined with -a or -s")
+        return align
+    if align_se3:
+        return "sim3" if correct_scale else "se3"
+    return "scale" if correct_scale else "none"
+
+
+def _read(path: Path) -> Trajectory:
+    """Read a trajectory file."""
+    from slam_graph.datasets.groundtruth import read_groundtruth
+
+    return read_groundtruth(path)
+
+
+def _report(
+    metric: str,
+    result: ErrorSeries,
+    relation: PoseRelation,
+    mode: AlignmentMode,
+    steps: dict[str, Any],
+    as_json: bool,
+) -> None:
+    """Print statistics."""
+    statistics = asdict(result.statistics)
+    unit = ERROR_UNITS[relation]
+    if as_json:
+        scale = result.similarity.scale
+        about: dict[str, Any] = {
+            "metric": metric.lower(),
+            "relation": relation,
+            "unit": unit,
+            "alignment": mode,
+        }
+        about |= {"scale": scale, "poses": result.poses, "errors": len(result.values), **steps}
+        echo_json({**about, "statistics": statistics})
+        return
+    step = ""
+    if steps:
+        pairs = "all pairs" if steps["all_pairs"] else "consecutive steps"
+        step = f", {pairs} of {steps['delta']:g} {steps['delta_unit']}"
+    typer.echo(
+        f"{metric} {relation}{f' [{unit}]' if unit else ''}{step}, alignment: {mode}, "
+        f"{result.poses} shared poses, {len(result.values)} errors"
+    )
+    echo_table(((name, f"{statistics[name]:.6f}") for name in STATISTICS), indent="  ")

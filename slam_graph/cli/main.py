@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `slam-graph`: launches a command and turns errors into exit codes.
+
+Exit codes: 0 success; 1 expected failure, said in one line; 2 usage or configuration error; 3 ran
+but never initialised, diverged or covered less than asked; 130 interrupted. Whatever takes long to
+import is imported inside the commands.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from slam_graph.cli import config, data, evaluate, run
+from slam_graph.errors import SlamGraphError
+from slam_graph.version import __version__
+
+app = typer.Typer(
+    help="Factor-graph SLAM: a recorded sequence in, a trajectory out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("run")(run.run)
+app.command("ape")(evaluate.ape)
+app.command("rpe")(evaluate.rpe)
+app.add_typer(data.app, name="data")
+app.add_typer(config.app, name="config")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"slam-graph {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
+def main() -> None:
+    """Launch; an error raised on purpose becomes one line and its exit code."""
+    try:
+        app(prog_name="slam-graph")
+    except SlamGraphError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

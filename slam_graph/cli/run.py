@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph run`: a recorded sequence in, a trajectory out."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
+from slam_graph.cli.data import Calibration, Data, Format, Groundtruth, Json
+from slam_graph.cli.output import echo_json
+from slam_graph.cli.progress import ProgressBar
+from slam_graph.cli.summary import echo_summary
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from slam_graph.config import RunConfig
+    from slam_graph.datasets.base import Sequence
+    from slam_graph.output.run_result import RunResult
+
+RerunMode = Literal["off", "save", "spawn", "connect"]
+
+INTERRUPTED = 130
+
+
+def run(
+    data: Data,
+    algorithm: Algorithm = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    cameras: Annotated[
+        str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")] = None,
+    output: Annotated[
+        Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
+    ] = Path("results"),
+    rerun: Annotated[
+        RerunMode, typer.Option("--rerun", help="Show the run in Rerun, or save it for Rerun.")
+    ] = "off",
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
+    ] = True,
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate the trajectory of a recording and write the results.
+
+    The newest results are also found under OUTPUT/<dataset>/latest.
+    """
+    from slam_graph.config import load_config
+    from slam_graph.datasets.registry import open_dataset
+
+    said = {"algorithm": algorithm, "cameras": cameras, "start_s": start, "duration_s": duration}
+    settings = load_config(config, set_ or (), **said, seed=seed)
+    with _collected_log() as log:
+        sequence = open_dataset(
+            data,
+            format=format_,
+            cameras=settings.cameras,
+            calibration=calibration,
+            groundtruth=groundtruth,
+        )
+        result, folder, files = _execute(sequence, settings, output, rerun, progress, log)
+    if as_json:
+        names = [str(path) for path in files]
+        echo_json({**result.metrics, "folder": str(folder), "files": names})
+    else:
+        echo_summary(result, folder, files)
+    _leave(result)
+
+
+def _execute(
+    sequence: Sequence,
+    settings: RunConfig,
+    output: Path,
+    rerun: RerunMode,
+    progress: bool,
+    log: list[str],
+) -> tuple[RunResult, Path, list[Path]]:
+    """Run, and write whatever came of it."""
+    from slam_graph.output.files import create_run_folder, link_latest, write_text
+    from slam_graph.pipeline import run as run_pipeline
+
+    folder = create_run_folder(output, sequence.info().name)
+    try:
+        viewer = _viewer(rerun, folder, sequence.info().name)
+        with _progress(sequence, settings, progress) as bar:
+            result = run_pipeline(sequence, settings, viewer=viewer, progress=bar)
+        files = result.save(folder)
+        if rerun == "save":
+            files.append(folder / "recording.rrd")
+        files.append(folder / "run.log")
+        write_text(files[-1], log)
+        link_latest(folder)
+    except BaseException:
+        _remove_if_empty(folder)
+        raise
+    return result, folder, files
+
+
+def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:
+    """The viewer that was asked for, or None."""
+    if mode == "off":
+        return None
+    from slam_graph.visualization.rerun_viewer import RerunViewer
+
+    return RerunViewer(mode, folder / "recording.rrd" if mode == "save" else None, name)
+
+
+def _progress(
+    sequence: Sequence, settings: RunConfig, wanted: bool
+) -> AbstractContextManager[ProgressBar | None]:
+    """A progress bar over the part that is asked for, or none."""
+    if not wanted:
+        return nullcontext()
+    info = sequence.info()
+    start_ns = info.start_ns + round(settings.start_s * 1e9)
+    end_ns = info.end_ns
+    if settings.duration_s is not None:
+        end_ns = min(end_ns, start_ns + round(settings.duration_s * 1e9))
+    return ProgressBar(start_ns, end_ns)
+
+
+class _ListHandler(logging.Handler):
+    """Keeps formatted lines."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__(logging.INFO)
+        self.lines = lines
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(self.format(record) + "\n")
+
+
+@contextmanager
+def _collected_log() -> Iterator[list[str]]:
+    """Collect what the package logs, and show its warnings on stderr."""
+    lines: list[str] = []
+    shown = logging.StreamHandler(sys.stderr)
+    shown.addFilter(lambda record: record.levelno == logging.WARNING)
+    shown.setFormatter(logging.Formatter("warning: %(message)s"))
+    logger = logging.getLogger("slam_graph")
+    logger.setLevel(logging.INFO)
+    handlers = (shown, _ListHandler(lines))
+    for handler in handlers:
+        logger.addHandler(handler)
+    try:
+        yield lines
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    """Take away the folder of a run that wrote nothing."""
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _leave(result: RunResult) -> None:
+    """End with the exit code that fits how the run ended."""
+    if result.status == "interrupted":
+        typer.echo(f"{result.message}; what was done so far is written", err=True)
+        raise typer.Exit(INTERRUPTED)
+    result.check()

@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The last lines of a run: a table of results and the files that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from slam_graph.cli.output import echo_table, number
+
+if TYPE_CHECKING:
+    from slam_graph.output.run_result import RunResult
+
+Table = dict[str, Any]
+
+
+def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
+    """Print what a run reached, and where its files are."""
+    metrics = result.metrics
+    echo_table(_overview(metrics))
+    if metrics["accuracy"]:
+        typer.echo("")
+        echo_table(_accuracy(metrics["accuracy"]))
+    if metrics["nees"] and "unavailable" not in metrics["nees"]:
+        typer.echo("")
+        echo_table(_consistency(metrics["nees"]))
+    typer.echo("")
+    typer.echo(f"{folder}/")
+    typer.echo("  " + " ".join(path.name for path in files))
+
+
+def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
+    """What was run, how much of it, and how fast."""
+    dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
+    cameras = f"{metrics['cameras']} camera{'s' if metrics['cameras'] > 1 else ''}"
+    yield "dataset", f"{dataset['name']} ({dataset['format']}, {dataset['content']}, {cameras})"
+    yield "algorithm", f"{metrics['algorithm']}, seed {metrics['seed']}"
+    yield "status", metrics["status"]
+    yield "read", f"{extent['frames']} frames of {extent['recorded_s']:.1f} s"
+    if extent["initialization_s"] is not None:
+        yield (
+            "estimated",
+            f"{extent['estimated_frames']} frames, {extent['coverage']:.1%} of the time, "
+            f"from {extent['initialization_s']:.2f} s on",
+        )
+    if timing["frames_per_s"] is not None:
+        yield (
+            "speed",
+            f"{timing['frames_per_s']:.0f} frames/s, {timing['real_time_factor']:.1f} x real time",
+        )
+    stages = {name: s for name, s in timing["stages"].items() if "." not in name}
+    if stages:
+        yield "ms a frame", ", ".join(f"{name} {s['mean_ms']:.2f}" for name, s in stages.items())
+    if metrics["warnings"]:
+        yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
+
+
+def _accuracy(accuracy: Table) -> Iterator[tuple[str, ...]]:
+    """Absolute and relative errors under each alignment."""
+    yield "alignment", "ATE rmse [m]", "[deg]", "RPE rmse, 1 m [m]", "[deg]", "scale"
+    for mode, table in accuracy.items():
+        if "unavailable" in table:
+            yield mode, table["unavailable"]
+            continue
+        steps = table["rpe"]
+        yield (
+            mode,
+            number(table["ate"]["translation_m"]["rmse"]),
+            number(table["ate"]["rotation_deg"]["rmse"], 3),
+            number(steps["translation_m"]["rmse"] if "delta_m" in steps else None),
+            number(steps["rotation_deg"]["rmse"] if "delta_m" in steps else None, 3),
+            number(table["scale"]),
+        )
+
+
+def _consistency(nees: Table) -> Iterator[tuple[str, ...]]:
+    """Mean NEES beside its ideal."""
+    yield "NEES", "mean", "ideal", "inside 95% bounds"
+    for name in ("orientation", "position", "pose"):
+        row = nees[name]
+        yield name, number(row["mean"], 2), str(row["ideal_mean"]), f"{row['inside_bounds']:.0%}"

@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files that appear whole or not at all, and the folder of a run with its `latest` link."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from slam_graph.errors import DataError
+
+LATEST = "latest"
+
+
+@contextmanager
+def appearing(path: Path) -> Iterator[Path]:
+    """A path to write to, which becomes `path` when the block ends well and vanishes otherwise.
+
+    The content is on the disk before the name is: a crash leaves the old file or the new one.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        with partial.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, lines: Iterable[str]) -> None:
+    """Write lines (with their line ends) as a whole file."""
+    with appearing(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.writelines(lines)
+
+
+def create_run_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
+    """A new folder `root/dataset/<UTC time>`, with a number behind the time if it exists already.
+
+    Raises:
+        DataError: if it cannot be made.
+    """
+    now = now or datetime.now(UTC)
+    name = now.astimezone(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+    try:
+        (root / dataset).mkdir(parents=True, exist_ok=True)
+        for attempt in range(1, 1000):
+            folder = root / dataset / (name if attempt == 1 else f"{name}-{attempt}")
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                continue
+            return folder
+    except OSError as error:
+        raise DataError(f"{root / dataset}: cannot make a folder: {error.strerror}") from error
+    raise DataError(f"{root / dataset}: too many runs at {name}")
+
+
+def link_latest(folder: Path) -> Path:
+    """Make `latest` beside a folder point at it, replacing an older link in one step.
+
+    The link is relative, so that the results can be moved.
+
+    Raises:
+        DataError: if something that is not a link stands in its place.
+    """
+    link = folder.parent / LATEST
+    if link.exists() and not link.is_symlink():
+        raise DataError(f"{link}: not a link; move it away, the newest results are in {folder}")
+    partial = folder.parent / f".{LATEST}.{os.getpid()}.partial"
+    partial.unlink(missing_ok=True)
+    partial.symlink_to(folder.name)
+    os.replace(partial, link)
+    return link
+
+
+@contextmanager
+def logged_to(path: Path) -> Iterator[None]:
+    """Write what the package logs to a file, which appears when the block ends, well or not."""
+    partial = path.with_name(f".{path.name}.partial")
+    handler = logging.FileHandler(partial, mode="w", encoding="utf-8")
+    formatter = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
+    handler.setFormatter(formatter)
+    logger = logging.getLogger("slam_graph")
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(min(logging.INFO, logger.getEffectiveLevel()))
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)
+        handler.close()
+        os.replace(partial, path)

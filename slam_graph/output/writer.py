@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a run: trajectory, states, map, settings, metrics and timing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slam_graph.config import dump_yaml
+from slam_graph.errors import DataError
+from slam_graph.evaluation.ape import ape
+from slam_graph.geometry.alignment import AlignmentMode
+from slam_graph.geometry.history import StateHistory
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry.tum import tum_lines
+from slam_graph.output.files import appearing, write_text
+from slam_graph.output.point_map import write_ply
+from slam_graph.sensors.kalibr import write_kalibr
+
+if TYPE_CHECKING:
+    from slam_graph.output.run_result import RunResult
+
+STATE_COLUMNS = ("velocity_{}_m_s", "gyro_bias_{}_rad_s", "accel_bias_{}_m_s2")
+SIGMA_COLUMNS = (
+    "sigma_rotation_body_{}_rad",
+    "sigma_position_body_{}_m",
+    "sigma_velocity_{}_m_s",
+    "sigma_accel_bias_{}_m_s2",
+    "sigma_gyro_bias_{}_rad_s",
+)
+
+
+def write_run(result: RunResult, folder: Path) -> list[Path]:
+    """Write all files of a run, the trajectory first; each appears whole or not at all.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    trajectory = folder / "trajectory.tum"
+    write_text(trajectory, tum_lines(result.trajectory))
+    states = folder / "states.csv"
+    write_text(states, state_lines(result.history))
+    files = [trajectory, states]
+    truth = result.truth_of_run()
+    if truth is not None:
+        files.append(folder / "groundtruth.tum")
+        write_text(files[-1], tum_lines(truth))
+    map_file, timing = folder / "map.ply", folder / "timing.csv"
+    write_ply(map_file, result.points.points())
+    write_text(timing, result.timing.csv_lines())
+    config, calibration = folder / "config.yaml", folder / "calibration.yaml"
+    write_text(config, [dump_yaml(result.config)])
+    write_kalibr(result.rig, calibration)
+    metrics = folder / "metrics.json"
+    write_text(metrics, [json.dumps(result.metrics, indent=2, allow_nan=False), "\n"])
+    files += [map_file, timing, config, calibration, metrics]
+    if truth is not None and write_picture(result, truth, folder / "trajectory.png"):
+        files.append(folder / "trajectory.png")
+    return files
+
+
+def write_picture(result: RunResult, truth: Trajectory, path: Path) -> bool:
+    """Draw the trajectory beside the truth; whether the two can be compared."""
+    from slam_graph.visualization.plots import plot_errors
+
+    alignment: AlignmentMode = "none" if result.start_was_given else "se3"
+    try:
+        position = ape(truth, result.trajectory, "trans_part", alignment)
+        rotation = ape(truth, result.trajectory, "angle_deg", alignment)
+    except DataError:
+        return False
+    title = f"{result.info.name}, {result.config.algorithm.name}, alignment: {alignment}"
+    aligned = position.similarity.apply(result.trajectory)
+    with appearing(path) as partial:
+        plot_errors(
+            partial, title, truth, aligned, position.values, rotation.values, position.stamps_ns
+        )
+    return True
+
+
+def state_lines(history: StateHistory) -> Iterator[str]:
+    """Velocities, biases and standard deviations as CSV; sigmas are empty where unknown."""
+    names = [column.format(axis) for column in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz"]
+    yield ",".join(["stamp_ns", *names]) + "\n"
+    trajectory = history.trajectory()
+    parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
+    rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
+        cells = ("" if np.isnan(value) else f"{value:.9g}" for value in row)
+        yield ",".join([str(stamp_ns), *cells]) + "\n"

@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A run: a recorded sequence in, a trajectory and a map out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from slam_graph.backend.estimator import Estimator
+from slam_graph.config import RunConfig, load_config
+from slam_graph.datasets.base import Sequence
+from slam_graph.errors import DataError
+from slam_graph.frontend import build_frontend
+from slam_graph.known_start import KnownStart
+from slam_graph.output.run_result import RunResult
+from slam_graph.output.timing import Stopwatch, milliseconds
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
+from slam_graph.supervision import check_sane, estimate, outcome
+from slam_graph.visualization.viewer import NullViewer, Viewer
+
+__all__ = ["Progress", "RunResult", "run"]
+
+
+class Progress(Protocol):
+    """Is told how far a run is."""
+
+    def advance(self, stamp_ns: int, initialized: bool) -> None:
+        """Called after each frame with its time."""
+        ...
+
+
+class Recorder(Protocol):
+    """Takes what the front end found, with the IMU samples that led up to it."""
+
+    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+        """Called after each frame."""
+        ...
+
+
+class NullProgress:
+    """Tells nobody."""
+
+    def advance(self, stamp_ns: int, initialized: bool) -> None:
+        """Tell nobody."""
+
+
+class NullRecorder:
+    """Records nothing."""
+
+    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+        """Record nothing."""
+
+
+def run(
+    sequence: Sequence,
+    config: RunConfig | None = None,
+    viewer: Viewer | None = None,
+    progress: Progress | None = None,
+    recorder: Recorder | None = None,
+) -> RunResult:
+    """Estimate the trajectory of a recorded sequence.
+
+    Once frames are being read nothing is lost: an interruption (Ctrl-C), a fault in the data or a
+    divergence ends the run, and the result holds what was done so far and says so in `status`.
+    `RunResult.check` raises what went wrong; `RunResult.save` writes the files.
+
+    Args:
+        sequence: the recording.
+        config: all settings, by default those of `load_config()`.
+        viewer: watches the run.
+        progress: is told how far the run is.
+        recorder: takes the front end's output, for a replay.
+
+    Raises:
+        DataError: if the sequence has not what the settings ask for.
+    """
+    config = config or load_config()
+    viewer, progress = viewer or NullViewer(), progress or NullProgress()
+    recorder = recorder or NullRecorder()
+
+    result = _open(sequence, config)
+    track = build_frontend(result.rig, config.frontend, config.seed, sequence.diagnostics)
+    estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
+    start = KnownStart.of(sequence, result, config.backend.initialization.mode)
+
+    with outcome(result, estimator, sequence.diagnostics), _watched(viewer, result):
+        for packet, clock in _packets(sequence, result):
+            features = track(packet.frame)
+            clock.lap("frontend", milliseconds(track.frame_stats))
+            start.apply(estimator, packet.frame.stamp_ns, result)
+            estimator.add_imu(packet.imu)
+            state = estimate(estimator, features)
+            clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
+            ids, points = estimator.landmarks()
+            if state is not None:
+                check_sane(state, config.limits)
+                result.history.append(state)
+                result.points.update(ids, points)
+            result.count_frame(features.stamp_ns, clock.milliseconds, track.frame_stats)
+            recorder.write(packet.imu, features)
+            progress.advance(features.stamp_ns, estimator.initialized)
+            viewer.show(packet.frame, features, state, points)
+    return result
+
+
+def _open(sequence: Sequence, config: RunConfig) -> RunResult:
+    """An empty result for the part of the sequence that is asked for."""
+    info = sequence.info()
+    start_ns = info.start_ns + round(config.start_s * 1e9)
+    if start_ns > info.end_ns:
+        length_s = (info.end_ns - info.start_ns) * 1e-9
+        raise DataError(
+            f"{info.name}: cannot start at {config.start_s:g} s, it is {length_s:.3f} s long"
+        )
+    end_ns = info.end_ns
+    if config.duration_s is not None:
+        end_ns = min(end_ns, start_ns + round(config.duration_s * 1e9))
+    rig = sequence.rig if config.cameras is None else sequence.rig.select(config.cameras)
+    return RunResult(info, config, rig, start_ns, end_ns, truth=sequence.groundtruth())
+
+
+def _packets(sequence: Sequence, result: RunResult) -> Iterator[tuple[Packet, Stopwatch]]:
+    """The packets that are asked for, each with a watch that has timed its reading."""
+    packets = sequence.packets(
+        result.start_ns if result.config.start_s > 0 else None,
+        result.end_ns if result.config.duration_s is not None else None,
+    )
+    count = len(result.rig.cameras)
+    while True:
+        clock = Stopwatch()
+        packet = next(packets, None)
+        if packet is None:
+            return
+        clock.lap("read")
+        yield Packet(packet.imu, _first_cameras(packet.frame, count)), clock
+
+
+def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:
+    """The same frame without the cameras that are not used."""
+    if isinstance(frame, CameraFrame):
+        return CameraFrame(frame.stamp_ns, frame.images[:count])
+    return FeatureFrame(frame.stamp_ns, frame.cameras[:count])
+
+
+@contextmanager
+def _watched(viewer: Viewer, result: RunResult) -> Iterator[None]:
+    """Open the viewer, and close it however the run ends."""
+    viewer.open(result.rig, result.truth_of_run())
+    try:
+        yield
+    finally:
+        viewer.close()

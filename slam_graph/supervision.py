@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Watching over a run: is the estimate sane, and how did the run end?"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from slam_graph.backend.estimator import Estimator
+from slam_graph.config import LimitsConfig
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import EstimationError, SlamGraphError
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.output.run_result import RunResult
+from slam_graph.sensors.measurements import FeatureFrame
+
+logger = logging.getLogger(__name__)
+
+
+class DivergenceError(EstimationError):
+    """The estimate left all that is possible."""
+
+
+def estimate(estimator: Estimator, features: FeatureFrame) -> NavState | None:
+    """The state at a frame.
+
+    Raises:
+        DivergenceError: if the linear algebra fails, which a sane state does not bring about.
+    """
+    try:
+        return estimator.add_frame(features)
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DivergenceError(
+            f"diverged at frame {features.stamp_ns}: the equations cannot be solved ({reason})"
+        ) from error
+
+
+def check_sane(state: NavState, limits: LimitsConfig) -> None:
+    """Refuse a state that cannot be true.
+
+    Raises:
+        DivergenceError: naming what is beyond its limit.
+    """
+    parts = (
+        state.world_T_body.matrix().ravel(),
+        state.velocity,
+        state.gyro_bias,
+        state.accel_bias,
+        np.zeros(0) if state.covariance is None else np.diag(state.covariance),
+    )
+    if not all(np.isfinite(part).all() for part in parts):
+        raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
+    sigma_m = 0.0
+    if state.covariance is not None:
+        sigma_m = float(np.sqrt(np.max(np.diag(state.covariance)[3:6])))
+    for what, value, limit in (
+        ("speed of {} m/s", float(np.linalg.norm(state.velocity)), limits.max_speed),
+        ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
+        ("gyroscope bias of {} rad/s", float(np.abs(state.gyro_bias).max()), limits.max_gyro_bias),
+        (
+            "accelerometer bias of {} m/s²",
+            float(np.abs(state.accel_bias).max()),
+            limits.max_accel_bias,
+        ),
+    ):
+        if value > limit:
+            raise DivergenceError(
+                f"diverged at frame {state.stamp_ns}: {what.format(f'{value:.3g}')} "
+                f"(the limit is {limit:g})"
+            )
+
+
+@contextmanager
+def outcome(result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> Iterator[None]:
+    """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
+    began = time.perf_counter()
+    try:
+        yield
+        _judge(result, estimator)
+    except KeyboardInterrupt as interrupt:
+        result.status, result.message = "interrupted", "interrupted before the end"
+        result.error = interrupt
+    except DivergenceError as error:
+        result.status, result.message, result.error = "diverged", str(error), error
+    except SlamGraphError as error:
+        result.status, result.message, result.error = "failed", str(error), error
+    except Exception as error:
+        logger.exception("internal error")
+        result.status, result.error = "failed", error
+        result.message = f"internal error: {type(error).__name__}: {error}"
+    result.wall_s = time.perf_counter() - began
+    result.warnings = +diagnostics.counts
+    level = logging.INFO if result.status == "ok" else logging.ERROR
+    logger.log(level, "%s", result.message or f"{result.frames} frames in {result.wall_s:.1f} s")
+
+
+def _judge(result: RunResult, estimator: Estimator) -> None:
+    """Whether a run that came to its end reached what was asked for."""
+    asked = result.config.min_coverage
+    if not estimator.initialized:
+        result.status = "not_initialized"
+        result.message = (
+            f"never initialised in {result.frames} frames: waiting for {estimator.waiting_for}"
+        )
+    elif result.coverage < asked:
+        result.status = "low_coverage"
+        result.message = (
+            f"the estimate covers {result.coverage:.1%} of the {result.recorded_s:.1f} s asked "
+            f"for, less than min_coverage = {asked:.1%}"
+        )

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Result files: whole or absent, read back as written, and a `latest` link that always works."""
+
+import csv
+import json
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam_graph.config import load_config
+from slam_graph.datasets.base import SequenceInfo
+from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.output.files import appearing, create_run_folder, link_latest, write_text
+from slam_graph.output.metrics import finite
+from slam_graph.output.point_map import PointMap, write_ply
+from slam_graph.output.run_result import RunResult
+from slam_graph.output.timing import Stopwatch, TimingLog, milliseconds
+from slam_graph.sensors.rig import Rig
+
+NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, ["old\n"])
+
+    def fail() -> None:
+        with appearing(path) as partial:
+            partial.write_text("half")
+            assert path.read_text() == "old\n"
+            raise RuntimeError("crash")
+
+    with pytest.raises(RuntimeError, match="crash"):
+        fail()
+    assert path.read_text() == "old\n"
+    write_text(path, ["new\n"])
+    assert path.read_text() == "new\n"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_run_folders_never_collide_and_latest_follows(tmp_path: Path) -> None:
+    first, second = (create_run_folder(tmp_path, "data", NOON) for _ in range(2))
+    assert first.name == "2026-03-04T12-00-00Z"
+    assert first != second
+    for folder in (first, second):
+        link = link_latest(folder)
+        assert link.resolve() == folder.resolve()
+        assert not link.readlink().is_absolute()
+    assert sorted(p.name for p in (tmp_path / "data").iterdir()) == sorted(
+        [first.name, second.name, "latest"]
+    )
+
+
+def test_a_real_folder_called_latest_is_left_alone(tmp_path: Path) -> None:
+    folder = create_run_folder(tmp_path, "data", NOON)
+    (tmp_path / "data" / "latest").mkdir()
+    with pytest.raises(DataError, match="not a link"):
+        link_latest(folder)
+
+
+def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot make a folder"):
+        create_run_folder(tmp_path / "file", "data")
+
+
+def test_timing_table_keeps_stages_that_come_late() -> None:
+    log = TimingLog()
+    log.append(1, {"read": 1.0})
+    log.append(2, {"read": 3.0, "backend": 5.0})
+    lines = list(log.csv_lines())
+    assert lines == [
+        "stamp_ns,backend_ms,read_ms\n",
+        "1,,1.0000\n",
+        "2,5.0000,3.0000\n",
+    ]
+    summary = log.summary()
+    assert (summary["read"].mean_ms, summary["read"].frames) == (2.0, 2)
+    assert (summary["backend"].median_ms, summary["backend"].frames) == (5.0, 1)
+
+
+def test_laps_of_a_stopwatch_add_up() -> None:
+    watch = Stopwatch()
+    watch.lap("read")
+    watch.lap("frontend", milliseconds({"detect_ms": 2.0, "tracked": 7}))
+    times = watch.milliseconds
+    assert times["total"] == pytest.approx(times["read"] + times["frontend"])
+    assert times["frontend.detect"] == 2.0
+    assert set(times) == {"total", "read", "frontend", "frontend.detect"}
+
+
+def test_map_keeps_the_last_estimate_and_reads_back(tmp_path: Path) -> None:
+    points = PointMap()
+    points.update(np.array([1, 2]), np.array([[0.0, 0, 0], [1, 2, 3]]))
+    points.update(np.array([1, 3]), np.array([[4.0, 5, 6], [np.nan, 0, 0]]))
+    path = tmp_path / "map.ply"
+    write_ply(path, points.points())
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    assert b"element vertex 2\n" in header
+    np.testing.assert_array_equal(
+        np.frombuffer(body, "<f8").reshape(-1, 3), [[4.0, 5, 6], [1, 2, 3]]
+    )
+
+
+def test_what_json_cannot_hold_becomes_null() -> None:
+    table = {"a": float("nan"), "b": [1.0, float("inf")], "c": {"d": (2, "x")}}
+    assert json.loads(json.dumps(finite(table), allow_nan=False)) == {
+        "a": None,
+        "b": [1.0, None],
+        "c": {"d": [2, "x"]},
+    }
+
+
+def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
+    """A result whose states are a trajectory that another system estimated."""
+    start, end = int(estimate.stamps_ns[0]), int(estimate.stamps_ns[-1])
+    info = SequenceInfo("clip", "euroc", "images", 2, len(estimate), start, end, 0, True)
+    result = RunResult(info, load_config(), Rig(()), start, end, truth=truth)
+    for index in range(len(estimate)):
+        stamp, zero = int(estimate.stamps_ns[index]), np.zeros(3)
+        covariance = np.eye(15) * 1e-4
+        result.history.append(NavState(stamp, estimate.pose(index), zero, zero, zero, covariance))
+        result.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
+    result.wall_s = 2.0
+    return result
+
+
+@pytest.mark.data
+def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
+    recording = data_dir / "euroc" / "MH_01_easy_17s"
+    truth = read_groundtruth(recording / "mav0" / "state_groundtruth_estimate0" / "data.csv")
+    estimate = read_groundtruth(recording / "peers" / "openvins_stereo.tum")
+    result = result_from(truth, estimate)
+    files = result.save(tmp_path / "out")
+    assert {path.name for path in files} == {path.name for path in (tmp_path / "out").iterdir()}
+    assert all(path.stat().st_size > 0 for path in files)
+
+    back = read_groundtruth(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_array_equal(back.stamps_ns, estimate.stamps_ns)
+    np.testing.assert_allclose(back.positions, estimate.positions, atol=1e-9)
+    with (tmp_path / "out" / "states.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(estimate)
+    assert float(rows[0]["sigma_position_body_x_m"]) == pytest.approx(0.01)
+
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["schema_version"] == 1
+    assert metrics["extent"]["coverage"] == 1.0
+    assert metrics["accuracy"]["se3"]["ate"]["translation_m"]["rmse"] < 0.0061
+    assert metrics["accuracy"]["sim3"]["scale"] == pytest.approx(1.0, abs=0.01)
+    assert metrics["accuracy"]["none"]["rpe"]["translation_m"]["rmse"] < 0.02
+    assert metrics["nees"]["alignment"] == "first_pose"
+    assert metrics["features_per_frame"] == {"tracked": 10.0}
+    assert metrics["timing"]["real_time_factor"] == pytest.approx(result.recorded_s / 2.0)
+    assert (tmp_path / "out" / "trajectory.png").read_bytes()[:4] == b"\x89PNG"
+    assert load_config(tmp_path / "out" / "config.yaml") == result.config
+
+
+def test_a_result_without_states_is_written_too(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
+    result = RunResult(info, load_config(), Rig(()), 0, 10**9)
+    result.save(tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["accuracy"] is None
+    assert metrics["extent"]["coverage"] == 0.0
+    assert metrics["extent"]["initialization_s"] is None
+    assert (tmp_path / "trajectory.tum").read_text() == ""
