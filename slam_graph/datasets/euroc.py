@@ -21,9 +21,8 @@ from slam_graph.datasets.imu_stream import clean_blocks, parse_imu_rows
 from slam_graph.datasets.packets import FrameStream
 from slam_graph.datasets.pairing import ABSENT, Groups, group_by_time
 from slam_graph.datasets.recorded import Extent, RecordedSequence
-from slam_graph.datasets.rows import count_rows, read_rows
+from slam_graph.datasets.rows import count_rows, read_rows, require_rows
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 
 STEREO_TOLERANCE_S = 0.003
@@ -73,8 +72,7 @@ class EurocSequence(RecordedSequence):
         )
         self.decode = decode
         self._imu_file = self.mav0 / "imu0" / "data.csv"
-        if count_rows(self._imu_file)[0] == 0:
-            raise DataError(f"{self._imu_file}: no IMU samples in this file")
+        require_rows(self._imu_file)
         self._folders = folders
         listed = [list_images(folder, self.diagnostics) for folder in folders]
         self._files = [names for _, names in listed]

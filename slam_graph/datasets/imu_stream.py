@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ class ImuCleaner:
     """Drops samples that cannot be used, counts them, and reports gaps.
 
     Counted kinds: `imu_not_finite`, `imu_duplicate` (the stamp of the latest sample again),
-    `imu_out_of_order` (older than the latest sample), `imu_gap`.
+    `imu_out_of_order`, `imu_gap`.
 
     Attributes:
         diagnostics: where faults are counted.
@@ -54,7 +55,7 @@ class ImuCleaner:
         for k in np.flatnonzero(wanted & ~finite):
             self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: sample dropped")
         candidates = np.flatnonzero(wanted & finite)
-        kept = candidates[self._in_order(data.stamps_ns, candidates, where)]
+        kept = self._in_order(data.stamps_ns, candidates, where)
         self._report_gaps(data.stamps_ns[kept], lambda k: where(int(kept[k])))
         return ImuData(data.stamps_ns[kept], data.gyro[kept], data.accel[kept])
 
@@ -63,17 +64,27 @@ class ImuCleaner:
         stamps_ns: NDArray[np.int64],
         candidates: NDArray[np.intp],
         where: Callable[[int], str],
-    ) -> NDArray[np.bool_]:
-        """Which candidates are newer than all before them."""
+    ) -> NDArray[np.intp]:
+        """The candidates without those that break the order of time.
+
+        Of two samples in the wrong order the second goes, unless it continues the samples before
+        them: then the first one had a stamp from the future, which must not block all that follow.
+        """
+        latest = np.iinfo(np.int64).min if self.latest_ns is None else self.latest_ns
         stamps = stamps_ns[candidates]
-        before = np.iinfo(np.int64).min if self.latest_ns is None else self.latest_ns
-        latest = np.maximum.accumulate(np.concatenate([[before], stamps]))[:-1]
-        for k in np.flatnonzero(stamps <= latest):
-            kind = "imu_duplicate" if stamps[k] == latest[k] else "imu_out_of_order"
-            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]}"
-            self.diagnostics.warn(kind, f"{sample} dropped, it follows {latest[k]}")
-        newer: NDArray[np.bool_] = stamps > latest
-        return newer
+        if np.all(stamps[1:] > stamps[:-1]) and not np.any(stamps[:1] <= latest):
+            return candidates
+        kept = []
+        times = stamps.tolist()
+        for k, (stamp, following) in enumerate(pairwise([*times, times[-1] + 1])):
+            if stamp <= latest or latest < following < stamp:
+                kind = "imu_duplicate" if stamp == latest else "imu_out_of_order"
+                sample = f"{where(int(candidates[k]))}: sample at {stamp}"
+                self.diagnostics.warn(kind, f"{sample} dropped, the one before it is at {latest}")
+                continue
+            latest = stamp
+            kept.append(k)
+        return candidates[kept]
 
     def _report_gaps(self, stamps: NDArray[np.int64], where: Callable[[int], str]) -> None:
         if len(stamps) == 0:

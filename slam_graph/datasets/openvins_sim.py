@@ -25,6 +25,7 @@ from slam_graph.datasets.rows import (
     count_rows,
     parse,
     read_rows,
+    require_rows,
     stamp_from_seconds,
     stamps_from_seconds,
 )
@@ -81,8 +82,7 @@ class OpenvinsSimulation(RecordedSequence):
         self._own_groundtruth = own if groundtruth is None and own.is_file() else None
         self._tracks, self._imu_file = path / "tracks.csv", path / "imu.csv"
         for file in (self._tracks, self._imu_file):
-            if next(read_rows(file, 2), None) is None:
-                raise DataError(f"{file}: no data rows in this file")
+            require_rows(file)
 
     @property
     def has_groundtruth(self) -> bool:

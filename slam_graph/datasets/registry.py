@@ -52,9 +52,7 @@ class Format:
 
 
 def _is_euroc(path: Path) -> bool:
-    return any((folder / "imu0").is_dir() for folder in (path, path / "mav0")) or (
-        (path / "mav0").is_dir()
-    )
+    return (path / "mav0").is_dir() or (path / "imu0").is_dir()
 
 
 def _is_openvins_sim(path: Path) -> bool:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -106,12 +107,20 @@ def parse(
         for k, line in enumerate(rows.lines):
             try:
                 _loadtxt([line], dtype, columns, delimiter)
-            except ValueError:
+            except ValueError as error:
                 raise DataError(
-                    f"{rows.where(k)}: cannot read '{line.strip()[:100]}' as {what}; "
-                    "correct or remove this row"
+                    f"{rows.where(k)}: {_reason(str(error), line)}; expected {what}"
                 ) from None
         raise
+
+
+def _reason(message: str, line: str) -> str:
+    """What NumPy did not like about a row, in our words."""
+    cell = re.search(r"string '(.*)' to (\w+) at row \d+, column (\d+)", message)
+    if cell is None:
+        return f"cannot read the row '{line.strip()[:80]}'"
+    kind = "an integer" if cell[2].startswith("int") else "a number"
+    return f"'{cell[1]}' in column {cell[3]} is not {kind}"
 
 
 def _loadtxt(
@@ -153,6 +162,12 @@ def stamps_from_seconds(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int
     )
     stamps = [stamp_from_seconds(texts[k], rows, int(k)) for k in first]
     return np.repeat(np.array(stamps, np.int64), np.diff(first, append=len(texts)))
+
+
+def require_rows(path: Path) -> None:
+    """Refuse a file that cannot be read or has no data rows."""
+    if next(read_rows(path, 2), None) is None:
+        raise DataError(f"{path}: no data rows in this file")
 
 
 def count_rows(path: Path) -> tuple[int, str, str]:
