@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The front end of recordings that hold feature tracks: it hands them on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
+from slam_graph.sensors.rig import Rig
+
+
+class ReplayFrontend:
+    """Hands on recorded features, except those that were dropped.
+
+    Attributes:
+        frame_stats: `tracked`, `new` and `dropped` features of the last frame.
+    """
+
+    def __init__(
+        self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
+    ) -> None:
+        """Prepare for the first frame; only the number of cameras of the rig matters."""
+        self._cameras = len(rig.cameras)
+        self._seen = np.zeros(0, np.int64)
+        self._dropped = np.zeros(0, np.int64)
+        self.frame_stats: dict[str, float] = {}
+
+    def track(self, frame: CameraFrame | FeatureFrame) -> FeatureFrame:
+        """The recorded features.
+
+        Raises:
+            DataError: if the frame holds images, or features of another number of cameras.
+        """
+        if isinstance(frame, CameraFrame):
+            raise DataError(f"frame {frame.stamp_ns} holds images, not recorded features")
+        if len(frame.cameras) != self._cameras:
+            raise DataError(
+                f"frame {frame.stamp_ns} has features of {len(frame.cameras)} cameras, the rig has "
+                f"{self._cameras}"
+            )
+        ids = np.unique(np.concatenate([c.ids for c in frame.cameras]))
+        dropped = np.isin(ids, self._dropped)
+        self.frame_stats = {
+            "tracked": float(np.count_nonzero(np.isin(ids[~dropped], self._seen))),
+            "new": float(np.count_nonzero(~np.isin(ids[~dropped], self._seen))),
+            "dropped": float(np.count_nonzero(dropped)),
+        }
+        self._seen = ids
+        if not dropped.any():
+            return frame
+        return FeatureFrame(
+            frame.stamp_ns, tuple(_without(c, self._dropped) for c in frame.cameras)
+        )
+
+    def drop(self, ids: NDArray[np.int64]) -> None:
+        """Do not report these features any more."""
+        self._dropped = np.union1d(self._dropped, ids)
+
+
+def _without(features: FeatureObservations, ids: NDArray[np.int64]) -> FeatureObservations:
+    keep = ~np.isin(features.ids, ids)
+    return FeatureObservations(features.ids[keep], features.pixels[keep], features.normalized[keep])
