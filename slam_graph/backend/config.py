@@ -56,13 +56,13 @@ class ZeroVelocityConfig(Settings):
     enabled: bool = True
     """Whether standing still is detected and used."""
     window_s: float = Field(0.5, gt=0)
-    """Length of the IMU window that is examined."""
-    max_gyro_std: float = Field(0.01, gt=0)
+    """Length of the window over which nothing may have moved."""
+    max_gyro_std: float = Field(0.2, gt=0)
     """Largest standard deviation of the angular rate, rad/s."""
-    max_accel_std: float = Field(0.15, gt=0)
+    max_accel_std: float = Field(2.5, gt=0)
     """Largest standard deviation of the specific force, m/s²."""
     max_disparity_px: float = Field(0.5, gt=0)
-    """Largest median motion of the features between two frames."""
+    """Largest median motion of the features over the window, and between two frames."""
     velocity_sigma: float = Field(0.01, gt=0)
     """How still a still platform is: standard deviation of its velocity, m/s."""
     position_sigma: float = Field(1e-3, gt=0)
@@ -97,8 +97,24 @@ class InitializationConfig(Settings):
     """How long the platform must stand still for a static start."""
     motion_window_s: float = Field(1.5, gt=0)
     """Length of the visual-inertial alignment of a start in motion."""
+    frame_spacing_s: float = Field(0.1, gt=0)
+    """Time between the frames that the alignment uses."""
+    retry_s: float = Field(0.2, ge=0)
+    """Time between two attempts to start in motion."""
+    features: int = Field(150, ge=10)
+    """How many features the alignment uses at most (the longest tracks)."""
+    min_features: int = Field(10, ge=5)
+    """How many features must fit the solution of a start in motion."""
+    max_normalized_cost: float = Field(3.0, gt=0)
+    """Largest mean squared residual of a start in motion, in squared standard deviations."""
+    max_velocity_sigma: float = Field(0.1, gt=0)
+    """How well a start in motion must know the velocity, m/s."""
     prior: PriorConfig = PriorConfig()
     """Uncertainty of the first state of a static start."""
+    motion_prior: PriorConfig = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
+    """Uncertainty of the guess that a start in motion refines."""
+    fix_gauge: bool = True
+    """Take the position and yaw of the first state as the definition of the world frame."""
 
 
 class BackendConfig(Settings):

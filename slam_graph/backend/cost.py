@@ -111,11 +111,14 @@ class Cost:
         layout = self.layout()
         return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
 
-    def error(self) -> float:
-        """Half the squared norm of all whitened residuals at the current estimates."""
+    def error(self, linear: Linearization) -> float:
+        """Half the squared norm of all whitened residuals at the current estimates.
+
+        Args:
+            linear: of this cost at the current estimates.
+        """
         total = 0.5 * float(np.sum(self.prior_at_estimate().Rd[:, -1] ** 2))
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
-        linear = self.linearize()
         if linear.tracked is not None:
             total += 0.5 * float(np.sum(linear.tracked.r**2))
         if linear.fresh is not None:
@@ -179,6 +182,15 @@ class Cost:
             step = linear.fresh.point_increments(delta[poses])
             self.fresh = replace(self.fresh, points=self.fresh.points + step)
         self.state.update(layout, delta)
+
+    def snapshot(self) -> tuple[State, NewFeatures | None]:
+        """What `apply` changes, to be given back to `restore`."""
+        return self.state.copy(), self.fresh
+
+    def restore(self, before: tuple[State, NewFeatures | None]) -> None:
+        """Undo what was applied since a snapshot."""
+        self.state.assign(before[0])
+        self.fresh = before[1]
 
     # --- gating --------------------------------------------------------------------------------
 

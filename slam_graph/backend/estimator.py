@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import B, L, X
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
@@ -27,15 +27,16 @@ from slam_graph.backend.imu import (
     preintegrate,
     preintegration_params,
 )
+from slam_graph.backend.initialization import Initializer, Start, current_covariance, start_from
 from slam_graph.backend.marginalization import marginalize
 from slam_graph.backend.policies import POSE_CHOICES, AlgorithmConfig
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
-from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import State, dims_of, imu_state_keys, stacked_poses
-from slam_graph.backend.tracks import Observations, TrackWindow
+from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.state import State, imu_state_keys, stacked_poses
+from slam_graph.backend.tracks import TrackWindow, is_in
 from slam_graph.backend.triangulation import triangulate
-from slam_graph.backend.zero_velocity import ZeroVelocityDetector, zero_velocity_factors
+from slam_graph.backend.zero_velocity import StandstillDetector, zero_velocity_factors
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
@@ -74,13 +75,17 @@ class Estimator:
         self._choose_poses = POSE_CHOICES[algorithm.cost.past_poses]
         self._time_offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
         self._imu = ImuBuffer()
-        self._standstill = ZeroVelocityDetector(self.config.zero_velocity, rig)
+        self._standstill = StandstillDetector(self.config.zero_velocity)
+        self._still = False
         self._state = State()
         self._tracks = TrackWindow()
         self._prior = SquareRootInformation.empty()
         self._current: NavState | None = None
         self._frame = -1
         self._past: list[int] = []
+        self._initializer: Initializer | None = Initializer(
+            self._projection, self._params, algorithm, self.config
+        )
         self._features = np.zeros(0, np.int64)  # ids of the features in the state, ascending
 
     # --- the outside -----------------------------------------------------------------------------
@@ -101,15 +106,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        self._frame = 0
-        self._current = state
-        self._state.insert_imu_state(0, state)
-        keys = imu_state_keys(0)
-        self._state.freeze(keys)
-        R = np.linalg.cholesky(np.linalg.inv(state.covariance)).T
-        Rd = np.zeros((len(R) + 1, len(R) + 1), order="F")
-        Rd[:-1, :-1] = R
-        self._prior = SquareRootInformation(Layout(dims_of(keys)), Rd)
+        self._adopt(start_from(state, self.config))
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given."""
@@ -122,11 +119,13 @@ class Estimator:
             The causal estimate with its covariance, or None as long as there is no state.
         """
         stamp_ns = frame.stamp_ns + self._time_offset_ns
+        self._still = self._standstill.is_still(self._imu, stamp_ns, frame)
+        if self._current is None:
+            self._try_to_start(stamp_ns, frame)
+        elif stamp_ns > self._current.stamp_ns:
+            self._current = self._step(stamp_ns, frame)
         if self._current is None:
             return None
-        if stamp_ns <= self._current.stamp_ns:
-            return None
-        self._current = self._step(stamp_ns, frame)
         self._imu.forget_before(stamp_ns - round(2e9))
         return replace(self._current, stamp_ns=frame.stamp_ns)
 
@@ -134,6 +133,21 @@ class Estimator:
         """Ids (N,) and world positions (N, 3) of the features in the state."""
         points = [self._state.estimate.atPoint3(L(j)) for j in self._features.tolist()]
         return self._features, np.array(points).reshape(-1, 3)
+
+    def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> None:
+        assert self._initializer is not None
+        start = self._initializer.try_to_start(
+            self._imu, stamp_ns, frame, self._standstill.since_ns
+        )
+        self.waiting_for = self._initializer.waiting_for
+        if start is not None:
+            self._adopt(start)
+
+    def _adopt(self, start: Start) -> None:
+        """Go on from a start."""
+        self._current, self._frame = start.current, start.frame
+        self._state, self._prior, self._features = start.state, start.prior, start.features
+        self._initializer = None
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -152,7 +166,7 @@ class Estimator:
             keep += [X(i) for i in keep_poses] + list(imu_state_keys(self._frame))
             self._prior = marginalize(posterior, self._state, keep, self.algorithm.marginalization)
             self._forget(keep_poses, cost)
-        return self._state.nav_state(self._frame, stamp_ns, self._current_covariance())
+        return self._state.nav_state(self._frame, stamp_ns, current_covariance(self._prior))
 
     @contextmanager
     def _timed(self, module: str) -> Iterator[None]:
@@ -167,14 +181,15 @@ class Estimator:
         assert self._current is not None
         previous = self._state.nav_state(self._frame, self._current.stamp_ns, None)
         samples = self._imu.between(previous.stamp_ns, stamp_ns)
-        pim = preintegrate(samples, self._state.estimate.atConstantBias(B(self._frame)), self._params)
+        pim = preintegrate(
+            samples, self._state.estimate.atConstantBias(B(self._frame)), self._params
+        )
         i, j = self._frame, self._frame + 1
         self._state.insert_imu_state(j, predict(previous, pim, stamp_ns))
         self._tracks.add(j, frame)
         self._past.append(i)
         self._frame = j
         factors: list[gtsam.NonlinearFactor] = [imu_factor(i, j, pim)]
-        self._still = self._standstill.is_still(self._imu, stamp_ns, frame)
         if self._still:
             factors += zero_velocity_factors(i, j, self.config.zero_velocity)
         return factors
@@ -215,10 +230,8 @@ class Estimator:
             return None
         obs = self._tracks.observations(ids)
         rotations, positions = stacked_poses(self._state.estimate, obs.frames)
-        result = triangulate(
-            obs, self._projection, rotations, positions, self.config.triangulation
-        )
-        lasting = np.isin(ids, choice.lasting)
+        result = triangulate(obs, self._projection, rotations, positions, self.config.triangulation)
+        lasting = is_in(ids, choice.lasting)
         self._tracks.consume(ids[~lasting])
         self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~result.good & ~lasting))
         fresh = NewFeatures(obs, result.points, lasting)
@@ -259,14 +272,5 @@ class Estimator:
 
     def _forget(self, keep_poses: list[int], cost: Cost) -> None:
         """Drop the observations of the frames that left."""
-        for index in list(self._tracks.frames):
-            if index != self._frame and index not in keep_poses:
-                self._tracks.remove_frame(index)
+        self._tracks.retain([*keep_poses, self._frame])
         self._past = list(keep_poses)
-
-    def _current_covariance(self) -> FloatArray:
-        """Covariance (15, 15) of the current IMU state, the last columns of the prior."""
-        last = SquareRootInformation(
-            Layout(dims_of(imu_state_keys(self._frame))), self._prior.Rd[-16:, -16:]
-        )
-        return last.covariance()

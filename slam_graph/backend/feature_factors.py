@@ -120,23 +120,41 @@ def robust_weights(error: FloatArray, gating: GatingConfig) -> FloatArray:
 def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:
     """Stack the observations of each feature and eliminate its position by Householder QR."""
     J, F = len(obs.ids), len(obs.frames)
-    counts, slots = obs.counts, obs.slots
-    M = int(counts.max(initial=2))
-    H_f, H_x, r = np.zeros((J, M, 2, 3)), np.zeros((J, M, 2, F, 6)), np.zeros((J, M, 2))
-    H_f[obs.feature, slots] = linear.by_point
-    H_x[obs.feature, slots, :, obs.frame] = linear.by_pose
-    r[obs.feature, slots] = linear.r
-    A, B = H_f.reshape(J, 2 * M, 3), H_x.reshape(J, 2 * M, 6 * F)
-    b = r.reshape(J, 2 * M, 1)
-    _householder(A, (B, b))
-    b = b[:, :, 0]
-    return ReducedFeatures(
-        np.triu(A[:, :3]), B[:, :3], b[:, :3], B[:, 3:], b[:, 3:], 2 * counts - 3
-    )
+    by_poses = np.zeros((len(obs), 2, F, 6))
+    by_poses[np.arange(len(obs)), :, obs.frame] = linear.by_pose
+    others = np.concatenate([by_poses.reshape(-1, 2, 6 * F), linear.r[:, :, None]], axis=2)
+    R_f, rest = eliminate_points(obs, linear.by_point, others)
+    H, r = rest[:, :, :-1], rest[:, :, -1]
+    return ReducedFeatures(R_f, H[:, :3], r[:, :3], H[:, 3:], r[:, 3:], 2 * obs.counts - 3)
 
 
-def _householder(A: FloatArray, others: tuple[FloatArray, ...]) -> None:
-    """Triangularise A (J, m, 3) in place and apply the same reflections to others (J, m, n)."""
+def eliminate_points(
+    obs: Observations, by_point: FloatArray, others: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Stack the rows of each feature and triangularise the coefficients of its position.
+
+    Args:
+        obs: N observations of J features.
+        by_point: (N, 2, 3) coefficients of the feature of each observation.
+        others: (N, 2, n) all other coefficients.
+
+    Returns:
+        R: (J, 3, 3) upper triangular coefficients of the features in the first three rows.
+        rest: (J, 2 M, n) the other coefficients in all rows, M the largest number of observations;
+            the rows from the fourth on do not contain the feature, unused ones are zero.
+    """
+    J, M, slots = len(obs.ids), int(obs.counts.max(initial=2)), obs.slots
+    A = np.zeros((J, M, 2, 3))
+    A[obs.feature, slots] = by_point
+    B = np.zeros((J, M, 2, others.shape[2]))
+    B[obs.feature, slots] = others
+    A, B = A.reshape(J, 2 * M, 3), B.reshape(J, 2 * M, -1)
+    _householder(A, B)
+    return np.triu(A[:, :3]), B
+
+
+def _householder(A: FloatArray, B: FloatArray) -> None:
+    """Triangularise A (J, m, 3) in place and apply the same reflections to B (J, m, n)."""
     for column in range(3):
         x = A[:, column:, column]
         norm = np.linalg.norm(x, axis=1)
@@ -144,7 +162,7 @@ def _householder(A: FloatArray, others: tuple[FloatArray, ...]) -> None:
         v[:, 0] += np.where(x[:, 0] >= 0, norm, -norm)
         scale = np.einsum("ji,ji->j", v, v)
         beta = 2.0 / np.where(scale > 0, scale, np.inf)
-        for target in (A, *others):
+        for target in (A, B):
             part = target[:, column:]
             projection = (v[:, None, :] @ part) * beta[:, None, None]
             part -= v[:, :, None] * projection

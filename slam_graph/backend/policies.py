@@ -59,7 +59,12 @@ class GaussNewtonPolicy(Settings):
     """Module 2: how the cost is minimised."""
 
     max_steps: int = Field(1, ge=1)
-    """Number of Gauss-Newton steps."""
+    """Number of steps at most."""
+    tolerance: float = Field(1e-6, ge=0)
+    """Steps end when no tangent moves by more (with damping: when the cost falls by less, relative
+    to its value)."""
+    damping: Literal["none", "levenberg_marquardt"] = "none"
+    """Plain Gauss-Newton, or Levenberg-Marquardt."""
 
 
 class MarginalizationPolicy(Settings):

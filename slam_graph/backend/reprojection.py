@@ -63,9 +63,7 @@ class RigProjection:
         difference = in_body - self.body_p_camera[obs.camera]
         return np.einsum("nji,nj->ni", self.body_R_camera[obs.camera], difference)
 
-    def pixels(
-        self, obs: Observations, in_camera: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def pixels(self, obs: Observations, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""
         depth = np.maximum(in_camera[:, 2:3], MIN_DEPTH)
         normalized = in_camera[:, :2] / depth

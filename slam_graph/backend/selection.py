@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.backend.policies import CostPolicy
-from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.tracks import TrackWindow, is_in
 
 IntArray = NDArray[np.int64]
 
@@ -49,13 +49,13 @@ def choose_features(
         policy: limits.
     """
     ids, lengths = tracks.lengths()
-    live = np.isin(ids, tracks.ids_in(current), assume_unique=True)
+    live = is_in(ids, tracks.ids_in(current))
     due = ~live
     if oldest_leaving is not None:
-        due |= np.isin(ids, tracks.ids_in(oldest_leaving), assume_unique=True)
+        due |= is_in(ids, tracks.ids_in(oldest_leaving))
     lasting = live & (lengths >= policy.state_feature_frames)
     chosen = _longest(ids[lasting], lengths[lasting], room)
-    due &= (lengths >= MIN_FRAMES) & ~np.isin(ids, chosen, assume_unique=True)
+    due &= (lengths >= MIN_FRAMES) & ~is_in(ids, chosen)
     ended = _longest(ids[due], lengths[due], policy.max_features_per_step)
     return FeatureChoice(ended, chosen)
 

@@ -57,6 +57,18 @@ class State:
         self.offsets: dict[int, FloatArray] = {}
         self.frozen: set[int] = set()
 
+    def copy(self) -> State:
+        """An independent copy."""
+        other = State()
+        other.assign(self)
+        return other
+
+    def assign(self, other: State) -> None:
+        """Take over all values of another state."""
+        self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
+        self.offsets = {key: offset.copy() for key, offset in other.offsets.items()}
+        self.frozen = set(other.frozen)
+
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
+from slam_graph.sensors.measurements import FeatureFrame
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -81,90 +81,91 @@ class Observations:
 
 
 class TrackWindow:
-    """Feature frames of the poses in the cost, and which of their observations are still unused.
+    """The observations of the frames in the cost that have not been used yet.
 
     Every observation enters the cost once: `consume` forgets those that have become part of the
-    prior.
+    prior. Rows are sorted by feature, then frame, then camera.
     """
 
     def __init__(self) -> None:
-        self.frames: dict[int, tuple[FeatureObservations, ...]] = {}
+        self._ids = np.zeros(0, np.int64)
+        self._frames = np.zeros(0, np.int64)
+        self._cameras = np.zeros(0, np.int64)
+        self._pixels = np.zeros((0, 2))
+        self._normalized = np.zeros((0, 2))
 
     def add(self, index: int, frame: FeatureFrame) -> None:
-        """Add the observations of a new frame."""
-        self.frames[index] = tuple(_sorted(camera) for camera in frame.cameras)
+        """Add the observations of a new frame, later than all before."""
+        cameras = frame.cameras
+        ids = np.concatenate([self._ids, *(c.ids for c in cameras)])
+        count = len(ids) - len(self._ids)
+        numbers = [np.full(len(c), number) for number, c in enumerate(cameras)]
+        order = np.argsort(ids, kind="stable")
+        self._ids = ids[order]
+        self._frames = np.concatenate([self._frames, np.full(count, index)])[order]
+        self._cameras = np.concatenate([self._cameras, *numbers])[order]
+        self._pixels = np.concatenate([self._pixels, *(c.pixels for c in cameras)])[order]
+        self._normalized = np.concatenate([self._normalized, *(c.normalized for c in cameras)])[
+            order
+        ]
 
-    def remove_frame(self, index: int) -> None:
-        """Forget a frame."""
-        self.frames.pop(index, None)
+    def retain(self, frames: Sequence[int]) -> None:
+        """Forget the observations of all other frames."""
+        self._select(np.isin(self._frames, frames))
 
     def consume(self, ids: IntArray) -> None:
-        """Forget all observations of some features (sorted ids)."""
-        if len(ids) == 0:
+        """Forget all observations of some features (ascending ids)."""
+        if len(ids):
+            self._select(~is_in(self._ids, ids))
+
+    def _select(self, rows: NDArray[np.bool_]) -> None:
+        if rows.all():
             return
-        for index, cameras in self.frames.items():
-            self.frames[index] = tuple(
-                _select(camera, ~np.isin(camera.ids, ids, assume_unique=True)) for camera in cameras
-            )
+        self._ids, self._frames, self._cameras = (
+            self._ids[rows],
+            self._frames[rows],
+            self._cameras[rows],
+        )
+        self._pixels, self._normalized = self._pixels[rows], self._normalized[rows]
 
     def ids_in(self, index: int) -> IntArray:
-        """The features seen in one frame by any camera, ascending."""
-        ids = [camera.ids for camera in self.frames.get(index, ())]
-        return np.unique(np.concatenate(ids)) if ids else np.zeros(0, np.int64)
+        """The features that any camera saw in one frame, ascending."""
+        return sorted_unique(self._ids[self._frames == index])
 
     def lengths(self) -> tuple[IntArray, IntArray]:
         """All features with unused observations (J,), and the number of frames that see each."""
-        seen = [self.ids_in(index) for index in self.frames]
-        if not seen:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        return np.unique(np.concatenate(seen), return_counts=True)
+        new_frame = np.ones(len(self._ids), np.bool_)
+        new_frame[1:] = (np.diff(self._ids) != 0) | (np.diff(self._frames) != 0)
+        return np.unique(self._ids[new_frame], return_counts=True)
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
-        """The unused observations of some features (sorted ids) in some frames (default: all)."""
-        order = tuple(sorted(self.frames if frames is None else frames))
-        parts: list[tuple[IntArray, IntArray, IntArray, FloatArray, FloatArray]] = []
-        for position, index in enumerate(order):
-            for number, camera in enumerate(self.frames[index]):
-                _, rows, there = np.intersect1d(
-                    ids, camera.ids, assume_unique=True, return_indices=True
-                )
-                n = len(rows)
-                parts.append(
-                    (
-                        rows,
-                        np.full(n, position),
-                        np.full(n, number),
-                        camera.pixels[there],
-                        camera.normalized[there],
-                    )
-                )
-        feature = np.concatenate([p[0] for p in parts]) if parts else np.zeros(0, np.int64)
-        by_feature = np.argsort(feature, kind="stable")
-
-        def column(k: int) -> NDArray[np.float64]:
-            return np.concatenate([p[k] for p in parts])[by_feature]
-
-        if not parts:
-            empty = np.zeros(0, np.int64)
-            return Observations(
-                ids, order, empty, empty, empty, np.zeros((0, 2)), np.zeros((0, 2))
-            )
+        """The unused observations of some features (ascending ids) in some frames (default: all)."""
+        rows = is_in(self._ids, ids)
+        if frames is not None:
+            rows &= np.isin(self._frames, frames)
+        numbers = self._frames[rows]
+        order = np.unique(numbers)
         return Observations(
             ids,
-            order,
-            feature[by_feature],
-            column(1).astype(np.int64),
-            column(2).astype(np.int64),
-            column(3),
-            column(4),
+            tuple(order.tolist()),
+            np.searchsorted(ids, self._ids[rows]),
+            np.searchsorted(order, numbers),
+            self._cameras[rows],
+            self._pixels[rows],
+            self._normalized[rows],
         )
 
 
-def _sorted(camera: FeatureObservations) -> FeatureObservations:
-    return _select(camera, np.argsort(camera.ids, kind="stable"))
+def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
+    """Which values (N,) are among some ascending ones."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    place = np.minimum(np.searchsorted(ascending, values), len(ascending) - 1)
+    return np.asarray(ascending[place] == values)
 
 
-def _select(
-    camera: FeatureObservations, rows: NDArray[np.bool_] | NDArray[np.intp]
-) -> FeatureObservations:
-    return FeatureObservations(camera.ids[rows], camera.pixels[rows], camera.normalized[rows])
+def sorted_unique(values: IntArray) -> IntArray:
+    """The distinct values of an ascending array."""
+    first = np.ones(len(values), np.bool_)
+    first[1:] = values[1:] != values[:-1]
+    return values[first]

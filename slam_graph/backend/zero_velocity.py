@@ -3,11 +3,15 @@
 """Standing still: how it is detected, and the factors that say so.
 
 While a platform stands still a monocular system sees neither scale nor accelerometer bias, and
-errors of the tracks would drive it away. Both the IMU and the images must agree that nothing moves:
-the IMU alone cannot tell standing still from slow even motion, nor the images from a far scene.
+errors of the tracks would drive it away. Both the images and the IMU must agree that nothing moves:
+the images alone cannot tell standing still from slow motion before a far scene, nor the IMU from
+slow even motion. The images are compared over the whole window, so that a hovering platform, which
+drifts, is told from one on the ground; running motors on the ground may shake the IMU.
 """
 
 from __future__ import annotations
+
+from collections import deque
 
 import gtsam
 import numpy as np
@@ -16,30 +20,53 @@ from gtsam.symbol_shorthand import V, X
 from slam_graph.backend.config import ZeroVelocityConfig
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-from slam_graph.sensors.rig import Rig
 
 MIN_FEATURES = 5
 """Fewer common features than this say nothing about the motion of the image."""
 
 
-class ZeroVelocityDetector:
-    """Decides for each frame whether the platform has stood still since the one before."""
+class StandstillDetector:
+    """Decides for each frame whether the platform has stood still for a while.
 
-    def __init__(self, config: ZeroVelocityConfig, rig: Rig) -> None:
+    Attributes:
+        since_ns: stamp of the first frame of the current standstill, None while moving.
+    """
+
+    def __init__(self, config: ZeroVelocityConfig) -> None:
         self.config = config
-        self._reference: FeatureObservations | None = None
+        self.since_ns: int | None = None
+        self._recent: deque[tuple[int, FeatureObservations]] = deque()
 
     def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
-        """Whether IMU and images agree that nothing has moved."""
-        previous, self._reference = self._reference, frame.cameras[0]
-        if not self.config.enabled or previous is None:
-            return False
-        return self._imu_is_still(imu, stamp_ns) and (
-            _median_motion_px(previous, frame.cameras[0]) < self.config.max_disparity_px
-        )
+        """Whether IMU and images agree that nothing has moved over the window.
 
-    def _imu_is_still(self, imu: ImuBuffer, stamp_ns: int) -> bool:
+        Args:
+            imu: samples up to the frame.
+            stamp_ns: time of the frame on the clock of the IMU.
+            frame: compared by the features of its first camera.
+        """
         start_ns = stamp_ns - round(self.config.window_s * 1e9)
+        self._recent.append((stamp_ns, frame.cameras[0]))
+        while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
+            self._recent.popleft()
+        still = (
+            self.config.enabled
+            and self._recent[0][0] <= start_ns
+            and self._images_are_still()
+            and self._imu_is_calm(imu, start_ns, stamp_ns)
+        )
+        if not still:
+            self.since_ns = None
+        elif self.since_ns is None:
+            self.since_ns = self._recent[0][0]
+        return still
+
+    def _images_are_still(self) -> bool:
+        now = self._recent[-1][1]
+        references = (self._recent[0][1], self._recent[-2][1])
+        return all(_median_motion_px(r, now) < self.config.max_disparity_px for r in references)
+
+    def _imu_is_calm(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
         if not imu.covers(start_ns):
             return False
         recent = imu.between(start_ns, stamp_ns)

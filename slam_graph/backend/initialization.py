@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Start-up: the first states and the prior that the loop goes on from.
+
+A start is tried at every frame until one succeeds: from standing still, or in motion. A start in
+motion is a batch problem over a short window under the engine's own cost, steps and
+marginalization; only its first guess is special.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.cost import Cost, NewFeatures
+from slam_graph.backend.gauss_newton import minimize
+from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
+from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.motion_start import StartWindow, guess_states
+from slam_graph.backend.policies import AlgorithmConfig, GaussNewtonPolicy
+from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.square_root import Layout, SquareRootInformation
+from slam_graph.backend.state import State, dims_of, imu_state_keys, stacked_poses
+from slam_graph.backend.static_start import fix_gauge, prior_covariance, state_at_rest
+from slam_graph.backend.tracks import TrackWindow, is_in, sorted_unique
+from slam_graph.backend.triangulation import triangulate
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import FeatureFrame
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
+"""How the window of a start in motion is solved."""
+FINAL = GaussNewtonPolicy(max_steps=1)
+OUTLIER_PX = 3.0
+"""Features with a larger root mean square reprojection error leave the window, in units of σ."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """What the loop needs to go on.
+
+    Attributes:
+        current: state of the last frame.
+        frame: its index.
+        state: variables.
+        prior: their prior.
+        features: ids (N,) of the features in the state, ascending.
+    """
+
+    current: NavState
+    frame: int
+    state: State
+    prior: SquareRootInformation
+    features: IntArray
+
+
+def start_from(given: NavState, config: BackendConfig) -> Start:
+    """Start from a state with a covariance."""
+    if config.initialization.fix_gauge:
+        given = fix_gauge(given, config.initialization.prior)
+    state = State()
+    state.insert_imu_state(0, given)
+    state.freeze(imu_state_keys(0))
+    return Start(given, 0, state, _prior_of(given), np.zeros(0, np.int64))
+
+
+def _prior_of(given: NavState) -> SquareRootInformation:
+    assert given.covariance is not None
+    Rd = np.zeros((16, 16), order="F")
+    Rd[:-1, :-1] = np.linalg.cholesky(np.linalg.inv(given.covariance)).T
+    return SquareRootInformation(Layout(dims_of(imu_state_keys(0))), Rd)
+
+
+class Initializer:
+    """Collects frames and tries to start from them.
+
+    Attributes:
+        waiting_for: why there is no start yet.
+    """
+
+    def __init__(
+        self,
+        rig: RigProjection,
+        params: gtsam.PreintegrationCombinedParams,
+        algorithm: AlgorithmConfig,
+        config: BackendConfig,
+    ) -> None:
+        self.waiting_for = "the first frames"
+        self._rig = rig
+        self._params = params
+        self._algorithm = algorithm
+        self._config = config
+        self._stamps_ns: list[int] = []
+        self._frames: list[FeatureFrame] = []
+        self._tried_ns = 0
+
+    def try_to_start(
+        self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame, still_since_ns: int | None
+    ) -> Start | None:
+        """Take the next frame and start if it is possible.
+
+        Args:
+            imu: samples up to the frame.
+            stamp_ns: time of the frame on the clock of the IMU.
+            frame: its features.
+            still_since_ns: since when the platform stands still, None if it moves.
+        """
+        mode = self._config.initialization.mode
+        outcome: Start | str = "a state to start from (mode 'given')"
+        if mode in ("auto", "static"):
+            outcome = self._at_rest(imu, stamp_ns, still_since_ns)
+        if mode in ("auto", "motion") and isinstance(outcome, str):
+            outcome = self._in_motion(imu, stamp_ns, frame)
+        if isinstance(outcome, str):
+            self.waiting_for = outcome
+            return None
+        return outcome
+
+    def _at_rest(self, imu: ImuBuffer, stamp_ns: int, since_ns: int | None) -> Start | str:
+        start = self._config.initialization
+        needed_ns = round(start.static_window_s * 1e9)
+        if since_ns is None or stamp_ns - since_ns < needed_ns:
+            return f"a still period of {start.static_window_s:g} s"
+        samples = imu.between(since_ns, stamp_ns)
+        return start_from(state_at_rest(samples, stamp_ns, start.prior), self._config)
+
+    def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Start | str:
+        start = self._config.initialization
+        length_ns = round(start.motion_window_s * 1e9)
+        if imu.covers(stamp_ns):
+            self._stamps_ns.append(stamp_ns)
+            self._frames.append(frame)
+        while self._stamps_ns and self._stamps_ns[0] < stamp_ns - length_ns - round(1e8):
+            del self._stamps_ns[0], self._frames[0]
+        if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
+            return f"{start.motion_window_s:g} s of frames with IMU samples"
+        if stamp_ns - self._tried_ns < round(start.retry_s * 1e9):
+            return self.waiting_for
+        self._tried_ns = stamp_ns
+        window = StartWindow.thinned(self._stamps_ns, self._frames, start.frame_spacing_s)
+        guess = guess_states(window, imu, self._rig, self._params, self._config.noise.gravity)
+        return guess if isinstance(guess, str) else self._refined(window, guess, imu)
+
+    # --- the batch problem of a start in motion ---------------------------------------------------
+
+    def _refined(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Start | str:
+        """Solve the window by the engine and marginalise all but its last state."""
+        cost = self._batch_cost(window, guess, imu)
+        try:
+            minimize(cost, BATCH)
+            if not self._without_outliers(cost):
+                return "features that fit the motion"
+            minimize(cost, BATCH)
+            features = self._keep_features(cost, window)
+            posterior = minimize(cost, FINAL)
+            normalized_cost = _normalized_cost(cost)
+        except np.linalg.LinAlgError:
+            return "motion that shows gravity and scale"
+        last = len(window.frames) - 1
+        keep = [L(j) for j in features.tolist()] + list(imu_state_keys(last))
+        prior = marginalize(posterior, cost.state, keep, self._algorithm.marginalization)
+        covariance = current_covariance(prior)
+        reason = self._doubt(normalized_cost, covariance)
+        if reason:
+            return reason
+        current = cost.state.nav_state(last, window.stamps_ns[-1], covariance)
+        return Start(current, last, cost.state, prior, features)
+
+    def _batch_cost(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Cost:
+        """All states of the window, a prior on the first, and the features they see."""
+        state, factors = State(), []
+        for k, nav in enumerate(guess):
+            state.insert_imu_state(k, nav)
+        bias = gtsam.imuBias.ConstantBias(guess[0].accel_bias, guess[0].gyro_bias)
+        for k, samples in enumerate(window.imu_between(imu)):
+            factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
+        wide = self._config.initialization.motion_prior
+        first = fix_gauge(replace(guess[0], covariance=prior_covariance(wide)), wide)
+        cost = Cost(state, self._rig, self._config, _prior_of(first), factors)
+        tracks = window.tracks()
+        ids, lengths = tracks.lengths()
+        long = lengths >= 3
+        longest = np.argsort(-lengths[long], kind="stable")[: self._config.initialization.features]
+        cost.fresh = self._triangulated(cost, tracks, np.sort(ids[long][longest]))
+        return cost
+
+    def _triangulated(self, cost: Cost, tracks: TrackWindow, ids: IntArray) -> NewFeatures:
+        obs = tracks.observations(ids)
+        poses = stacked_poses(cost.state.estimate, obs.frames)
+        result = triangulate(obs, self._rig, *poses, self._config.triangulation)
+        fresh = NewFeatures(obs, result.points, np.zeros(len(ids), np.bool_))
+        return fresh.subset(result.good)
+
+    def _without_outliers(self, cost: Cost) -> bool:
+        """Triangulate anew and drop what does not fit; whether enough is left."""
+        assert cost.fresh is not None
+        obs = cost.fresh.obs
+        if len(obs.ids) == 0:
+            return False
+        poses = stacked_poses(cost.state.estimate, obs.frames)
+        result = triangulate(obs, self._rig, *poses, self._config.triangulation)
+        fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
+        good = result.good & fits
+        cost.fresh = NewFeatures(obs, result.points, cost.fresh.in_state).subset(good)
+        return bool(np.sum(good) >= max(self._config.initialization.min_features, 0.5 * len(good)))
+
+    def _keep_features(self, cost: Cost, window: StartWindow) -> IntArray:
+        """Make variables of the features that the last frame still sees."""
+        assert cost.fresh is not None
+        fresh, room = cost.fresh, self._algorithm.cost.max_state_features
+        seen = sorted_unique(np.sort(np.concatenate([c.ids for c in window.frames[-1].cameras])))
+        live = is_in(fresh.obs.ids, seen)
+        order = np.argsort(-np.where(live, fresh.obs.counts, 0), kind="stable")[:room]
+        chosen = np.zeros(len(live), np.bool_)
+        chosen[order] = True
+        chosen &= live
+        for j in np.flatnonzero(chosen):
+            cost.state.insert_point(int(fresh.obs.ids[j]), fresh.points[j])
+        cost.fresh = replace(fresh, in_state=chosen)
+        return fresh.obs.ids[chosen]
+
+    def _doubt(self, normalized_cost: float, covariance: FloatArray) -> str | None:
+        """Why the solution should not be trusted, if so."""
+        start = self._config.initialization
+        velocity_sigma = float(np.sqrt(np.max(np.diag(covariance)[6:9])))
+        if normalized_cost > start.max_normalized_cost:
+            return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
+        if velocity_sigma > start.max_velocity_sigma:
+            return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+        return None
+
+
+def _normalized_cost(cost: Cost) -> float:
+    """Mean squared residual of the features that do not depend on their positions."""
+    fresh = cost.linearize().fresh
+    if fresh is None:
+        return float("inf")
+    return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
+
+
+def current_covariance(prior: SquareRootInformation) -> FloatArray:
+    """Covariance (15, 15) of the IMU state that makes up the last columns of a prior."""
+    keys = list(prior.layout.dims)[-3:]
+    return SquareRootInformation(Layout(dims_of(keys)), prior.Rd[-16:, -16:]).covariance()
