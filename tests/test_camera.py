@@ -32,9 +32,7 @@ each_camera = pytest.mark.parametrize("camera", ALL, ids=["none", "radtan", "equ
 
 def pixel_grid(camera: Camera) -> np.ndarray:
     """Pixels all over the image; of a fisheye those that are less than 75° off its axis."""
-    u, v = np.meshgrid(
-        np.linspace(0, camera.width - 1, 41), np.linspace(0, camera.height - 1, 31)
-    )
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 41), np.linspace(0, camera.height - 1, 31))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     angle = np.hypot(*((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T)
     return pixels[angle < np.deg2rad(75)] if camera is WIDE else pixels
@@ -75,13 +73,9 @@ def test_projection_depends_on_the_ray_only(camera: Camera) -> None:
 
 
 def test_radtan_agrees_with_gtsam() -> None:
-    oracle = gtsam.Cal3DS2(
-        RADTAN.fx, RADTAN.fy, 0.0, RADTAN.cx, RADTAN.cy, *RADTAN.coefficients
-    )
+    oracle = gtsam.Cal3DS2(RADTAN.fx, RADTAN.fy, 0.0, RADTAN.cx, RADTAN.cy, *RADTAN.coefficients)
     m = RADTAN.undistort(pixel_grid(RADTAN))
-    np.testing.assert_allclose(
-        RADTAN.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-9
-    )
+    np.testing.assert_allclose(RADTAN.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-9)
 
 
 @pytest.mark.parametrize("camera", [EQUIDISTANT, WIDE], ids=["equidistant", "wide"])
@@ -90,9 +84,7 @@ def test_equidistant_agrees_with_gtsam(camera: Camera) -> None:
         camera.fx, camera.fy, 0.0, camera.cx, camera.cy, *camera.coefficients
     )
     m = camera.undistort(pixel_grid(camera))
-    np.testing.assert_allclose(
-        camera.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-8
-    )
+    np.testing.assert_allclose(camera.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-8)
 
 
 def test_calibration_matrix_projects_undistorted_points() -> None:

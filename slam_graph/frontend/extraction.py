@@ -82,7 +82,9 @@ class CornerExtractor:
             return np.zeros((0, 2), np.float32)
         counts = self._count(occupied)
         emptiest_first = np.argsort(counts, kind="stable")
-        wanting = (counts < self._share) & (self._rest == 0)
+        # No cell rests while many features are missing, e.g. after the lens was covered
+        awake = (self._rest == 0) | (2 * missing > self._config.features)
+        wanting = (counts < self._share) & awake
         candidates = emptiest_first[wanting[emptiest_first]]
         free = self._free(occupied)
         found: list[Points] = []

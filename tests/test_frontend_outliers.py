@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the epipolar checks, on random scenes."""
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.outliers import (
+    eight_point,
+    epipolar_distance,
+    essential_matrix,
+    fundamental_inliers,
+    triangulated_depths,
+)
+
+FOCAL_PX = 450.0
+B_T_A = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.05, -0.1, 0.02])), [0.2, -0.05, 0.1])
+
+
+def scene(
+    rng: np.random.Generator, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normalised coordinates (N, 2) in a and b, and depths (N, 2) there."""
+    depth_m = rng.uniform(1, 8, count)
+    in_a = np.column_stack([rng.uniform(-0.7, 0.7, (count, 2)), np.ones(count)]) * depth_m[:, None]
+    in_b = np.asarray(B_T_A.transformFrom(in_a.T)).T
+    depths_m = np.column_stack([in_a[:, 2], in_b[:, 2]])
+    return in_a[:, :2] / in_a[:, 2:], in_b[:, :2] / in_b[:, 2:], depths_m
+
+
+def test_true_matches_fit_the_essential_matrix_and_triangulate() -> None:
+    m_a, m_b, depths_m = scene(np.random.default_rng(0), 50)
+    assert np.max(epipolar_distance(essential_matrix(B_T_A), m_a, m_b)) < 1e-12
+    np.testing.assert_allclose(triangulated_depths(B_T_A, m_a, m_b), depths_m, rtol=1e-9)
+
+
+def test_epipolar_distance_is_the_smallest_correction() -> None:
+    m_a, m_b, _ = scene(np.random.default_rng(1), 200)
+    E = essential_matrix(B_T_A)
+    line = np.column_stack([m_a, np.ones(len(m_a))]) @ E.T
+    normal = line[:, :2] / np.linalg.norm(line[:, :2], axis=1, keepdims=True)
+    # An error e across the line in one image only is shared between both by Sampson's distance
+    distance = epipolar_distance(E, m_a, m_b + 1e-5 * normal)
+    assert np.all(distance < 1e-5)
+    assert np.all(distance > 0.5e-5)
+
+
+def test_parallel_rays_are_infinitely_far_away() -> None:
+    sideways = gtsam.Pose3(gtsam.Rot3(), [-0.1, 0, 0])
+    m = np.array([[0.1, 0.2]])
+    assert np.all(np.isinf(triangulated_depths(sideways, m, m)))
+    behind = triangulated_depths(sideways, m, m + np.array([0.01, 0.0]))
+    assert np.all(behind < 0)
+
+
+def test_without_a_baseline_nothing_is_rejected() -> None:
+    still = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.1, 0, 0])), [0.0, 0, 0])
+    m = np.random.default_rng(2).normal(size=(10, 2))
+    np.testing.assert_array_equal(epipolar_distance(essential_matrix(still), m, m), 0.0)
+
+
+def test_eight_points_give_the_essential_matrix_up_to_scale() -> None:
+    m_a, m_b, _ = scene(np.random.default_rng(3), 40)
+    F, E = eight_point(m_a, m_b), essential_matrix(B_T_A)
+    F, E = F / np.linalg.norm(F), E / np.linalg.norm(E)
+    assert min(np.linalg.norm(F - E), np.linalg.norm(F + E)) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_outliers_are_found_among_noisy_matches(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    m_a, m_b, _ = scene(rng, 200)
+    m_b += rng.normal(scale=0.2 / FOCAL_PX, size=m_b.shape)
+    wrong = rng.permutation(200)[:50]
+    m_b[wrong] += rng.uniform(-40, 40, (50, 2)) / FOCAL_PX
+    true_distance_px = epipolar_distance(essential_matrix(B_T_A), m_a, m_b) * FOCAL_PX
+    inlier = fundamental_inliers(m_a, m_b, FOCAL_PX, FrontendConfig())
+    right = np.setdiff1d(np.arange(200), wrong)
+    assert np.mean(inlier[right]) > 0.97
+    assert not np.any(inlier[true_distance_px > 3.0])
+    np.testing.assert_array_equal(inlier, fundamental_inliers(m_a, m_b, FOCAL_PX, FrontendConfig()))
+
+
+def test_a_still_camera_and_few_points_reject_nothing() -> None:
+    rng = np.random.default_rng(4)
+    m = rng.uniform(-0.5, 0.5, (100, 2))
+    noisy = m + rng.normal(scale=0.1 / FOCAL_PX, size=m.shape)
+    assert np.all(fundamental_inliers(m, noisy, FOCAL_PX, FrontendConfig()))
+    few = m[:5]
+    assert np.all(fundamental_inliers(few, few[::-1], FOCAL_PX, FrontendConfig()))
