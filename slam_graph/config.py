@@ -100,7 +100,7 @@ class RunConfig(Settings):
     backend: BackendConfig = BackendConfig()
     """From features and IMU to states."""
     limits: LimitsConfig = LimitsConfig()
-    """Beyond what an estimate counts as diverged."""
+    """When a run is given up as diverged."""
 
 
 def load_config(

@@ -12,7 +12,7 @@ from slam_graph.backend.estimator import Estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.base import Sequence
 from slam_graph.errors import DataError
-from slam_graph.frontend import build_frontend
+from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
 from slam_graph.output.run_result import RunResult
 from slam_graph.output.timing import Stopwatch, milliseconds
@@ -81,14 +81,16 @@ def run(
     recorder = recorder or NullRecorder()
 
     result = _open(sequence, config)
-    track = build_frontend(result.rig, config.frontend, config.seed, sequence.diagnostics)
+    frontend = build_frontend(
+        result.rig, config.frontend, config.seed, sequence.diagnostics, result.info.content
+    )
     estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
     with outcome(result, estimator, sequence.diagnostics), _watched(viewer, result):
         for packet, clock in _packets(sequence, result):
-            features = track(packet.frame)
-            clock.lap("frontend", milliseconds(track.frame_stats))
+            features = frontend.track(packet.frame)
+            clock.lap("frontend", milliseconds(frontend.frame_stats))
             start.apply(estimator, packet.frame.stamp_ns, result)
             estimator.add_imu(packet.imu)
             state = estimate(estimator, features)
@@ -98,7 +100,7 @@ def run(
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
-            result.count_frame(features.stamp_ns, clock.milliseconds, track.frame_stats)
+            result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
             recorder.write(packet.imu, features)
             progress.advance(features.stamp_ns, estimator.initialized)
             viewer.show(packet.frame, features, state, points)

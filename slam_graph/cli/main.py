@@ -9,6 +9,7 @@ import is imported inside the commands.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -17,6 +18,10 @@ import typer
 from slam_graph.cli import config, data, evaluate, run
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
+
+# The matrices of a window are a few hundred wide: threads of BLAS cost more there than they bring,
+# ten times as much where other work shares the cores. It reads this when NumPy is first imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     help="Factor-graph SLAM: a recorded sequence in, a trajectory out.",

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from slam_graph.geometry.alignment import Similarity
 from slam_graph.geometry.interpolation import interpolate
@@ -96,7 +96,8 @@ def nees(
 def mean_bounds(dof: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Between what the mean of `count` independent NEES values lies with a given probability."""
     tail = (1.0 - confidence) / 2.0
-    low, high = chi2.ppf([tail, 1.0 - tail], dof * count) / count
+    # the quantile function of χ² with k degrees of freedom is 2 γ⁻¹(k/2, ·)
+    low, high = 2.0 * gammaincinv(dof * count / 2.0, [tail, 1.0 - tail]) / count
     return float(low), float(high)
 
 
