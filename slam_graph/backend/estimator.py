@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, X
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
@@ -77,6 +78,8 @@ class Estimator:
         self._imu = ImuBuffer()
         self._standstill = StandstillDetector(self.config.zero_velocity)
         self._still = False
+        # the matrices are small: waking threads for them costs many times what they save
+        self._threads = ThreadpoolController()
         self._state = State()
         self._tracks = TrackWindow()
         self._prior = SquareRootInformation.empty()
@@ -118,6 +121,10 @@ class Estimator:
         Returns:
             The causal estimate with its covariance, or None as long as there is no state.
         """
+        with self._threads.limit(limits=1, user_api="blas"):
+            return self._add_frame(frame)
+
+    def _add_frame(self, frame: FeatureFrame) -> NavState | None:
         stamp_ns = frame.stamp_ns + self._time_offset_ns
         self._still = self._standstill.is_still(self._imu, stamp_ns, frame)
         if self._current is None:
