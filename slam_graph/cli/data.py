@@ -54,7 +54,8 @@ def info(
         echo_json(table)
         return
     for camera in table.pop("camera_models"):
-        table[camera.pop("name")] = ", ".join(f"{key} {value}" for key, value in camera.items())
+        name = camera.pop("name")
+        table[name] = ", ".join(f"{key} {value}" for key, value in camera.items())
     echo_table((name, str(value)) for name, value in table.items())
 
 
@@ -77,7 +78,7 @@ def check(
     if as_json:
         echo_json({"errors": errors, "findings": [asdict(finding) for finding in findings]})
     else:
-        echo_table((finding.severity, finding.what, finding.where) for finding in findings)
+        echo_table((finding.severity, finding.where, finding.what) for finding in findings)
         typer.echo(f"{sequence.info().name}: {'unusable' if errors else 'ok'}")
     if errors:
         raise typer.Exit(1)

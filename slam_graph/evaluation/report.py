@@ -16,7 +16,7 @@ from slam_graph.evaluation.ape import ErrorSeries, ape
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
 from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees
 from slam_graph.evaluation.rpe import rpe
-from slam_graph.geometry.alignment import AlignmentMode, Similarity, align_first_pose
+from slam_graph.geometry.alignment import AlignmentMode, Similarity, align_first_pose, align_yaw
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 
@@ -53,17 +53,22 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
         truth: the true trajectory.
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
-            given); otherwise its first pose is laid on the true one in yaw and position.
+            given); otherwise it is aligned in yaw and position, which nothing tells it, over the
+            whole run: the truth's own orientation at one time may be off by far more than the
+            estimate's uncertainty there. What never moves is aligned by its first pose.
     """
     estimate = history.trajectory()
-    similarity = Similarity.identity()
+    similarity, alignment = Similarity.identity(), "none"
     if not aligned:
-        true_start, own_start = synchronize(truth, estimate)
-        similarity = align_first_pose(true_start, own_start)
+        true, own = synchronize(truth, estimate)
+        try:
+            similarity, alignment = align_yaw(true.positions, own.positions), "yaw"
+        except DataError:
+            similarity, alignment = align_first_pose(true, own), "first_pose"
     result = nees(estimate, history.pose_covariances(), truth, similarity)
     if len(result.stamps_ns) == 0:
         return None
-    table: Table = {"alignment": "none" if aligned else "first_pose", "states": len(result.pose)}
+    table: Table = {"alignment": alignment, "states": len(result.pose)}
     for name, (values, dof) in result.series().items():
         low, high = mean_bounds(dof, 1)
         table[name] = {
