@@ -22,6 +22,7 @@ from scipy.optimize import brentq
 
 from slam_graph.backend.feature_factors import eliminate_points
 from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.square_root import triangularize
 from slam_graph.backend.tracks import Observations
 
 FloatArray = NDArray[np.float64]
@@ -135,12 +136,12 @@ def _depths(
     in_body = np.einsum("nji,nj->ni", motion.rotations[obs.frame], points[obs.feature] - p)
     camera_axis = rig.body_R_camera[obs.camera][:, :, 2]
     depths = np.einsum("ni,ni->n", camera_axis, in_body - rig.body_p_camera[obs.camera])
-    return np.maximum(np.abs(depths), MIN_DEPTH_M)
+    return np.asarray(np.maximum(np.abs(depths), MIN_DEPTH_M), dtype=np.float64)
 
 
 def _constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignment:
     """Least squares under |g| = gravity: a secular equation in the Lagrange multiplier."""
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    R = triangularize(np.column_stack([A, b]))
     of_v, of_g, right = R[:3, :3], R[3:6, 3:6], R[3:6, 6]
     values, vectors = np.linalg.eigh(of_g.T @ of_g)
     projected = vectors.T @ (of_g.T @ right)

@@ -101,7 +101,7 @@ class InitializationConfig(Settings):
     """Time between the frames that the alignment uses."""
     retry_s: float = Field(0.2, ge=0)
     """Time between two attempts to start in motion."""
-    features: int = Field(150, ge=10)
+    features: int = Field(75, ge=10)
     """How many features the alignment uses at most (the longest tracks)."""
     min_features: int = Field(10, ge=5)
     """How many features must fit the solution of a start in motion."""

@@ -98,7 +98,7 @@ class Cost:
 
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
-        keys = [key for factor in self.factors for key in factor.keys()]
+        keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
         if self.fresh is not None:
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
         return self.prior.layout.extended(

@@ -275,7 +275,7 @@ class Estimator:
         if cost.fresh is not None:
             ids = np.union1d(ids, cost.fresh.obs.ids[cost.fresh.in_state])
         self._features = ids
-        return ids.tolist()
+        return [int(j) for j in ids]
 
     def _forget(self, keep_poses: list[int], cost: Cost) -> None:
         """Drop the observations of the frames that left."""

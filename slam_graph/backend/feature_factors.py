@@ -84,7 +84,8 @@ class ReducedFeatures:
     def point_increments(self, delta_poses: FloatArray) -> FloatArray:
         """The δf (J, 3) that go with an increment of the poses (6 F,)."""
         rest = self.r_1 - self.T @ delta_poses
-        return np.linalg.solve(self.R_f, rest[:, :, None])[:, :, 0]
+        increments = np.linalg.solve(self.R_f, rest[:, :, None])[:, :, 0]
+        return np.asarray(increments, dtype=np.float64)
 
 
 def whiten(
@@ -119,7 +120,7 @@ def robust_weights(error: FloatArray, gating: GatingConfig) -> FloatArray:
 
 def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:
     """Stack the observations of each feature and eliminate its position by Householder QR."""
-    J, F = len(obs.ids), len(obs.frames)
+    F = len(obs.frames)
     by_poses = np.zeros((len(obs), 2, F, 6))
     by_poses[np.arange(len(obs)), :, obs.frame] = linear.by_pose
     others = np.concatenate([by_poses.reshape(-1, 2, 6 * F), linear.r[:, :, None]], axis=2)
@@ -144,11 +145,11 @@ def eliminate_points(
             the rows from the fourth on do not contain the feature, unused ones are zero.
     """
     J, M, slots = len(obs.ids), int(obs.counts.max(initial=2)), obs.slots
-    A = np.zeros((J, M, 2, 3))
-    A[obs.feature, slots] = by_point
-    B = np.zeros((J, M, 2, others.shape[2]))
-    B[obs.feature, slots] = others
-    A, B = A.reshape(J, 2 * M, 3), B.reshape(J, 2 * M, -1)
+    stacked = np.zeros((J, M, 2, 3))
+    stacked[obs.feature, slots] = by_point
+    beside = np.zeros((J, M, 2, others.shape[2]))
+    beside[obs.feature, slots] = others
+    A, B = stacked.reshape(J, 2 * M, 3), beside.reshape(J, 2 * M, -1)
     _householder(A, B)
     return np.triu(A[:, :3]), B
 

@@ -25,7 +25,8 @@ def squared_mahalanobis(r: FloatArray, H: FloatArray, covariance: FloatArray) ->
         (J,) rᵀ (H P Hᵀ + I)⁻¹ r; χ² distributed with m degrees of freedom.
     """
     S = H @ covariance @ H.transpose(0, 2, 1) + np.eye(H.shape[1])
-    return np.einsum("ji,ji->j", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+    distances: FloatArray = np.einsum("ji,ji->j", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+    return distances
 
 
 def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:

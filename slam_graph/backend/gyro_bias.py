@@ -32,9 +32,19 @@ ROBUST_WIDTH = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
-    """A pair of frames: bearings (N, 3) in the body's orientation, and the rotation between."""
+class _Pairs:
+    """Pairs of frames with their common features.
 
+    Attributes:
+        pair: (N,) which pair each feature belongs to, ascending.
+        starts: (P,) first feature of each pair.
+        first, second: (N, 3) bearings in the orientation of the body.
+        R: (P, 3, 3) rotation from the second body to the first.
+        by_bias: (P, 3, 3) its derivative by the bias.
+    """
+
+    pair: NDArray[np.intp]
+    starts: NDArray[np.intp]
     first: FloatArray
     second: FloatArray
     R: FloatArray
@@ -58,7 +68,7 @@ def estimate_gyro_bias(
     bias = np.zeros(3)
     for _ in range(2):  # the rotation is linearised in the bias: once more at the solution
         pairs = _pairs(frames, imu, rig, params, bias)
-        if not pairs:
+        if pairs is None:
             return None
         result = least_squares(
             _residuals, np.zeros(3), args=(pairs,), loss="huber", f_scale=ROBUST_WIDTH
@@ -67,14 +77,12 @@ def estimate_gyro_bias(
     return bias
 
 
-def _residuals(change: FloatArray, pairs: list[_Pair]) -> FloatArray:
-    """Root mean squared distance of each pair's normals from the plane that fits them best."""
-    errors = np.empty(len(pairs))
-    for k, pair in enumerate(pairs):
-        R = pair.R @ Rotation.from_rotvec(pair.by_bias @ change).as_matrix()
-        normals = np.cross(pair.first, pair.second @ R.T)
-        errors[k] = np.sqrt(max(np.linalg.eigvalsh(normals.T @ normals)[0], 0.0))
-    return errors
+def _residuals(change: FloatArray, pairs: _Pairs) -> FloatArray:
+    """Distance (P,) of each pair's normals from the plane that fits them best."""
+    R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
+    normals = np.cross(pairs.first, np.einsum("nij,nj->ni", R[pairs.pair], pairs.second))
+    scatter = np.add.reduceat(normals[:, :, None] * normals[:, None, :], pairs.starts)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, 0], 0.0))
 
 
 def _pairs(
@@ -83,22 +91,38 @@ def _pairs(
     rig: RigProjection,
     params: gtsam.PreintegrationCombinedParams,
     bias: FloatArray,
-) -> list[_Pair]:
-    pairs = []
+) -> _Pairs | None:
+    first, second, rotations, derivatives = [], [], [], []
     for before, after, samples in zip(frames[:-1], frames[1:], imu, strict=True):
-        R = _rotation(samples, bias, params)
-        by_bias = np.empty((3, 3))
-        for axis in range(3):
-            moved = _rotation(samples, bias + STEP_RAD_S * np.eye(3)[axis], params)
-            by_bias[:, axis] = Rotation.from_matrix(R.T @ moved).as_rotvec() / STEP_RAD_S
+        R, by_bias = _rotation_by_bias(samples, bias, params)
         for camera, (one, two) in enumerate(zip(before.cameras, after.cameras, strict=True)):
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
             if len(i) >= MIN_COMMON:
                 mounting = rig.body_R_camera[camera]
-                pairs.append(
-                    _Pair(_bearings(one, i, mounting), _bearings(two, j, mounting), R, by_bias)
-                )
-    return pairs
+                first.append(_bearings(one, i, mounting))
+                second.append(_bearings(two, j, mounting))
+                rotations.append(R)
+                derivatives.append(by_bias)
+    if not first:
+        return None
+    counts = np.array([len(bearings) for bearings in first])
+    return _Pairs(
+        np.repeat(np.arange(len(counts)), counts),
+        np.cumsum(counts) - counts,
+        np.concatenate(first),
+        np.concatenate(second),
+        np.array(rotations),
+        np.array(derivatives),
+    )
+
+
+def _rotation_by_bias(
+    samples: ImuData, bias: FloatArray, params: gtsam.PreintegrationCombinedParams
+) -> tuple[FloatArray, FloatArray]:
+    """The rotation (3, 3) over some samples and its derivative (3, 3) by the gyroscope bias."""
+    R = _rotation(samples, bias, params)
+    moved = np.array([_rotation(samples, bias + step, params) for step in STEP_RAD_S * np.eye(3)])
+    return R, Rotation.from_matrix(R.T @ moved).as_rotvec().T / STEP_RAD_S
 
 
 def _rotation(
@@ -110,4 +134,5 @@ def _rotation(
 
 def _bearings(obs: FeatureObservations, rows: NDArray[np.intp], R: FloatArray) -> FloatArray:
     bearings = np.concatenate([obs.normalized[rows], np.ones((len(rows), 1))], axis=1)
-    return (bearings / np.linalg.norm(bearings, axis=1, keepdims=True)) @ R.T
+    unit: FloatArray = (bearings / np.linalg.norm(bearings, axis=1, keepdims=True)) @ R.T
+    return unit

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start in motion: a first guess of all states of a short window, from images and IMU together.
 
-Gyroscope bias from epipolar geometry, then velocity, gravity and scale in closed form. The engine
-refines the guess with its own cost and steps (see initialization.py).
+Gyroscope bias from epipolar geometry, then velocity, gravity and scale in closed form. The
+engine refines the guess with its own cost and steps (see initialization.py).
 """
 
 from __future__ import annotations

@@ -56,12 +56,14 @@ class RigProjection:
     def in_body(self, obs: Observations, at: Geometry) -> FloatArray:
         """The observed features (N, 3) in the body frame of the observing pose."""
         difference = at.points[obs.feature] - at.positions[obs.frame]
-        return np.einsum("nji,nj->ni", at.rotations[obs.frame], difference)
+        points: FloatArray = np.einsum("nji,nj->ni", at.rotations[obs.frame], difference)
+        return points
 
     def in_camera(self, obs: Observations, in_body: FloatArray) -> FloatArray:
         """Points (N, 3) of the body frame in the frame of the observing camera."""
         difference = in_body - self.body_p_camera[obs.camera]
-        return np.einsum("nji,nj->ni", self.body_R_camera[obs.camera], difference)
+        points: FloatArray = np.einsum("nji,nj->ni", self.body_R_camera[obs.camera], difference)
+        return points
 
     def pixels(self, obs: Observations, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""

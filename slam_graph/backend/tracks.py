@@ -139,7 +139,7 @@ class TrackWindow:
         return np.unique(self._ids[new_frame], return_counts=True)
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
-        """The unused observations of some features (ascending ids) in some frames (default: all)."""
+        """The unused observations of some features (ascending ids) in some or all frames."""
         rows = is_in(self._ids, ids)
         if frames is not None:
             rows &= np.isin(self._frames, frames)

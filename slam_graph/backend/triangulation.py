@@ -142,7 +142,8 @@ def _refine(obs: Observations, rays: _Rays, points: FloatArray, iterations: int)
         if np.max(np.abs(step), initial=0.0) < 1e-7:
             break
     local = np.concatenate([x[:, :2], np.ones((len(x), 1))], axis=1) / x[:, 2:]
-    return home_p + np.einsum("nij,nj->ni", home_R, local)
+    points = home_p + np.einsum("nij,nj->ni", home_R, local)
+    return np.asarray(points, dtype=np.float64)
 
 
 def _normal_equations(
