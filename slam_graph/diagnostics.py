@@ -32,5 +32,7 @@ class Diagnostics:
         """Count one event of `kind` and log `message` if it is among the first of its kind."""
         self.counts[kind] += 1
         if self.counts[kind] <= LOGGED_PER_KIND:
-            last = " (further ones are only counted)" if self.counts[kind] == LOGGED_PER_KIND else ""
+            last = (
+                " (further ones are only counted)" if self.counts[kind] == LOGGED_PER_KIND else ""
+            )
             logger.warning("%s: %s%s", kind, message, last)

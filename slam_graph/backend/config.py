@@ -97,11 +97,11 @@ class InitializationConfig(Settings):
     """How long the platform must stand still for a static start."""
     motion_window_s: float = Field(1.5, gt=0)
     """Length of the visual-inertial alignment of a start in motion."""
-    frame_spacing_s: float = Field(0.1, gt=0)
+    frame_spacing_s: float = Field(0.15, gt=0)
     """Time between the frames that the alignment uses."""
     retry_s: float = Field(0.2, ge=0)
     """Time between two attempts to start in motion."""
-    features: int = Field(75, ge=10)
+    features: int = Field(150, ge=10)
     """How many features the alignment uses at most (the longest tracks)."""
     min_features: int = Field(10, ge=5)
     """How many features must fit the solution of a start in motion."""

@@ -82,7 +82,8 @@ class Cost:
         state: estimates and linearisation points.
         rig: projection into the cameras.
         config: noise and gating.
-        prior: what was marginalised before, over the offsets from the first estimates.
+        prior: what was marginalised before, over the offsets from the linearisation points; its
+            variables must be frozen.
         factors: GTSAM's factors between the variables.
         tracked: observations of features that are in the state already.
         fresh: features that enter now.

@@ -78,6 +78,22 @@ def _prior_of(given: NavState) -> SquareRootInformation:
     return SquareRootInformation(Layout(dims_of(imu_state_keys(0))), Rd)
 
 
+def _prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:
+    """The prior on the state of frame 0 as factors, whose linearisation point may move."""
+    assert first.covariance is not None
+    x, v, b = imu_state_keys(0)
+    noise = [
+        gtsam.noiseModel.Gaussian.Covariance(first.covariance[block, block])
+        for block in (slice(0, 6), slice(6, 9), slice(9, 15))
+    ]
+    bias = gtsam.imuBias.ConstantBias(first.accel_bias, first.gyro_bias)
+    return [
+        gtsam.PriorFactorPose3(x, first.world_T_body, noise[0]),
+        gtsam.PriorFactorVector(v, first.velocity, noise[1]),
+        gtsam.PriorFactorConstantBias(b, bias, noise[2]),
+    ]
+
+
 class Initializer:
     """Collects frames and tries to start from them.
 
@@ -183,7 +199,8 @@ class Initializer:
             factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
         wide = self._config.initialization.motion_prior
         first = fix_gauge(replace(guess[0], covariance=prior_covariance(wide)), wide)
-        cost = Cost(state, self._rig, self._config, _prior_of(first), factors)
+        factors += _prior_factors(first)
+        cost = Cost(state, self._rig, self._config, SquareRootInformation.empty(), factors)
         tracks = window.tracks()
         ids, lengths = tracks.lengths()
         long = lengths >= 3
