@@ -24,6 +24,10 @@ class NoiseConfig(Settings):
     """Factor on all IMU noise densities of the calibration."""
     gravity: float = Field(9.81, gt=0)
     """Magnitude of gravity in m/s²."""
+    max_imu_gap_s: float = Field(0.05, gt=0)
+    """Longest time without IMU samples that is bridged as if there were none missing."""
+    imu_gap_scale: float = Field(100.0, ge=1)
+    """Factor on the IMU noise between two frames with a longer gap."""
 
 
 class TriangulationConfig(Settings):

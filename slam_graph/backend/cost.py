@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Module 1, cost construction: the variables and residuals that are in the cost now.
+"""The cost: residuals as a function of the variables, their linearisation and their gate.
 
 The cost is the sum of the marginal prior, factors of GTSAM (IMU, zero velocity), single
 observations of features that are in the state, and whole tracks of features that enter it now. A

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 FloatArray = NDArray[np.float64]
 
@@ -37,4 +37,5 @@ def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _quantiles(largest: int, confidence: float) -> FloatArray:
-    return np.concatenate([[0.0], chi2.ppf(confidence, np.arange(1, largest + 1))])
+    # the quantile of χ² with k degrees of freedom is 2 P⁻¹(k/2, p), P the incomplete gamma function
+    return np.concatenate([[0.0], 2.0 * gammaincinv(0.5 * np.arange(1, largest + 1), confidence)])

@@ -51,10 +51,19 @@ class ImuBuffer:
     def __init__(self) -> None:
         self.data = ImuData.empty()
 
-    def add(self, imu: ImuData) -> None:
-        """Append samples that follow those already there."""
-        if len(imu):
-            self.data = ImuData.concatenate([self.data, imu])
+    def add(self, imu: ImuData) -> int:
+        """Append samples, and return how many were left out.
+
+        Samples that are not finite or do not follow those already there are left out.
+        """
+        newest = self.data.stamps_ns[-1] if len(self.data) else np.iinfo(np.int64).min
+        latest = np.maximum.accumulate(np.concatenate([[newest], imu.stamps_ns]))[:-1]
+        good = (imu.stamps_ns > latest) & np.isfinite(imu.gyro).all(axis=1)
+        good &= np.isfinite(imu.accel).all(axis=1)
+        if good.any():
+            rows = ImuData(imu.stamps_ns[good], imu.gyro[good], imu.accel[good])
+            self.data = ImuData.concatenate([self.data, rows])
+        return int(np.sum(~good))
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the samples before the last one at or before `stamp_ns`."""
@@ -66,9 +75,21 @@ class ImuBuffer:
         """Whether there is a sample at or before `stamp_ns`."""
         return len(self.data) > 0 and int(self.data.stamps_ns[0]) <= stamp_ns
 
+    def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
+        """Longest time within an interval without a sample, infinite without any sample."""
+        if len(self.data) == 0:
+            return float("inf")
+        t = self.data.stamps_ns
+        first = max(int(np.searchsorted(t, start_ns, side="right")) - 1, 0)
+        last = int(np.searchsorted(t, end_ns)) + 1
+        around = np.clip(np.concatenate([[start_ns], t[first:last], [end_ns]]), start_ns, end_ns)
+        return float(np.max(np.diff(around))) * 1e-9
+
     def between(self, start_ns: int, end_ns: int) -> ImuData:
         """Samples at both ends (interpolated, or the nearest held) and all in between."""
         t = self.data.stamps_ns
+        if len(t) == 0:  # nothing known: the caller asks `largest_gap_s` first
+            return ImuData(np.array([start_ns, end_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
         inside = slice(
             int(np.searchsorted(t, start_ns, side="right")), int(np.searchsorted(t, end_ns))
         )

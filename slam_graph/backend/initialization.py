@@ -9,7 +9,7 @@ marginalization; only its first guess is special.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -29,6 +29,7 @@ from slam_graph.backend.state import State, dims_of, imu_state_keys, stacked_pos
 from slam_graph.backend.static_start import fix_gauge, prior_covariance, state_at_rest
 from slam_graph.backend.tracks import TrackWindow, is_in, sorted_unique
 from slam_graph.backend.triangulation import triangulate
+from slam_graph.backend.window import Window
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
 
@@ -42,33 +43,14 @@ OUTLIER_PX = 3.0
 """Features with a larger root mean square reprojection error leave the window, in units of σ."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Start:
-    """What the loop needs to go on.
-
-    Attributes:
-        current: state of the last frame.
-        frame: its index.
-        state: variables.
-        prior: their prior.
-        features: ids (N,) of the features in the state, ascending.
-    """
-
-    current: NavState
-    frame: int
-    state: State
-    prior: SquareRootInformation
-    features: IntArray
-
-
-def start_from(given: NavState, config: BackendConfig) -> Start:
+def start_from(given: NavState, config: BackendConfig) -> Window:
     """Start from a state with a covariance."""
     if config.initialization.fix_gauge:
         given = fix_gauge(given, config.initialization.prior)
     state = State()
     state.insert_imu_state(0, given)
     state.freeze(imu_state_keys(0))
-    return Start(given, 0, state, _prior_of(given), np.zeros(0, np.int64))
+    return Window(0, given.stamp_ns, state, _prior_of(given))
 
 
 def _prior_of(given: NavState) -> SquareRootInformation:
@@ -119,7 +101,7 @@ class Initializer:
 
     def try_to_start(
         self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame, still_since_ns: int | None
-    ) -> Start | None:
+    ) -> Window | None:
         """Take the next frame and start if it is possible.
 
         Args:
@@ -129,7 +111,7 @@ class Initializer:
             still_since_ns: since when the platform stands still, None if it moves.
         """
         mode = self._config.initialization.mode
-        outcome: Start | str = "a state to start from (mode 'given')"
+        outcome: Window | str = "a state to start from (mode 'given')"
         if mode in ("auto", "static"):
             outcome = self._at_rest(imu, stamp_ns, still_since_ns)
         if mode in ("auto", "motion") and isinstance(outcome, str):
@@ -139,7 +121,7 @@ class Initializer:
             return None
         return outcome
 
-    def _at_rest(self, imu: ImuBuffer, stamp_ns: int, since_ns: int | None) -> Start | str:
+    def _at_rest(self, imu: ImuBuffer, stamp_ns: int, since_ns: int | None) -> Window | str:
         start = self._config.initialization
         needed_ns = round(start.static_window_s * 1e9)
         if since_ns is None or stamp_ns - since_ns < needed_ns:
@@ -147,7 +129,7 @@ class Initializer:
         samples = imu.between(since_ns, stamp_ns)
         return start_from(state_at_rest(samples, stamp_ns, start.prior), self._config)
 
-    def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Start | str:
+    def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | str:
         start = self._config.initialization
         length_ns = round(start.motion_window_s * 1e9)
         if imu.covers(stamp_ns):
@@ -166,7 +148,7 @@ class Initializer:
 
     # --- the batch problem of a start in motion ---------------------------------------------------
 
-    def _refined(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Start | str:
+    def _refined(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Window | str:
         """Solve the window by the engine and marginalise all but its last state."""
         cost = self._batch_cost(window, guess, imu)
         try:
@@ -182,16 +164,13 @@ class Initializer:
         last = len(window.frames) - 1
         keep = [L(j) for j in features.tolist()] + list(imu_state_keys(last))
         prior = marginalize(posterior, cost.state, keep, self._algorithm.marginalization)
-        covariance = current_covariance(prior)
-        reason = self._doubt(normalized_cost, covariance)
-        if reason:
-            return reason
-        current = cost.state.nav_state(last, window.stamps_ns[-1], covariance)
-        return Start(current, last, cost.state, prior, features)
+        start = Window(last, window.stamps_ns[-1], cost.state, prior, features=features)
+        return self._doubt(normalized_cost, start.covariance()) or start
 
     def _batch_cost(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Cost:
         """All states of the window, a prior on the first, and the features they see."""
-        state, factors = State(), []
+        state = State()
+        factors: list[gtsam.NonlinearFactor] = []
         for k, nav in enumerate(guess):
             state.insert_imu_state(k, nav)
         bias = gtsam.imuBias.ConstantBias(guess[0].accel_bias, guess[0].gyro_bias)
@@ -260,9 +239,3 @@ def _normalized_cost(cost: Cost) -> float:
     if fresh is None:
         return float("inf")
     return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
-
-
-def current_covariance(prior: SquareRootInformation) -> FloatArray:
-    """Covariance (15, 15) of the IMU state that makes up the last columns of a prior."""
-    keys = list(prior.layout.dims)[-3:]
-    return SquareRootInformation(Layout(dims_of(keys)), prior.Rd[-16:, -16:]).covariance()

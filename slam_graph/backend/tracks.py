@@ -128,6 +128,10 @@ class TrackWindow:
         )
         self._pixels, self._normalized = self._pixels[rows], self._normalized[rows]
 
+    def frames(self) -> set[int]:
+        """The frames with unused observations."""
+        return set(np.unique(self._frames).tolist())
+
     def ids_in(self, index: int) -> IntArray:
         """The features that any camera saw in one frame, ascending."""
         return sorted_unique(self._ids[self._frames == index])

@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""From one frame to the next: the state is predicted from the IMU, and the factor says how well."""
+
+from __future__ import annotations
+
+import gtsam
+from gtsam.symbol_shorthand import B
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.imu import (
+    ImuBuffer,
+    imu_factor,
+    predict,
+    preintegrate,
+    preintegration_params,
+)
+from slam_graph.backend.window import Window
+from slam_graph.backend.zero_velocity import zero_velocity_factors
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.sensors.rig import ImuNoise
+
+
+class Propagation:
+    """Appends a new frame to a window by the dynamics model.
+
+    Attributes:
+        params: of the preintegration.
+    """
+
+    def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
+        self.config = config
+        self.diagnostics = diagnostics
+        noise = config.noise
+        self.params = preintegration_params(imu, noise.gravity, noise.imu_scale)
+        self._gap_params = preintegration_params(
+            imu, noise.gravity, noise.imu_scale * noise.imu_gap_scale
+        )
+
+    def append_frame(
+        self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool
+    ) -> list[gtsam.NonlinearFactor]:
+        """Make a new frame the current one.
+
+        Args:
+            window: gets the predicted state of the new frame.
+            imu: samples up to the frame.
+            stamp_ns: time of the frame on the clock of the IMU.
+            still: whether the platform has not moved.
+
+        Returns:
+            The factors between the frame before and the new one.
+        """
+        i, j = window.frame, window.frame + 1
+        previous = window.state.nav_state(i, window.stamp_ns, None)
+        samples = imu.between(window.stamp_ns, stamp_ns)
+        bias = window.state.estimate.atConstantBias(B(i))
+        pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
+        window.state.insert_imu_state(j, predict(previous, pim, stamp_ns))
+        window.past.append(i)
+        window.frame, window.stamp_ns = j, stamp_ns
+        factors: list[gtsam.NonlinearFactor] = [imu_factor(i, j, pim)]
+        if still:
+            factors += zero_velocity_factors(i, j, self.config.zero_velocity)
+        return factors
+
+    def _params(
+        self, imu: ImuBuffer, start_ns: int, end_ns: int
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Noise of the IMU, much larger where samples are missing."""
+        gap_s = imu.largest_gap_s(start_ns, end_ns)
+        if gap_s <= self.config.noise.max_imu_gap_s:
+            return self.params
+        self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
+        return self._gap_params
