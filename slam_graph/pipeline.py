@@ -110,6 +110,8 @@ def run(
 def _open(sequence: Sequence, config: RunConfig) -> RunResult:
     """An empty result for the part of the sequence that is asked for."""
     info = sequence.info()
+    if info.frames == 0:
+        raise DataError(f"{info.name}: holds no camera frames; there is nothing to run on")
     start_ns = info.start_ns + round(config.start_s * 1e9)
     if start_ns > info.end_ns:
         length_s = (info.end_ns - info.start_ns) * 1e-9
