@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The χ² gate: correct measurements are distributed as it assumes, wrong ones are rejected."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+from flight import Flight, rig, room, scene
+from gtsam.symbol_shorthand import L, X
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
+
+from slam_graph.backend.config import BackendConfig, GatingConfig, NoiseConfig
+from slam_graph.backend.cost import Cost, Linearization, NewFeatures
+from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.square_root import Layout, SquareRootInformation
+from slam_graph.backend.state import State, dims_of
+from slam_graph.backend.tracks import Observations
+from slam_graph.backend.triangulation import triangulate
+from slam_graph.geometry.trajectory import NavState
+
+FloatArray = NDArray[np.float64]
+FRAMES = 5
+SIGMA_PX = 0.8
+CONFIG = BackendConfig(
+    noise=NoiseConfig(pixel_sigma=SIGMA_PX), gating=GatingConfig(robust_loss="none")
+)
+CAMERAS = rig(2)
+PROJECTION = RigProjection(CAMERAS)
+
+
+@dataclass
+class Trial:
+    """Features seen from poses whose estimates are wrong by a draw from their covariance."""
+
+    obs: Observations
+    layout: Layout
+    covariance: FloatArray
+    state: State
+
+
+def trial(rng: np.random.Generator) -> Trial:
+    """A scene at a random time; errors are small, so that the problem is nearly linear."""
+    start = rng.uniform(0.0, 20.0)
+    times = np.array([start + 0.25 * k for k in range(FRAMES)])
+    obs, truth = scene(Flight(), CAMERAS, room(20, rng), times, rng, SIGMA_PX, FRAMES)
+    root = rng.normal(size=(6 * FRAMES, 6 * FRAMES)) / np.sqrt(6 * FRAMES)
+    scale = np.tile(np.repeat([2e-3, 8e-3], 3), FRAMES)
+    root = scale[:, None] * root
+    error = (root @ rng.normal(size=6 * FRAMES)).reshape(FRAMES, 6)
+    state = State()
+    for i in range(FRAMES):
+        pose = gtsam.Pose3(gtsam.Rot3(truth.rotations[i]), truth.positions[i])
+        state.insert_imu_state(
+            i, NavState(0, pose.retract(error[i]), np.zeros(3), np.zeros(3), np.zeros(3))
+        )
+    layout = Layout(dims_of(X(i) for i in range(FRAMES)))
+    return Trial(obs, layout, root @ root.T, state)
+
+
+def fresh_cost(case: Trial) -> tuple[Cost, Linearization]:
+    """The features as new ones, triangulated from the wrong poses."""
+    poses = [case.state.estimate.atPose3(X(i)).matrix() for i in range(FRAMES)]
+    R, p = np.array(poses)[:, :3, :3], np.array(poses)[:, :3, 3]
+    points = triangulate(case.obs, PROJECTION, R, p, CONFIG.triangulation).points
+    cost = Cost(case.state, PROJECTION, CONFIG, SquareRootInformation.empty())
+    cost.fresh = NewFeatures(case.obs, points, np.zeros(len(points), np.bool_))
+    return cost, cost.linearize()
+
+
+def tracked_cost(
+    case: Trial, rng: np.random.Generator
+) -> tuple[Cost, Linearization, FloatArray, Layout]:
+    """The features as variables of the state, with errors and covariance of their own."""
+    truth = fresh_cost(case)[0].fresh
+    assert truth is not None
+    layout = case.layout.extended(dims_of(L(j) for j in case.obs.ids.tolist()))
+    sigma = 0.01
+    P = np.eye(layout.size) * sigma**2
+    P[: case.layout.size, : case.layout.size] = case.covariance
+    for j, point in zip(case.obs.ids.tolist(), truth.points, strict=True):
+        case.state.insert_point(j, point + rng.normal(0.0, sigma, 3))
+    cost = Cost(case.state, PROJECTION, CONFIG, SquareRootInformation.empty())
+    cost.tracked = case.obs
+    return cost, cost.linearize(), P, layout
+
+
+@pytest.fixture(scope="module")
+def solved() -> list[tuple[Trial, Cost, Linearization]]:
+    """Many scenes, each with its new features linearised."""
+    rng = np.random.default_rng(17)
+    trials = [case for case in (trial(rng) for _ in range(300)) if len(case.obs.ids)]
+    assert len(trials) > 200
+    return [(case, *fresh_cost(case)) for case in trials]
+
+
+def quantiles(solved: list[tuple[Trial, Cost, Linearization]], scale: float) -> list[float]:
+    """Of one feature of each scene, because those of one scene share the errors of its poses."""
+    found = []
+    for case, _, linear in solved:
+        assert linear.fresh is not None
+        fresh = linear.fresh
+        distances = squared_mahalanobis(fresh.r_2, fresh.N, scale * case.covariance)
+        found.append(float(chi2.cdf(distances[0], fresh.dof[0])))
+    return found
+
+
+def test_distances_of_new_features_are_chi_squared(
+    solved: list[tuple[Trial, Cost, Linearization]],
+) -> None:
+    assert kstest(quantiles(solved, 1.0), "uniform").pvalue > 0.01
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.25, 4.0])
+def test_distances_under_a_wrong_covariance_are_not(
+    solved: list[tuple[Trial, Cost, Linearization]], scale: float
+) -> None:
+    """The test above has the power to see a covariance that is too small or too large."""
+    assert kstest(quantiles(solved, scale), "uniform").pvalue < 1e-4
+
+
+def test_distances_of_tracked_observations_are_chi_squared() -> None:
+    """The true points are drawn around, so that errors of pose and point are independent."""
+    rng = np.random.default_rng(23)
+    distances = []
+    for _ in range(250):
+        start = rng.uniform(0.0, 20.0)
+        times = np.array([start + 0.25 * k for k in range(FRAMES)])
+        obs, at = scene(Flight(), CAMERAS, room(8, rng), times, rng, SIGMA_PX)
+        if len(obs) == 0:
+            continue
+        root = rng.normal(size=(9, 9)) * np.repeat([3e-4, 2e-3, 2e-3], 3)[:, None]
+        error = root @ rng.normal(size=9)
+        turns = np.broadcast_to(Rotation.from_rotvec(error[:3]).as_matrix(), (FRAMES, 3, 3))
+        wrong = Geometry(
+            at.rotations @ turns,
+            at.positions + at.rotations @ error[3:6],
+            at.points + error[6:],
+        )
+        row = np.arange(len(obs)) == rng.integers(len(obs))
+        one = obs.rows(row)
+        by_pose, by_point = PROJECTION.jacobians(one, wrong)
+        H = np.concatenate([by_pose, by_point], axis=2) / SIGMA_PX
+        r = PROJECTION.residuals(one, wrong)[0] / SIGMA_PX
+        distances.append(float(squared_mahalanobis(r, H, root @ root.T)[0]))
+    assert kstest(distances, chi2(2).cdf).pvalue > 0.01
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_the_gate_passes_its_share_of_correct_features(
+    solved: list[tuple[Trial, Cost, Linearization]], confidence: float
+) -> None:
+    gating = GatingConfig(robust_loss="none", confidence=confidence)
+    config = CONFIG.model_copy(update={"gating": gating})
+    passed: list[bool] = []
+    for case, cost, linear in solved:
+        tracked, fresh = replace(cost, config=config).gate(linear, case.covariance, case.layout)
+        assert len(tracked) == 0
+        passed += fresh.tolist()
+    error = np.sqrt(confidence * (1 - confidence) / len(passed))
+    assert abs(np.mean(passed) - confidence) < 4 * error + 0.01
+
+
+def test_wrong_features_are_rejected_and_right_ones_are_not() -> None:
+    rng = np.random.default_rng(31)
+    caught = spared = wrong = right = 0
+    for _ in range(60):
+        case = trial(rng)
+        if len(case.obs.ids) < 2:
+            continue
+        bad = np.arange(len(case.obs.ids)) % 2 == 0
+        rows = np.flatnonzero(bad[case.obs.feature] & (case.obs.slots == 3))
+        case.obs.pixels[rows] += 15.0 * rng.choice([-1.0, 1.0], (len(rows), 2))
+        cost, linear = fresh_cost(case)
+        fresh = cost.gate(linear, case.covariance, case.layout)[1]
+        caught, wrong = caught + int((~fresh[bad]).sum()), wrong + int(bad.sum())
+        spared, right = spared + int(fresh[~bad].sum()), right + int((~bad).sum())
+    assert wrong > 50
+    assert caught == wrong
+    assert spared > 0.9 * right
+
+
+def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
+    rng = np.random.default_rng(37)
+    case = trial(rng)
+    while len(case.obs.ids) < 3:
+        case = trial(rng)
+    bad = np.arange(len(case.obs)) % 4 == 1
+    cost, _, P, layout = tracked_cost(case, rng)
+    assert cost.tracked is not None
+    case.obs.pixels[bad] += 60.0
+    tracked, fresh = cost.gate(cost.linearize(), P, layout)
+    assert len(fresh) == 0
+    assert not tracked[bad].any()
+    assert tracked[~bad].mean() > 0.8
+
+
+def test_thresholds_are_quantiles() -> None:
+    dof = np.array([2, 1, 27, 3])
+    np.testing.assert_allclose(threshold(dof, 0.95), chi2.ppf(0.95, dof))
+    assert len(threshold(np.zeros(0, np.int64), 0.95)) == 0

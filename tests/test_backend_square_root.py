@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Square-root information against dense linear algebra."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
+
+FloatArray = NDArray[np.float64]
+DIMS = {10: 3, 11: 6, 12: 1, 13: 3, 14: 2}
+SIZE = sum(DIMS.values())
+SEEDS = range(5)
+
+
+def random_rows(rng: np.random.Generator, count: int, size: int = SIZE) -> FloatArray:
+    return rng.normal(size=(count, size + 1))
+
+
+def gaussian(rng: np.random.Generator) -> SquareRootInformation:
+    Rd = triangularize(random_rows(rng, 2 * SIZE))
+    return SquareRootInformation(Layout(DIMS), Rd)
+
+
+def cost_at(gauss: SquareRootInformation, x: FloatArray) -> float:
+    """The whole least-squares cost, with the part that no increment can remove."""
+    return float(np.sum((gauss.R @ x - gauss.d) ** 2) + gauss.Rd[-1, -1] ** 2)
+
+
+def dense(*blocks: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of stacked rows by a textbook least squares."""
+    rows = np.concatenate(blocks)
+    A, b = rows[:, :-1], rows[:, -1]
+    mean = np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=np.float64)
+    return mean, np.asarray(np.linalg.inv(A.T @ A), dtype=np.float64)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("count", [0, 1, SIZE, 2 * SIZE, 2 * SIZE + 1, 20 * SIZE])
+def test_an_update_is_least_squares_of_all_rows(seed: int, count: int) -> None:
+    """Also for more rows than twice the columns, which are compressed first."""
+    rng = np.random.default_rng(seed)
+    prior, rows = gaussian(rng), random_rows(rng, count)
+    posterior = prior.updated(rows)
+    mean, covariance = dense(prior.Rd, rows)
+    np.testing.assert_allclose(posterior.solution(), mean, atol=1e-9)
+    np.testing.assert_allclose(posterior.covariance(), covariance, atol=1e-9)
+    root = posterior.root_covariance()
+    np.testing.assert_allclose(root @ root.T, covariance, atol=1e-9)
+    x = rng.normal(size=SIZE)
+    stacked = np.concatenate([prior.Rd, rows])
+    expected = np.sum((stacked[:, :-1] @ x - stacked[:, -1]) ** 2)
+    np.testing.assert_allclose(cost_at(posterior, x), expected, rtol=1e-10)
+
+
+def test_a_tall_update_equals_the_same_rows_in_pieces() -> None:
+    rng = np.random.default_rng(0)
+    prior, rows = gaussian(rng), random_rows(rng, 7 * SIZE)
+    whole = prior.updated(rows)
+    pieces = prior
+    for part in np.array_split(rows, 9):
+        pieces = pieces.updated(part)
+    np.testing.assert_allclose(whole.solution(), pieces.solution(), atol=1e-9)
+    np.testing.assert_allclose(whole.R.T @ whole.R, pieces.R.T @ pieces.R, atol=1e-9)
+    assert np.all(np.tril(whole.Rd, -1) == 0.0)
+
+
+def test_an_update_leaves_the_prior_and_the_rows_alone() -> None:
+    rng = np.random.default_rng(1)
+    prior, rows = gaussian(rng), np.asfortranarray(random_rows(rng, SIZE))
+    before = prior.Rd.copy(), rows.copy()
+    prior.updated(rows)
+    np.testing.assert_array_equal(prior.Rd, before[0])
+    np.testing.assert_array_equal(rows, before[1])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_marginal_is_the_schur_complement(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    gauss = gaussian(rng)
+    keys = rng.permutation(list(DIMS)).tolist()
+    keep, gone = keys[:3], keys[3:]
+    marginal = gauss.marginal(keep)
+    information, vector = gauss.R.T @ gauss.R, gauss.R.T @ gauss.d
+    k, g = gauss.layout.indices(keep), gauss.layout.indices(gone)
+    gain = information[np.ix_(k, g)] @ np.linalg.inv(information[np.ix_(g, g)])
+    schur = information[np.ix_(k, k)] - gain @ information[np.ix_(g, k)]
+    assert list(marginal.layout.dims) == keep
+    np.testing.assert_allclose(marginal.R.T @ marginal.R, schur, atol=1e-9)
+    np.testing.assert_allclose(marginal.R.T @ marginal.d, vector[k] - gain @ vector[g], atol=1e-9)
+    np.testing.assert_allclose(marginal.solution(), gauss.solution()[k], atol=1e-9)
+    np.testing.assert_allclose(marginal.covariance(), gauss.covariance()[np.ix_(k, k)], atol=1e-9)
+    best = gauss.solution()
+    np.testing.assert_allclose(cost_at(marginal, best[k]), cost_at(gauss, best), rtol=1e-9)
+
+
+def test_a_marginal_over_all_variables_only_reorders() -> None:
+    gauss = gaussian(np.random.default_rng(2))
+    keys = list(DIMS)[::-1]
+    again = gauss.marginal(keys).marginal(list(DIMS))
+    np.testing.assert_allclose(again.R.T @ again.R, gauss.R.T @ gauss.R, atol=1e-9)
+    assert gauss.marginal([]).layout.size == 0
+
+
+def test_what_is_not_determined_is_not_made_up() -> None:
+    gauss = gaussian(np.random.default_rng(3)).extended({99: 3})
+    kept = gauss.marginal([99, 10])
+    np.testing.assert_allclose(kept.R[:3, :3], 0.0, atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        gauss.solution()
+    with pytest.raises(np.linalg.LinAlgError):
+        gauss.covariance()
+
+
+def test_a_shift_moves_the_argument() -> None:
+    rng = np.random.default_rng(4)
+    gauss, delta, x = gaussian(rng), rng.normal(size=SIZE), rng.normal(size=SIZE)
+    shifted = gauss.shifted(delta)
+    np.testing.assert_allclose(cost_at(shifted, x), cost_at(gauss, x + delta), rtol=1e-10)
+    np.testing.assert_allclose(shifted.solution(), gauss.solution() - delta, atol=1e-9)
+    np.testing.assert_array_equal(shifted.R, gauss.R)
+
+
+def test_an_extension_adds_variables_of_which_nothing_is_known() -> None:
+    rng = np.random.default_rng(5)
+    gauss = gaussian(rng)
+    wide = gauss.extended({20: 2, 21: 3})
+    assert list(wide.layout.dims) == [*DIMS, 20, 21]
+    x = rng.normal(size=SIZE + 5)
+    np.testing.assert_allclose(cost_at(wide, x), cost_at(gauss, x[:SIZE]), rtol=1e-12)
+    rows = random_rows(rng, 12, SIZE + 5)
+    padded = np.insert(gauss.Rd, [SIZE] * 5, 0.0, axis=1)
+    mean, covariance = dense(padded, rows)
+    np.testing.assert_allclose(wide.updated(rows).solution(), mean, atol=1e-9)
+    np.testing.assert_allclose(wide.updated(rows).covariance(), covariance, atol=1e-9)
+    assert gauss.extended({}) is gauss
+
+
+def test_knowledge_can_grow_from_nothing() -> None:
+    empty = SquareRootInformation.empty()
+    assert empty.layout.size == 0
+    grown = empty.extended({7: 2}).updated(np.array([[2.0, 0.0, 4.0], [0.0, 1.0, 3.0]]))
+    np.testing.assert_allclose(grown.solution(), [2.0, 3.0])
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (7, 7), (40, 7)])
+def test_a_triangle_has_the_same_normal_equations(shape: tuple[int, int]) -> None:
+    rows = np.random.default_rng(6).normal(size=shape)
+    R = triangularize(rows)
+    assert R.shape == (7, 7)
+    assert np.all(np.tril(R, -1) == 0.0)
+    np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9)

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The variables: estimates, linearisation points, and which of them may move."""
+
+import gtsam
+import numpy as np
+import pytest
+from flight import Flight, rig, room, scene
+from gtsam.symbol_shorthand import B, L, V, X
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.cost import Cost, NewFeatures
+from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.policies import MarginalizationPolicy
+from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.state import State, dim, dims_of, imu_state_keys
+from slam_graph.geometry.trajectory import NavState
+
+FloatArray = NDArray[np.float64]
+KEYS = [L(5), X(0), X(1), V(1), B(1)]
+
+
+@pytest.fixture
+def state() -> State:
+    """Two IMU states and a feature."""
+    made = State()
+    for frame in range(2):
+        made.insert_imu_state(frame, Flight().nav_state(0.3 * frame))
+    made.insert_point(5, np.array([1.0, 2.0, 3.0]))
+    return made
+
+
+def layout(keys: list[int]) -> Layout:
+    return Layout(dims_of(keys))
+
+
+def delta(keys: list[int], seed: int = 0) -> FloatArray:
+    return 0.1 * np.random.default_rng(seed).normal(size=layout(keys).size)
+
+
+def assert_same_values(a: gtsam.Values, b: gtsam.Values, atol: float = 1e-12) -> None:
+    assert set(a.keys()) == set(b.keys())
+    difference = a.localCoordinates(b)
+    for key in a.keys():  # noqa: SIM118
+        np.testing.assert_allclose(difference.at(key), 0.0, atol=atol)
+
+
+def test_dimensions() -> None:
+    assert [dim(key) for key in KEYS] == [3, 6, 6, 3, 6]
+    assert imu_state_keys(3) == (X(3), V(3), B(3))
+
+
+def test_a_state_goes_in_and_comes_out() -> None:
+    given = Flight(gyro_bias=np.arange(3.0), accel_bias=-np.arange(3.0)).nav_state(0.7)
+    made = State()
+    made.insert_imu_state(4, given)
+    out = made.nav_state(4, given.stamp_ns, np.eye(15))
+    assert isinstance(out, NavState)
+    np.testing.assert_array_equal(out.world_T_body.matrix(), given.world_T_body.matrix())
+    for name in ("velocity", "gyro_bias", "accel_bias"):
+        np.testing.assert_array_equal(getattr(out, name), getattr(given, name))
+
+
+def test_an_update_is_a_retraction_at_the_linearisation_point(state: State) -> None:
+    first = gtsam.Values(state.first)
+    step = delta(KEYS)
+    state.update(layout(KEYS), step)
+    columns = layout(KEYS).columns
+    pose = first.atPose3(X(1)).retract(step[columns[X(1)]])
+    np.testing.assert_allclose(state.estimate.atPose3(X(1)).matrix(), pose.matrix())
+    for key, values in ((V(1), first.atVector(V(1))), (L(5), first.atPoint3(L(5)))):
+        moved = state.estimate.atPoint3(key) if key == L(5) else state.estimate.atVector(key)
+        np.testing.assert_allclose(moved, values + step[columns[key]])
+    bias = first.atConstantBias(B(1)).vector() + step[columns[B(1)]]
+    np.testing.assert_allclose(state.estimate.atConstantBias(B(1)).vector(), bias)
+    np.testing.assert_array_equal(state.estimate.atVector(V(0)), first.atVector(V(0)))
+    assert_same_values(state.first, first)
+
+
+def test_updates_of_a_frozen_variable_add_up_in_one_tangent(state: State) -> None:
+    """Not first ⊕ a ⊕ b but first ⊕ (a + b): the prior is a function of that sum."""
+    state.freeze(KEYS)
+    a, b = delta(KEYS, 1), delta(KEYS, 2)
+    for step in (a, b):
+        state.relinearize()
+        state.update(layout(KEYS), step)
+    np.testing.assert_allclose(state.offset(layout(KEYS)), a + b)
+    columns = layout(KEYS).columns[X(0)]
+    expected = state.first.atPose3(X(0)).retract((a + b)[columns])
+    np.testing.assert_allclose(state.estimate.atPose3(X(0)).matrix(), expected.matrix())
+    steps = state.first.atPose3(X(0)).retract(a[columns]).retract(b[columns])
+    assert np.abs(steps.matrix() - expected.matrix()).max() > 1e-4
+
+
+def test_relinearisation_moves_all_but_the_frozen(state: State) -> None:
+    state.freeze([X(0)])
+    state.update(layout(KEYS), delta(KEYS))
+    first, estimate = gtsam.Values(state.first), gtsam.Values(state.estimate)
+    state.relinearize()
+    assert_same_values(state.estimate, estimate)
+    np.testing.assert_array_equal(state.first.atPose3(X(0)).matrix(), first.atPose3(X(0)).matrix())
+    assert state.offsets[X(0)].any()
+    for key in (X(1), V(1), B(1), L(5)):
+        assert not state.offsets[key].any()
+    np.testing.assert_allclose(
+        state.first.atPose3(X(1)).matrix(), estimate.atPose3(X(1)).matrix(), atol=1e-12
+    )
+
+
+def test_rebasing_moves_the_frozen_too(state: State) -> None:
+    state.freeze(KEYS)
+    state.update(layout(KEYS), delta(KEYS))
+    estimate = gtsam.Values(state.estimate)
+    state.rebase()
+    assert not state.frozen
+    assert not state.offset(layout(KEYS)).any()
+    assert_same_values(state.estimate, estimate)
+    assert_same_values(state.first, estimate)
+
+
+def test_a_copy_is_independent(state: State) -> None:
+    state.freeze([V(1)])
+    before = state.copy()
+    values = gtsam.Values(state.estimate)
+    state.update(layout(KEYS), delta(KEYS))
+    state.freeze([X(0)])
+    state.remove([L(5)])
+    assert_same_values(before.estimate, values)
+    assert before.frozen == {V(1)}
+    assert not before.offset(layout(KEYS)).any()
+    state.assign(before)
+    assert_same_values(state.estimate, values)
+    assert state.offsets.keys() == before.offsets.keys()
+    state.update(layout(KEYS), delta(KEYS))
+    assert not before.offset(layout(KEYS)).any()
+
+
+def test_removal_forgets_everything_of_a_variable(state: State) -> None:
+    state.freeze([L(5), X(0)])
+    state.remove([L(5), V(0)])
+    assert not state.estimate.exists(L(5))
+    assert not state.first.exists(V(0))
+    assert L(5) not in state.offsets
+    assert state.frozen == {X(0)}
+    state.insert_point(5, np.zeros(3))
+    assert L(5) not in state.frozen
+
+
+def test_a_cost_is_restored_with_its_features() -> None:
+    """A rejected step of Levenberg-Marquardt leaves no trace."""
+    rng = np.random.default_rng(0)
+    cameras = rig()
+    obs, truth = scene(Flight(), cameras, room(60, rng), np.linspace(0.0, 1.0, 4), rng)
+    state = State()
+    for frame, t_s in enumerate(np.linspace(0.0, 1.0, 4)):
+        state.insert_imu_state(frame, Flight().nav_state(float(t_s)))
+    cost = Cost(state, RigProjection(cameras), BackendConfig(), SquareRootInformation.empty())
+    cost.prior = cost.prior.extended(dims_of(X(i) for i in range(4)))
+    cost.fresh = NewFeatures(obs, truth.points, np.zeros(len(obs.ids), np.bool_))
+    linear = cost.linearize()
+    error = cost.error(linear)
+    before, estimate = cost.snapshot(), gtsam.Values(state.estimate)
+    cost.apply(delta([X(i) for i in range(4)]), linear, cost.layout())
+    assert cost.error(cost.linearize()) != error
+    assert np.abs(cost.fresh.points - truth.points).max() > 1e-3
+    cost.restore(before)
+    assert cost.state is state
+    assert_same_values(state.estimate, estimate)
+    np.testing.assert_array_equal(cost.fresh.points, truth.points)
+    assert cost.error(cost.linearize()) == pytest.approx(error, rel=1e-12)
+
+
+@pytest.mark.parametrize("first_estimates", [True, False])
+def test_the_prior_is_a_function_of_the_offsets(state: State, first_estimates: bool) -> None:
+    """At the estimate it is the marginal of the posterior, wherever it is based."""
+    rng = np.random.default_rng(3)
+    wide = layout(KEYS)
+    posterior = SquareRootInformation(wide, triangularize(rng.normal(size=(40, wide.size + 1))))
+    state.freeze([X(0)])
+    state.update(wide, delta(KEYS))
+    keep = [X(1), L(5)]
+    expected = posterior.marginal(keep)
+    prior = marginalize(
+        posterior, state, keep, MarginalizationPolicy(first_estimates=first_estimates)
+    )
+    assert not state.estimate.exists(X(0))
+    assert state.estimate.exists(X(1))
+    offset = state.offset(prior.layout)
+    assert bool(offset.any()) is first_estimates
+    assert state.frozen == (set(keep) if first_estimates else set())
+    np.testing.assert_allclose(prior.shifted(offset).Rd, expected.Rd, atol=1e-12)
