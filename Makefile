@@ -1,0 +1,66 @@
+# What one does with a checkout; `make help` lists it. Needs python3 with venv, and make.
+
+PYTHON ?= python3
+DATA ?= demo
+GROUNDTRUTH ?=
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+# Matrices here are a few hundred wide: threads of BLAS cost more than they bring.
+export OPENBLAS_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint types check format docs bench clean
+
+help:  ## List these commands
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
+
+demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path for another one)
+	@$(BIN)/slam-graph run "$(DATA)" $(if $(GROUNDTRUTH),--groundtruth "$(GROUNDTRUTH)") $(ARGS)
+
+test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/.installed-dev  ## Check style and formatting
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-dev  ## Check types
+	@$(BIN)/mypy
+
+check: lint types test  ## All of these
+
+format: $(VENV)/.installed-dev  ## Put the sources into the agreed format
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+docs: $(VENV)/.installed  ## Write docs/configuration.md anew from the settings in the code
+	@$(BIN)/python docs/generate_configuration.py
+
+bench: $(VENV)/.installed  ## Measure accuracy and speed
+	@$(BIN)/python -m benchmarks.run $(ARGS)
+
+clean:  ## Remove what was built, installed and cached, but no results
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamps: installed again only when a requirement or a pin has changed. The second installation
+# contains the first.
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(call install,.)
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml constraints.txt
+	@$(call install,.[dev])
+	@touch $(VENV)/.installed $@
+
+define install
+$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+  echo "error: slam_graph needs Python 3.11 or newer, $(PYTHON) is not; say PYTHON=path" >&2; exit 1; } ; \
+echo "Installing into $(VENV); the first time takes a minute or two." >&2; \
+$(PYTHON) -m venv $(VENV) && $(PIP) install --quiet -c constraints.txt -e '$(1)'
+endef

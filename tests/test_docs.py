@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The documents: links lead somewhere, named files exist, the list of settings is current."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)")
+SOURCE = re.compile(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|yaml|md|ipynb|png))`")
+
+KIND = re.compile(r"(?:\.warn\(|diagnostics\.counts\[|Fault\(|kind = )\s*\"([a-z_]+)\"")
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that a forge makes of the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        if target.startswith(("https://", "http://")):
+            continue
+        path = page.parent / target
+        assert path.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_sources_that_are_named_exist(page: Path) -> None:
+    """A path in backquotes is meant from the top of the checkout, or from the package."""
+    for path in SOURCE.findall(page.read_text(encoding="utf-8")):
+        found = (ROOT / path).is_file() or (ROOT / "slam_graph" / path).is_file()
+        assert found, f"{page.name}: {path}"
+
+
+def test_the_list_of_settings_is_current() -> None:
+    script = ROOT / "docs" / "generate_configuration.py"
+    spec = importlib.util.spec_from_file_location("generate_configuration", script)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    written = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert written == module.page(), "run `make docs`"
+
+
+def test_every_kind_of_warning_is_explained() -> None:
+    kinds = set()
+    for path in (ROOT / "slam_graph").rglob("*.py"):
+        source = path.read_text(encoding="utf-8")
+        kinds |= set(
+            re.findall(
+                r"(?:\.warn\(|diagnostics\.counts\[|Fault\(|kind = )\s*\"([a-z_]+)\"", source
+            )
+        )
+    assert {"imu_gap", "image_unreadable", "feature_rejected_by_gate"} <= kinds
+    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"^\| `([a-z_]+)` \|", page, re.MULTILINE))
+    assert not kinds - explained

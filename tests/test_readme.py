@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the README shows is true: its Python runs, its commands exist, the demo prints its lines."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from slam_graph.cli.main import app
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [README, *((ROOT / "docs" / page).read_text() for page in ("results.md", "datasets.md"))]
+
+GROUPS = ("data", "config")
+"""Commands of `slam-graph` that have commands of their own."""
+
+
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+
+
+def shell_lines() -> list[str]:
+    """The commands of all pages, once each."""
+    shown = [line for page in PAGES for block in blocks("sh", page) for line in block.splitlines()]
+    typed = [line for block in blocks("console") for line in block.splitlines()]
+    return sorted({*shown, *(line.removeprefix("$ ") for line in typed if line.startswith("$ "))})
+
+
+def first_words(text: str) -> list[str]:
+    """The label of each line of the report of a run."""
+    return [line.split("  ")[0] for line in text.splitlines() if line[:1].isalpha()]
+
+
+def test_python_example_runs_in_ten_lines(tmp_path: Path) -> None:
+    (example,) = blocks("python")
+    assert len([line for line in example.splitlines() if line.strip()]) == 10
+    done = subprocess.run(
+        [sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[-1]) < 0.5, "msckf and swf are half a metre apart"
+    assert (tmp_path / "results" / "msckf" / "trajectory.tum").is_file()
+
+
+@pytest.mark.parametrize("line", shell_lines())
+def test_command_exists(line: str) -> None:
+    program, *words = shlex.split(line)
+    if program == "make":
+        done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return
+    assert program == "slam-graph"
+    command = words[: 2 if words[0] in GROUPS else 1]
+    shown = CliRunner().invoke(app, [*command, "--help"])
+    assert shown.exit_code == 0
+    for word in words:
+        assert not word.startswith("-") or re.search(rf"(^|\s){word}\b", shown.stdout), word
+
+
+def test_targets_that_are_named_exist() -> None:
+    targets = set(re.findall(r"`make ([a-z]+)", README + (ROOT / "CONTRIBUTING.md").read_text()))
+    assert {"bench", "check"} <= targets
+    for target in targets:
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+
+def test_demo_prints_what_is_shown(tmp_path: Path) -> None:
+    shown = blocks("console")[0].splitlines()
+    done = subprocess.run(
+        [sys.executable, "-m", "slam_graph.cli.main", "run", "demo", "--no-progress"],
+        cwd=tmp_path,
+        env=os.environ,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    printed = done.stdout.splitlines()
+    assert shown[0] == "$ make demo"
+    assert first_words("\n".join(shown[1:-2])) == first_words("\n".join(printed[:-2]))
+    assert shown[-1] == printed[-1], "the list of files"
+    assert shown[4] == printed[3], "how much was read"
