@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Module 1, cost construction: which poses, features and residuals are in the cost now.
 
-The policy chooses the past poses. Features of the state are observed once more; features whose
-tracks end enter with all their observations and are used once; long-lived ones become variables of
-the state. All of them pass the χ² gate first.
+The policy chooses the past poses. Features of the state are observed once more; long-lived ones
+become variables of the state; others enter with all their observations, to be used once when their
+track ends, or in every step as long as poses that saw them stay. All of them pass the χ² gate
+first.
 """
 
 from __future__ import annotations
@@ -12,23 +13,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
-from slam_graph.backend.policies import POSE_CHOICES, CostPolicy
+from slam_graph.backend.policies import CostPolicy
+from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
 from slam_graph.backend.state import stacked_poses
-from slam_graph.backend.tracks import is_in
+from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
+FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(eq=False)
@@ -39,21 +42,26 @@ class ConstructedCost:
         cost: all residuals.
         linear: their linearisation at the current estimates, where it is known already.
         past: past frames whose poses stay.
+        moving: those of them whose velocity and bias stay.
         features: ids of the features that stay in the state, ascending.
+        leaving: (J,) those of the cost's new features that are used for the last time.
     """
 
     cost: Cost
     linear: Linearization | None
     past: list[int]
+    moving: list[int]
     features: IntArray
+    leaving: BoolArray
 
     def drop_features(self) -> None:
-        """Leave only the prior and the dynamics."""
+        """Leave only the prior and the factors."""
         if self.cost.fresh is not None:
             new = self.cost.fresh.obs.ids[self.cost.fresh.in_state]
             self.cost.state.remove(L(int(j)) for j in new)
             self.features = self.features[~is_in(self.features, new)]
         self.cost.tracked = self.cost.fresh = self.linear = None
+        self.leaving = np.zeros(0, np.bool_)
 
 
 class CostConstruction:
@@ -71,59 +79,89 @@ class CostConstruction:
         self.config = config
         self.diagnostics = diagnostics
 
-    def construct(
-        self, window: Window, dynamics: Sequence[gtsam.NonlinearFactor], still: bool
-    ) -> ConstructedCost:
+    def construct(self, window: Window, still: bool) -> ConstructedCost:
         """The cost now.
 
         Args:
             window: with the current frame and its observations.
-            dynamics: factors between the frame before and the current one.
             still: whether the platform stands still; then images say nothing new, and the new pose
                 takes the place of the last one.
         """
-        cost = Cost(window.state, self.rig, self.config, window.prior, dynamics)
+        cost = Cost(window.state, self.rig, self.config, window.prior, list(window.factors))
+        nothing = np.zeros(0, np.bool_)
         if still:
-            return ConstructedCost(cost, None, window.past[:-1], window.features)
-        past = POSE_CHOICES[self.policy.past_poses](window.past, self.policy.max_past_poses)
-        oldest = window.past[0]
-        layout = cost.layout()
-        predicted = cost.prior_at_estimate().updated(cost.factor_rows(layout)).covariance()
+            past = window.past[:-1]
+            return self._constructed(window, cost, None, past, window.features, nothing)
+        past = POSE_CHOICES[self.policy.past_poses](window, self.policy)
+        predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
         seen = np.intersect1d(window.features, window.tracks.ids_in(window.frame), True)
         cost.tracked = window.tracks.observations(seen, [window.frame])
         window.tracks.consume(window.features)
-        cost.fresh = self._new_features(window, None if oldest in past else oldest, len(seen))
+        leaving_frames = [i for i in window.past if i not in past]
+        cost.fresh = self._new_features(window, leaving_frames, len(seen))
         linear = cost.linearize()
-        tracked_ok, fresh_ok = cost.gate(linear, predicted, layout)
-        linear = self._leave_out(cost, linear, tracked_ok, fresh_ok)
-        # a pose that no unused observation refers to has nothing more to give
-        useful = window.tracks.frames()
-        past = [i for i in past if i in useful]
-        return ConstructedCost(cost, linear, past, self._in_state(cost))
+        tracked_ok, fresh_ok = cost.gate(linear, predicted)
+        linear = self._leave_out(window, cost, linear, tracked_ok, fresh_ok)
+        leaving = self._leaving(window, cost, leaving_frames)
+        if self.policy.features != "window":
+            # a pose that no unused observation refers to has nothing more to give
+            useful = window.tracks.frames()
+            past = [i for i in past if i in useful]
+        return self._constructed(window, cost, linear, past, self._in_state(window, cost), leaving)
+
+    def _constructed(
+        self,
+        window: Window,
+        cost: Cost,
+        linear: Linearization | None,
+        past: list[int],
+        features: IntArray,
+        leaving: BoolArray,
+    ) -> ConstructedCost:
+        count = self.policy.recent_frames - 1
+        recent = set(window.past[-count:]) if count else set()
+        moving = [i for i in window.moving if i in recent and i in past]
+        return ConstructedCost(cost, linear, past, moving, features, leaving)
+
+    # --- features --------------------------------------------------------------------------------
 
     def _new_features(
-        self, window: Window, oldest_leaving: int | None, in_state: int
+        self, window: Window, leaving_frames: Sequence[int], in_state: int
     ) -> NewFeatures | None:
-        """Triangulated features that enter the cost now; their observations are used up."""
-        room = self.policy.max_state_features - in_state
-        choice = choose_features(window.tracks, window.frame, oldest_leaving, room, self.policy)
-        ids = np.union1d(choice.ended, choice.lasting)
+        """Triangulated features that are in the cost with all of their observations."""
+        bound = self.policy.max_state_features
+        room = len(window.tracks.seen) if bound is None else bound - in_state
+        choice = choose_features(window, leaving_frames, room, self.policy)
+        ids = np.union1d(choice.used, choice.lasting)
         if len(ids) == 0:
             return None
         obs = window.tracks.observations(ids)
+        points, good = self._points(window, obs)
+        lasting = is_in(ids, choice.lasting)
+        if self.policy.features == "window":
+            window.tracks.consume(ids[lasting & good])
+        else:  # a lasting one that is not good may yet become so
+            window.tracks.consume(ids[~lasting | good])
+        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~good & ~lasting))
+        return NewFeatures(obs, points, lasting).subset(good)
+
+    def _points(self, window: Window, obs: Observations) -> tuple[FloatArray, BoolArray]:
+        """Positions (J, 3) of features, those of the last step where there are, and their worth."""
         poses = stacked_poses(window.state.estimate, obs.frames)
         result = triangulate(obs, self.rig, *poses, self.config.triangulation)
-        lasting = is_in(ids, choice.lasting)
-        window.tracks.consume(ids[~lasting | result.good])  # a lasting one may yet become good
-        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~result.good & ~lasting))
-        return NewFeatures(obs, result.points, lasting).subset(result.good)
+        known_ids, known_points = window.landmarks
+        known = is_in(obs.ids, known_ids)
+        points = result.points.copy()
+        points[known] = known_points[np.searchsorted(known_ids, obs.ids[known])]
+        return points, result.good
 
     def _leave_out(
         self,
+        window: Window,
         cost: Cost,
         linear: Linearization,
-        tracked_ok: NDArray[np.bool_],
-        fresh_ok: NDArray[np.bool_],
+        tracked_ok: BoolArray,
+        fresh_ok: BoolArray,
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
         rejected = int(np.sum(~tracked_ok) + np.sum(~fresh_ok))
@@ -131,16 +169,35 @@ class CostConstruction:
         if linear.tracked is not None and cost.tracked is not None:
             cost.tracked = cost.tracked.rows(tracked_ok)
         if linear.fresh is not None and cost.fresh is not None:
+            window.tracks.consume(cost.fresh.obs.ids[~fresh_ok])
             cost.fresh = cost.fresh.subset(fresh_ok)
             for row in np.flatnonzero(cost.fresh.in_state):
                 cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])
         return linear.subset(tracked_ok, fresh_ok)
 
-    def _in_state(self, cost: Cost) -> IntArray:
-        """The features of the state that the current frame sees, old and new."""
+    def _in_state(self, window: Window, cost: Cost) -> IntArray:
+        """The features that stay in the state: those that are tracked, old and new, or all."""
         ids = np.zeros(0, np.int64)
         if cost.tracked is not None:
             ids = np.unique(cost.tracked.ids[cost.tracked.feature])
+        if self.policy.keep_lost_features:
+            ids = window.features
         if cost.fresh is not None:
             ids = np.union1d(ids, cost.fresh.obs.ids[cost.fresh.in_state])
         return ids
+
+    def _leaving(self, window: Window, cost: Cost, leaving_frames: Sequence[int]) -> BoolArray:
+        """Which new features (J,) are used for the last time.
+
+        All of them, or those of a keyframe that leaves which are no longer tracked.
+        """
+        if cost.fresh is None:
+            return np.zeros(0, np.bool_)
+        ids = cost.fresh.obs.ids
+        if self.policy.features != "window":
+            return np.ones(len(ids), np.bool_)
+        going = [i for i in leaving_frames if i in window.keyframes_before]
+        seen_by_going = np.zeros(len(ids), np.bool_)
+        frames = np.array(cost.fresh.obs.frames)[cost.fresh.obs.frame]
+        seen_by_going[cost.fresh.obs.feature[np.isin(frames, going)]] = True
+        return (seen_by_going & ~is_in(ids, window.tracks.seen)) | cost.fresh.in_state

@@ -101,6 +101,7 @@ class Cost:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
         if self.fresh is not None:
+            keys += [X(i) for i in self.fresh.obs.frames]
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
         return self.prior.layout.extended(
             dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
@@ -111,6 +112,13 @@ class Cost:
         prior = self.prior.shifted(self.state.offset(self.prior.layout))
         layout = self.layout()
         return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
+
+    def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
+        """The prior with only some of the factors and of the new features (J,)."""
+        features = self.fresh.subset(fresh) if self.fresh is not None else None
+        if features is not None:
+            features = replace(features, obs=features.obs.without_idle_frames())
+        return Cost(self.state, self.rig, self.config, self.prior, factors, None, features)
 
     def error(self, linear: Linearization) -> float:
         """Half the squared norm of all whitened residuals at the current estimates.
@@ -196,28 +204,28 @@ class Cost:
     # --- gating --------------------------------------------------------------------------------
 
     def gate(
-        self, linear: Linearization, covariance: FloatArray, layout: Layout
+        self, linear: Linearization, predicted: SquareRootInformation
     ) -> tuple[BoolArray, BoolArray]:
         """Which tracked observations (N,) and new features (J,) pass the χ² test.
 
         Args:
             linear: of this cost.
-            covariance: (n, n) predicted covariance of the variables of `layout`; what it does not
-                cover is not gated.
-            layout: its columns.
+            predicted: what is known of the variables before these measurements.
         """
         tracked = np.zeros(0, np.bool_)
         fresh = np.zeros(0, np.bool_)
         confidence = self.config.gating.confidence
         if linear.tracked is not None and self.tracked is not None:
-            columns = _tracked_columns(self.tracked, layout)
+            keys = [X(i) for i in self.tracked.frames]
+            keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
+            covariance = predicted.covariance_of(keys)
+            columns = _tracked_columns(self.tracked, Layout(dims_of(keys)))
             H = np.concatenate([linear.tracked.by_pose, linear.tracked.by_point], axis=2)
             P = covariance[columns[:, :, None], columns[:, None, :]]
             distance = squared_mahalanobis(linear.tracked.r, H, P)
             tracked = distance < threshold(np.array([2]), confidence)[0]
         if linear.fresh is not None and self.fresh is not None:
-            poses = layout.indices(X(i) for i in self.fresh.obs.frames)
-            P = covariance[np.ix_(poses, poses)]
+            P = predicted.covariance_of([X(i) for i in self.fresh.obs.frames])
             distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
             fresh = distance < threshold(linear.fresh.dof, confidence)
         return tracked, fresh
@@ -226,7 +234,8 @@ class Cost:
 def _tracked_columns(obs: Observations, layout: Layout) -> NDArray[np.intp]:
     """Columns (N, 9) of the pose and the feature of each observation."""
     poses = np.array([layout.columns[X(i)].start for i in obs.frames])
-    points = np.array([layout.columns[L(j)].start for j in obs.ids.tolist()])
+    keys = [L(j) for j in obs.ids.tolist()]
+    points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
     return np.concatenate(
         [
             poses[obs.frame][:, None] + np.arange(6),

@@ -20,11 +20,12 @@ from slam_graph.backend.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.initialization import Initializer, start_from
-from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.marginalization import marginalize_step
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.propagation import Propagation
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.state import imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.diagnostics import Diagnostics
@@ -80,20 +81,18 @@ class Estimator:
 
     # --- the loop --------------------------------------------------------------------------------
 
-    def _step(self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool) -> None:
+    def _step(self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool) -> NavState:
         """One turn of the loop: the three modules, in order."""
         with self._timed("propagation"):
-            dynamics = self._propagation.append_frame(window, self._imu, stamp_ns, still)
+            self._propagation.append_frame(window, self._imu, stamp_ns, still)
             window.tracks.add(window.frame, frame)
         with self._timed("cost"):
-            constructed = self._construction.construct(window, dynamics, still)
+            constructed = self._construction.construct(window, still)
         with self._timed("gauss_newton"):
             posterior = self._minimize(constructed)
         with self._timed("marginalization"):
-            keep = window.keys(constructed.past, constructed.features)
-            policy = self.algorithm.marginalization
-            window.prior = marginalize(posterior, window.state, keep, policy)
-            window.shrink(constructed.past, constructed.features)
+            marginalize_step(window, constructed, posterior, self.algorithm.marginalization)
+        return window.current(posterior.covariance_of(imu_state_keys(window.frame)))
 
     def _minimize(self, constructed: ConstructedCost) -> SquareRootInformation:
         """Take the steps; without the features if these leave something undetermined."""
@@ -159,6 +158,7 @@ class Estimator:
         self._latest_ns = stamp_ns
         frame = self._finite(frame)
         with self._threads.limit(limits=1, user_api="blas"):
+            state: NavState | None = None
             still = self._standstill.is_still(self._imu, stamp_ns, frame)
             if self.window is None:
                 with self._timed("start"):
@@ -166,10 +166,13 @@ class Estimator:
                     self.window = self._initializer.try_to_start(
                         self._imu, stamp_ns, frame, since_ns
                     )
+                if self.window is not None:
+                    current = imu_state_keys(self.window.frame)
+                    state = self.window.current(self.window.prior.covariance_of(current))
             elif stamp_ns > self.window.stamp_ns:
-                self._step(self.window, stamp_ns, frame, still)
+                state = self._step(self.window, stamp_ns, frame, still)
             self._imu.forget_before(stamp_ns - IMU_HISTORY_NS)
-            return self.window.current() if self.window is not None else None
+            return state
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features in the state."""

@@ -51,6 +51,11 @@ def minimize(
     return posterior
 
 
+def linearized(cost: Cost) -> SquareRootInformation:
+    """A cost as a Gaussian over an increment of the current estimates."""
+    return _system(cost, cost.linearize(), cost.layout())
+
+
 def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInformation:
     """The linearised cost as a Gaussian over an increment of the estimates."""
     rows = np.concatenate([cost.factor_rows(layout), cost.rows(linear, layout)])

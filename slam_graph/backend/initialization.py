@@ -163,9 +163,11 @@ class Initializer:
             return "motion that shows gravity and scale"
         last = len(window.frames) - 1
         keep = [L(j) for j in features.tolist()] + list(imu_state_keys(last))
-        prior = marginalize(posterior, cost.state, keep, self._algorithm.marginalization)
+        policy = self._algorithm.marginalization
+        prior = marginalize(posterior, cost.state, keep, policy.first_estimates)
         start = Window(last, window.stamps_ns[-1], cost.state, prior, features=features)
-        return self._doubt(normalized_cost, start.covariance()) or start
+        covariance = prior.covariance_of(imu_state_keys(last))
+        return self._doubt(normalized_cost, covariance) or start
 
     def _batch_cost(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Cost:
         """All states of the window, a prior on the first, and the features they see."""

@@ -11,34 +11,80 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from slam_graph.backend.construction import ConstructedCost
+from slam_graph.backend.gauss_newton import linearized
 from slam_graph.backend.policies import MarginalizationPolicy
 from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.state import State
+from slam_graph.backend.window import Window
+
+
+def marginalize_step(
+    window: Window,
+    constructed: ConstructedCost,
+    posterior: SquareRootInformation,
+    policy: MarginalizationPolicy,
+) -> None:
+    """Let go of what does not stay after a step.
+
+    Args:
+        window: loses the variables and observations that leave, and gets the new prior.
+        constructed: the cost of the step, at its minimum, and what stays.
+        posterior: of the whole cost, over an increment of the current estimates.
+        policy: which residuals become part of the prior.
+    """
+    keep = window.keys(constructed.past, constructed.moving, constructed.features)
+    if policy.absorb == "all":
+        window.factors = []
+    else:
+        staying = set(keep)
+        stays = [staying.issuperset(factor.keys()) for factor in window.factors]
+        leaving = [f for f, stay in zip(window.factors, stays, strict=True) if not stay]
+        posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
+        window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
+    _keep_landmarks(window, constructed)
+    window.prior = marginalize(posterior, window.state, keep, policy.first_estimates)
+    window.past, window.moving = list(constructed.past), list(constructed.moving)
+    window.features = constructed.features
+    window.tracks.retain([*constructed.past, window.frame])
+
+
+def _keep_landmarks(window: Window, constructed: ConstructedCost) -> None:
+    """Remember where the features are that the next step uses again, forget the others."""
+    fresh = constructed.cost.fresh
+    if fresh is None:
+        return
+    again = ~constructed.leaving
+    window.landmarks = fresh.obs.ids[again], fresh.points[again]
+    if len(constructed.leaving):
+        window.tracks.consume(fresh.obs.ids[constructed.leaving])
 
 
 def marginalize(
     posterior: SquareRootInformation,
     state: State,
     keep: Sequence[int],
-    policy: MarginalizationPolicy,
+    first_estimates: bool,
 ) -> SquareRootInformation:
     """Eliminate all variables but `keep` and make the rest the prior of the next step.
 
     Args:
-        posterior: over an increment of the current estimates.
+        posterior: over an increment of the current estimates; of the residuals that are to become
+            part of the prior.
         state: the variables that leave are removed from it; those that stay keep the linearisation
             points that the prior was made with (first-estimates Jacobians), or, without that, are
             linearised anew at their estimates.
-        keep: keys that stay, in the order of the new prior's columns.
-        policy: whether first-estimates Jacobians are used.
+        keep: keys that stay, in the order of the new prior's columns; those that the posterior does
+            not contain stay free of it.
+        first_estimates: whether first-estimates Jacobians are used.
 
     Returns:
         The prior as a function of the offsets of the estimates from their linearisation points.
     """
-    prior = posterior.marginal(keep)
-    state.remove([key for key in posterior.layout.dims if key not in prior.layout])
-    if policy.first_estimates:
-        state.freeze(keep)
-    else:
+    staying = set(keep)
+    prior = posterior.marginal([key for key in keep if key in posterior.layout])
+    state.remove([key for key in state.variables() if key not in staying])
+    if not first_estimates:
         state.rebase()
+    state.freeze(prior.layout.dims)
     return prior.shifted(-state.offset(prior.layout))

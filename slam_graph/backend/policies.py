@@ -3,56 +3,43 @@
 """The policy table: what makes one algorithm differ from another, module by module.
 
 An algorithm is a YAML file in `configs/algorithms/` with one section for each module of the loop.
+How poses are chosen is in `pose_choice.py`, how features are in `selection.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Literal
 
 from pydantic import Field
 
 from slam_graph.backend.config import Settings
 
-PoseChoice = Callable[[Sequence[int], int], list[int]]
-
-
-def most_recent(frames: Sequence[int], count: int) -> list[int]:
-    """The latest `count` frames."""
-    return list(frames[-count:])
-
-
-def evenly_spaced(frames: Sequence[int], count: int) -> list[int]:
-    """Frames thinned evenly in time once there are more than `count`, the oldest kept.
-
-    Every third frame leaves, starting from the second oldest (Mourikis & Roumeliotis 2007, sec.
-    III-E), so that some poses of the far past stay beside the recent ones.
-    """
-    if len(frames) <= count:
-        return list(frames)
-    leaving = set(frames[1:-1:3])
-    return [frame for frame in frames if frame not in leaving]
-
-
-POSE_CHOICES: dict[str, PoseChoice] = {
-    "most_recent": most_recent,
-    "evenly_spaced": evenly_spaced,
-}
-
 
 class CostPolicy(Settings):
     """Module 1: which variables and residuals are in the cost."""
 
-    past_poses: Literal["most_recent", "evenly_spaced"] = "most_recent"
+    past_poses: Literal["most_recent", "evenly_spaced", "keyframes"] = "most_recent"
     """Which past poses stay in the cost beside the current IMU state."""
     max_past_poses: int = Field(11, ge=1)
-    """N_max: how many past poses at most."""
-    max_state_features: int = Field(40, ge=0)
-    """How many long-lived features are held in the state; all others are used once."""
+    """N_max: how many past poses at most (of `keyframes`: how many keyframes)."""
+    recent_frames: int = Field(1, ge=1)
+    """How many of the last frames keep their velocity and bias; 1 is the current one only."""
+    features: Literal["once", "state", "window"] = "once"
+    """What becomes of a feature that is not held in the state. once: used when its track ends, with
+    all its observations, and marginalised at once. state: never used, only features of the state
+    count. window: in the cost of every step as long as poses that saw it are."""
+    keep_lost_features: bool = False
+    """Whether features of the state stay in it when they are no longer tracked."""
+    max_state_features: int | None = Field(40, ge=0)
+    """How many features are held in the state while they are tracked; null for no bound."""
     state_feature_frames: int = Field(10, ge=2)
     """How many frames must have seen a feature before it may be held in the state."""
     max_features_per_step: int = Field(60, ge=1)
-    """How many features at most are used once in one step (the longest tracks first)."""
+    """How many features outside the state are in the cost of one step (longest tracks first)."""
+    keyframe_overlap: float = Field(0.6, ge=0, le=1)
+    """A frame becomes a keyframe when the last one saw less than this share of its features."""
+    keyframe_motion: float = Field(0.05, ge=0)
+    """… or when these have moved by more than this in the image (median, focal lengths)."""
 
 
 class GaussNewtonPolicy(Settings):
@@ -72,6 +59,9 @@ class MarginalizationPolicy(Settings):
 
     first_estimates: bool = True
     """First-estimates Jacobians for the variables of the prior."""
+    absorb: Literal["all", "touching"] = "all"
+    """Which residuals become part of the prior: all of the step, as in a filter, or only those that
+    touch a variable that leaves; then the others are linearised anew in the next step."""
 
 
 class AlgorithmConfig(Settings):

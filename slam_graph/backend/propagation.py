@@ -37,19 +37,15 @@ class Propagation:
             imu, noise.gravity, noise.imu_scale * noise.imu_gap_scale
         )
 
-    def append_frame(
-        self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool
-    ) -> list[gtsam.NonlinearFactor]:
+    def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
         """Make a new frame the current one.
 
         Args:
-            window: gets the predicted state of the new frame.
+            window: gets the predicted state of the new frame, and the factors that tie it to the
+                frame before.
             imu: samples up to the frame.
             stamp_ns: time of the frame on the clock of the IMU.
             still: whether the platform has not moved.
-
-        Returns:
-            The factors between the frame before and the new one.
         """
         i, j = window.frame, window.frame + 1
         previous = window.state.nav_state(i, window.stamp_ns, None)
@@ -58,11 +54,11 @@ class Propagation:
         pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
         window.state.insert_imu_state(j, predict(previous, pim, stamp_ns))
         window.past.append(i)
+        window.moving.append(i)
         window.frame, window.stamp_ns = j, stamp_ns
-        factors: list[gtsam.NonlinearFactor] = [imu_factor(i, j, pim)]
+        window.factors.append(imu_factor(i, j, pim))
         if still:
-            factors += zero_velocity_factors(i, j, self.config.zero_velocity)
-        return factors
+            window.factors += zero_velocity_factors(i, j, self.config.zero_velocity)
 
     def _params(
         self, imu: ImuBuffer, start_ns: int, end_ns: int

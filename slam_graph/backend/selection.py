@@ -1,22 +1,25 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which features enter the cost in a step: those whose track ended, or would lose its beginning.
+"""Which features are in the cost of a step with all of their observations.
 
-A feature that is still tracked waits, because later observations make it worth more. It enters
-when its track has ended, when the oldest pose that saw it leaves, or when it has lived long enough
-to become a variable of the state and there is room.
+A feature that is to be used once waits as long as it is tracked, because later observations make it
+worth more: it enters when its track has ended, or when the oldest pose that saw it leaves. One that
+has lived long enough becomes a variable of the state, if there is room.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.backend.policies import CostPolicy
-from slam_graph.backend.tracks import TrackWindow, is_in
+from slam_graph.backend.tracks import is_in
+from slam_graph.backend.window import Window
 
+BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 MIN_FRAMES = 2
@@ -25,39 +28,43 @@ MIN_FRAMES = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureChoice:
-    """Features that enter now, ascending ids.
+    """Features that are in the cost, ascending ids.
 
     Attributes:
-        ended: (J,) their track ended, or loses its beginning: to be used once.
+        used: (J,) those that stay outside the state.
         lasting: (K,) long-lived ones that may become variables of the state.
     """
 
-    ended: IntArray
+    used: IntArray
     lasting: IntArray
 
 
 def choose_features(
-    tracks: TrackWindow, current: int, oldest_leaving: int | None, room: int, policy: CostPolicy
+    window: Window, leaving_frames: Sequence[int], room: int, policy: CostPolicy
 ) -> FeatureChoice:
-    """Choose the features that enter the cost.
+    """Choose the features of a step.
 
     Args:
-        tracks: unused observations of all frames in the cost, the current one included.
-        current: index of the current frame.
-        oldest_leaving: index of the oldest frame if it leaves in this step.
+        window: with unused observations of all its frames, the current one included.
+        leaving_frames: past frames whose poses leave in this step.
         room: how many features may still be added to the state.
         policy: limits.
     """
-    ids, lengths = tracks.lengths()
-    live = is_in(ids, tracks.ids_in(current))
-    due = ~live
-    if oldest_leaving is not None:
-        due |= is_in(ids, tracks.ids_in(oldest_leaving))
+    ids, lengths = window.tracks.lengths()
+    live = is_in(ids, window.tracks.seen)
     lasting = live & (lengths >= policy.state_feature_frames)
-    chosen = _longest(ids[lasting], lengths[lasting], room)
+    chosen = _longest(ids[lasting], lengths[lasting], max(room, 0))
+    if policy.features == "state":
+        due = np.zeros(len(ids), np.bool_)
+        window.tracks.consume(ids[~live])
+    elif policy.features == "window":
+        due = np.ones(len(ids), np.bool_)
+    else:
+        due = ~live
+        if window.past and window.past[0] in leaving_frames:
+            due |= is_in(ids, window.tracks.ids_in(window.past[0]))
     due &= (lengths >= MIN_FRAMES) & ~is_in(ids, chosen)
-    ended = _longest(ids[due], lengths[due], policy.max_features_per_step)
-    return FeatureChoice(ended, chosen)
+    return FeatureChoice(_longest(ids[due], lengths[due], policy.max_features_per_step), chosen)
 
 
 def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:

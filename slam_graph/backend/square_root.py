@@ -107,12 +107,17 @@ class SquareRootInformation:
         """
         if len(Ab) == 0:
             return self
-        if len(Ab) > 2 * self.layout.size:
+        first = int(np.argmax(Ab.any(axis=0)))  # columns to the left are not touched
+        Ab = Ab[:, first:]
+        if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
-        block = min(BLOCK_SIZE, self.layout.size + 1)
-        Rd, _, _, info = lapack.dtpqrt(0, block, self.Rd, np.asfortranarray(Ab))
+        triangle = np.asfortranarray(self.Rd[first:, first:])
+        block = min(BLOCK_SIZE, len(triangle))
+        triangle, _, _, info = lapack.dtpqrt(0, block, triangle, np.asfortranarray(Ab))
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
+        Rd = self.Rd.copy(order="F")
+        Rd[first:, first:] = triangle
         return SquareRootInformation(self.layout, Rd)
 
     def solution(self) -> FloatArray:
@@ -130,6 +135,17 @@ class SquareRootInformation:
         """The (n, n) covariance R⁻¹ R⁻ᵀ."""
         inverse = self.root_covariance()
         return np.asarray(inverse @ inverse.T, dtype=np.float64)
+
+    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """The covariance of some variables only, in the order given."""
+        columns = self.layout.indices(keys)
+        first = int(columns.min(initial=self.layout.size))
+        right = np.zeros((self.layout.size - first, len(columns)), order="F")
+        right[columns - first, np.arange(len(columns))] = 1.0
+        root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the information is singular")
+        return np.asarray(root.T @ root, dtype=np.float64)
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""

@@ -85,6 +85,10 @@ class State:
         self.first.insert(L(feature), point)
         self.offsets[L(feature)] = np.zeros(POINT_DIM)
 
+    def variables(self) -> list[int]:
+        """Keys of all variables."""
+        return list(self.offsets)
+
     def remove(self, keys: Iterable[int]) -> None:
         """Forget variables."""
         for key in keys:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,15 @@ class Observations:
             self.normalized[keep],
         )
 
+    def without_idle_frames(self) -> Observations:
+        """The same observations over only those frames that have any."""
+        used = np.unique(self.frame)
+        return replace(
+            self,
+            frames=tuple(self.frames[int(k)] for k in used),
+            frame=np.searchsorted(used, self.frame),
+        )
+
     def subset(self, keep: NDArray[np.bool_]) -> Observations:
         """The observations of the features where `keep` (J,) holds."""
         rows = keep[self.feature]
@@ -85,6 +94,9 @@ class TrackWindow:
 
     Every observation enters the cost once: `consume` forgets those that have become part of the
     prior. Rows are sorted by feature, then frame, then camera.
+
+    Attributes:
+        seen: ids (N,) of all features that the last frame saw, used or not, ascending.
     """
 
     def __init__(self) -> None:
@@ -93,10 +105,12 @@ class TrackWindow:
         self._cameras = np.zeros(0, np.int64)
         self._pixels = np.zeros((0, 2))
         self._normalized = np.zeros((0, 2))
+        self.seen = np.zeros(0, np.int64)
 
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
         cameras = frame.cameras
+        self.seen = np.unique(np.concatenate([c.ids for c in cameras]))
         ids = np.concatenate([self._ids, *(c.ids for c in cameras)])
         count = len(ids) - len(self._ids)
         numbers = [np.full(len(c), number) for number, c in enumerate(cameras)]
@@ -135,6 +149,18 @@ class TrackWindow:
     def ids_in(self, index: int) -> IntArray:
         """The features that any camera saw in one frame, ascending."""
         return sorted_unique(self._ids[self._frames == index])
+
+    def motion(self, before: int, after: int) -> FloatArray:
+        """How far (N,) features moved in the first camera between two frames, normalised."""
+        i, j = (
+            np.flatnonzero((self._frames == index) & (self._cameras == 0))
+            for index in (before, after)
+        )
+        _, a, b = np.intersect1d(
+            self._ids[i], self._ids[j], assume_unique=True, return_indices=True
+        )
+        moved = self._normalized[j[b]] - self._normalized[i[a]]
+        return np.asarray(np.linalg.norm(moved, axis=1), dtype=np.float64)
 
     def lengths(self) -> tuple[IntArray, IntArray]:
         """All features with unused observations (J,), and the number of frames that see each."""

@@ -7,17 +7,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import State, dims_of, imu_state_keys
-from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.state import State, imu_state_keys
+from slam_graph.backend.tracks import TrackWindow, is_in
 from slam_graph.geometry.trajectory import NavState
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+def _no_ids() -> IntArray:
+    return np.zeros(0, np.int64)
+
+
+def _no_landmarks() -> tuple[IntArray, FloatArray]:
+    return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 @dataclass(eq=False)
@@ -31,7 +40,13 @@ class Window:
         prior: what the steps so far have left behind about the variables.
         tracks: observations that have not been used yet.
         past: indices of the past frames whose poses are in the state, ascending.
+        moving: those of the past frames whose velocity and bias are in the state too, ascending.
+        keyframes: those of the past frames that are keyframes.
+        keyframes_before: the same before this step's choice of poses.
+        factors: GTSAM's factors that are not part of the prior yet.
         features: ids (N,) of the features in the state, ascending.
+        landmarks: ids (N,) and world positions (N, 3) of the features that are in the cost without
+            being in the state.
     """
 
     frame: int
@@ -40,26 +55,29 @@ class Window:
     prior: SquareRootInformation
     tracks: TrackWindow = field(default_factory=TrackWindow)
     past: list[int] = field(default_factory=list)
-    features: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    moving: list[int] = field(default_factory=list)
+    keyframes: set[int] = field(default_factory=set)
+    keyframes_before: set[int] = field(default_factory=set)
+    factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    features: IntArray = field(default_factory=_no_ids)
+    landmarks: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
 
-    def keys(self, past: Sequence[int], features: IntArray) -> list[int]:
-        """Keys of some features and past poses, and of the current IMU state, in this order."""
-        poses = [X(i) for i in past]
-        return [L(int(j)) for j in features] + poses + list(imu_state_keys(self.frame))
+    def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
+        """Keys of some features, past poses and past IMU states, and of the current IMU state.
 
-    def shrink(self, past: Sequence[int], features: IntArray) -> None:
-        """Keep only these past frames and features."""
-        self.past, self.features = list(past), features
-        self.tracks.retain([*past, self.frame])
+        They are in this order, and features that are no longer tracked come first: what no new
+        measurement touches stands to the left, where an update need not go.
+        """
+        lost = ~is_in(features, self.tracks.seen)
+        keys = [L(int(j)) for j in np.concatenate([features[lost], features[~lost]])]
+        keys += [X(i) for i in past if i not in moving]
+        for i in (*moving, self.frame):
+            keys += imu_state_keys(i)
+        return keys
 
-    def current(self) -> NavState:
-        """The state of the current frame, with its covariance."""
-        return self.state.nav_state(self.frame, self.stamp_ns, self.covariance())
-
-    def covariance(self) -> FloatArray:
-        """Covariance (15, 15) of the current IMU state: the last columns of the prior."""
-        layout = Layout(dims_of(imu_state_keys(self.frame)))
-        return SquareRootInformation(layout, self.prior.Rd[-16:, -16:]).covariance()
+    def current(self, covariance: FloatArray) -> NavState:
+        """The state of the current frame, with its covariance (15, 15)."""
+        return self.state.nav_state(self.frame, self.stamp_ns, covariance)
 
     def points(self) -> FloatArray:
         """World positions (N, 3) of the features in the state."""
