@@ -37,8 +37,7 @@ def marginalize(
     """
     prior = posterior.marginal(keep)
     state.remove([key for key in posterior.layout.dims if key not in prior.layout])
-    if policy.first_estimates:
-        state.freeze(keep)
-    else:
+    if not policy.first_estimates:
         state.rebase()
+    state.freeze(keep)  # the steps to come must not move what the prior is a function of
     return prior.shifted(-state.offset(prior.layout))
