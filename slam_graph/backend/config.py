@@ -24,9 +24,9 @@ class NoiseConfig(Settings):
     """Factor on all IMU noise densities of the calibration."""
     gravity: float = Field(9.81, gt=0)
     """Magnitude of gravity in m/s²."""
-    max_imu_gap_s: float = Field(0.05, gt=0)
+    max_imu_gap_s: float = Field(0.03, gt=0)
     """Longest time without IMU samples that is bridged as if there were none missing."""
-    imu_gap_scale: float = Field(100.0, ge=1)
+    imu_gap_scale: float = Field(1000.0, ge=1)
     """Factor on the IMU noise between two frames with a longer gap."""
 
 
@@ -99,6 +99,8 @@ class InitializationConfig(Settings):
     """auto: from the state that the data brings, else from standing still, else in motion."""
     static_window_s: float = Field(1.0, gt=0)
     """How long the platform must stand still for a static start."""
+    static_disparity_px: float = Field(1.5, gt=0)
+    """Largest median motion of the features in that time; running motors shake the picture."""
     motion_window_s: float = Field(1.5, gt=0)
     """Length of the visual-inertial alignment of a start in motion."""
     frame_spacing_s: float = Field(0.15, gt=0)

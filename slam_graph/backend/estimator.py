@@ -39,6 +39,8 @@ IntArray = NDArray[np.int64]
 
 IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
+MAX_AHEAD_NS = 10_000_000_000
+"""A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
 
 class Estimator:
@@ -151,21 +153,18 @@ class Estimator:
         """
         stamp_ns = frame.stamp_ns + self._time_offset_ns
         self.timings = {}
-        if stamp_ns <= self._latest_ns:
-            message = f"frame at {frame.stamp_ns} ns does not follow the one before"
+        if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
+            message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = stamp_ns
-        frame = self._finite(frame)
+        frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
             state: NavState | None = None
             still = self._standstill.is_still(self._imu, stamp_ns, frame)
             if self.window is None:
                 with self._timed("start"):
-                    since_ns = self._standstill.since_ns
-                    self.window = self._initializer.try_to_start(
-                        self._imu, stamp_ns, frame, since_ns
-                    )
+                    self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
                 if self.window is not None:
                     current = imu_state_keys(self.window.frame)
                     state = self.window.current(self.window.prior.covariance_of(current))
@@ -180,8 +179,12 @@ class Estimator:
             return np.zeros(0, np.int64), np.zeros((0, 3))
         return self.window.features, self.window.points()
 
-    def _finite(self, frame: FeatureFrame) -> FeatureFrame:
-        """The frame without observations that are not finite."""
+    def _usable(self, frame: FeatureFrame) -> FeatureFrame:
+        """The frame with all cameras of the rig, without observations that are not finite."""
+        missing = len(self.rig.cameras) - len(frame.cameras)
+        if missing > 0:
+            empty = (FeatureObservations.empty(),) * missing
+            frame = FeatureFrame(frame.stamp_ns, frame.cameras + empty)
         good = [np.isfinite(np.hstack([c.pixels, c.normalized])).all(axis=1) for c in frame.cameras]
         bad = sum(int(np.sum(~rows)) for rows in good)
         if not bad:

@@ -21,6 +21,7 @@ from slam_graph.sensors.rig import ImuNoise
 FloatArray = NDArray[np.float64]
 
 NS_PER_S = 1_000_000_000
+FAR_FUTURE_NS = 2**62
 INTEGRATION_SIGMA = 1e-5
 """Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
 
@@ -65,6 +66,10 @@ class ImuBuffer:
             self.data = ImuData.concatenate([self.data, rows])
         return int(np.sum(~good))
 
+    def newest_ns(self) -> int:
+        """Time of the last sample; far in the future as long as there is none."""
+        return int(self.data.stamps_ns[-1]) if len(self.data) else FAR_FUTURE_NS
+
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the samples before the last one at or before `stamp_ns`."""
         first = int(np.searchsorted(self.data.stamps_ns, stamp_ns, side="right")) - 1
@@ -76,14 +81,16 @@ class ImuBuffer:
         return len(self.data) > 0 and int(self.data.stamps_ns[0]) <= stamp_ns
 
     def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
-        """Longest time within an interval without a sample, infinite without any sample."""
+        """Longest time between samples that an interval has part in, infinite without samples."""
         if len(self.data) == 0:
             return float("inf")
         t = self.data.stamps_ns
-        first = max(int(np.searchsorted(t, start_ns, side="right")) - 1, 0)
-        last = int(np.searchsorted(t, end_ns)) + 1
-        around = np.clip(np.concatenate([[start_ns], t[first:last], [end_ns]]), start_ns, end_ns)
-        return float(np.max(np.diff(around))) * 1e-9
+        before = t[: int(np.searchsorted(t, start_ns, side="right"))][-1:]
+        after = t[int(np.searchsorted(t, end_ns)) :][:1]
+        inside = t[(t > start_ns) & (t < end_ns)]
+        first = before if len(before) else [start_ns]
+        last = after if len(after) else [end_ns]
+        return float(np.max(np.diff(np.concatenate([first, inside, last])))) * 1e-9
 
     def between(self, start_ns: int, end_ns: int) -> ImuData:
         """Samples at both ends (interpolated, or the nearest held) and all in between."""
@@ -119,6 +126,9 @@ def preintegrate(
     gyro = 0.5 * (samples.gyro[1:] + samples.gyro[:-1])
     accel = 0.5 * (samples.accel[1:] + samples.accel[:-1])
     dts = np.diff(samples.stamps_ns) * 1e-9
+    # GTSAM turns the specific force by the attitude at the start of a step; this is half a step on
+    half_turn = 0.5 * dts[:, None] * (gyro - bias.gyroscope())
+    accel = accel + np.cross(half_turn, accel - bias.accelerometer())
     for a, w, dt in zip(accel, gyro, dts.tolist(), strict=True):
         pim.integrateMeasurement(a, w, dt)
     return pim

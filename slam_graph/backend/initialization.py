@@ -30,6 +30,7 @@ from slam_graph.backend.static_start import fix_gauge, prior_covariance, state_a
 from slam_graph.backend.tracks import TrackWindow, is_in, sorted_unique
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
+from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
 
@@ -98,22 +99,24 @@ class Initializer:
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
+        largest = config.initialization.static_disparity_px
+        self._standstill = StandstillDetector(
+            config.zero_velocity.model_copy(update={"max_disparity_px": largest, "enabled": True})
+        )
 
-    def try_to_start(
-        self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame, still_since_ns: int | None
-    ) -> Window | None:
+    def try_to_start(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """Take the next frame and start if it is possible.
 
         Args:
             imu: samples up to the frame.
             stamp_ns: time of the frame on the clock of the IMU.
             frame: its features.
-            still_since_ns: since when the platform stands still, None if it moves.
         """
         mode = self._config.initialization.mode
         outcome: Window | str = "a state to start from (mode 'given')"
+        self._standstill.is_still(imu, stamp_ns, frame)
         if mode in ("auto", "static"):
-            outcome = self._at_rest(imu, stamp_ns, still_since_ns)
+            outcome = self._at_rest(imu, stamp_ns)
         if mode in ("auto", "motion") and isinstance(outcome, str):
             outcome = self._in_motion(imu, stamp_ns, frame)
         if isinstance(outcome, str):
@@ -121,8 +124,8 @@ class Initializer:
             return None
         return outcome
 
-    def _at_rest(self, imu: ImuBuffer, stamp_ns: int, since_ns: int | None) -> Window | str:
-        start = self._config.initialization
+    def _at_rest(self, imu: ImuBuffer, stamp_ns: int) -> Window | str:
+        start, since_ns = self._config.initialization, self._standstill.since_ns
         needed_ns = round(start.static_window_s * 1e9)
         if since_ns is None or stamp_ns - since_ns < needed_ns:
             return f"a still period of {start.static_window_s:g} s"
@@ -132,7 +135,7 @@ class Initializer:
     def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | str:
         start = self._config.initialization
         length_ns = round(start.motion_window_s * 1e9)
-        if imu.covers(stamp_ns):
+        if imu.covers(stamp_ns) and len(frame.cameras[0]) >= start.min_features:
             self._stamps_ns.append(stamp_ns)
             self._frames.append(frame)
         while self._stamps_ns and self._stamps_ns[0] < stamp_ns - length_ns - round(1e8):

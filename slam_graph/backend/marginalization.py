@@ -86,5 +86,5 @@ def marginalize(
     state.remove([key for key in state.variables() if key not in staying])
     if not first_estimates:
         state.rebase()
-    state.freeze(prior.layout.dims)
+    state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
     return prior.shifted(-state.offset(prior.layout))

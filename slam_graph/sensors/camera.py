@@ -107,7 +107,8 @@ class Camera:
         coefficients = np.array(self.coefficients)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-9)
         if self.distortion == "radtan":
-            start = cv2.undistortPointsIter(source, np.eye(3), coefficients, None, None, criteria)
+            eye = np.eye(3)
+            start = cv2.undistortPointsIter(source, eye, coefficients, eye, eye, criteria)
         else:
             start = cv2.fisheye.undistortPoints(source, np.eye(3), coefficients, criteria=criteria)
         m = np.asarray(start, dtype=np.float64)[:, 0, :]

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The real images of EuRoC MH_01, 17 s from a start in flight, beside what others make of them."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+
+from benchmarks.metric import Metric, info
+from benchmarks.running import Errors, Run, within
+from benchmarks.suite import ALGORITHMS, Benchmark, Outcome
+from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.geometry.trajectory import Trajectory
+
+RECORDING = "euroc/MH_01_easy_17s"
+
+START_BAR_S = 3.0
+ATE_BAR_M = 0.02
+
+PEERS = {
+    1: {"openvins": "openvins_mono"},
+    2: {"openvins": "openvins_stereo", "basalt": "basalt_stereo", "okvis2": "okvis2_slam_causal"},
+}
+"""Files of causal estimates of others by their name, for each number of cameras."""
+
+
+def measure(data: Path, cameras: int) -> Outcome:
+    """Start-up, errors after alignment in SE(3), and lost frames; then the others' errors."""
+    outcome = Outcome()
+    folder = data / RECORDING
+    peers = {
+        name: read_groundtruth(folder / "peers" / f"{file}.tum")
+        for name, file in PEERS[cameras].items()
+    }
+    for name in ALGORITHMS:
+        run = Run(folder, name, cameras)
+        errors = run.errors("se3")
+        outcome.metrics += [
+            Metric(f"{name}.start", run.seconds_to_start, "s", "lower", START_BAR_S),
+            Metric(f"{name}.ate", errors.position_m, "m", "lower", ATE_BAR_M),
+            Metric(f"{name}.orientation", errors.orientation_deg, "deg", "lower"),
+            Metric(f"{name}.frames_lost", run.frames_lost, "frames", "lower", 0.0),
+            Metric(f"{name}.coverage", errors.span_s, "s", "higher"),
+            info(f"{name}.ate_where_openvins", _ate_within(run, peers["openvins"]), "m"),
+        ]
+        outcome.notes += run.notes()
+    truth = read_groundtruth(folder)
+    for name, peer in peers.items():
+        errors = Errors.of(truth, peer, "se3")
+        outcome.metrics += [
+            info(f"{name}.ate", errors.position_m, "m"),
+            info(f"{name}.orientation", errors.orientation_deg, "deg"),
+            info(f"{name}.coverage", errors.span_s, "s"),
+        ]
+    return outcome
+
+
+def _ate_within(run: Run, span: Trajectory) -> float:
+    """ATE over the time that another estimate covers, in metres."""
+    if not run.ok:
+        return math.nan
+    return Errors.of(run.truth, within(run.result.trajectory, span), "se3").position_m
+
+
+BENCHMARKS = {
+    f"mh01_{word}": Benchmark(
+        f"EuRoC MH_01, 17 s of images, {word}, started in flight: start-up, ATE, lost frames",
+        (RECORDING,),
+        partial(measure, cameras=cameras),
+    )
+    for word, cameras in (("mono", 1), ("stereo", 2))
+}

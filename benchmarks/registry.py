@@ -1,0 +1,18 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All benchmarks by name, in the order in which they run. A new suite is a module and a line here.
+
+A module offers `BENCHMARKS`, a table of `Benchmark` by name.
+"""
+
+from __future__ import annotations
+
+from benchmarks import mh01, openvins_sim, speed, wheel
+from benchmarks.suite import Benchmark
+
+BENCHMARKS: dict[str, Benchmark] = {
+    **wheel.BENCHMARKS,
+    **mh01.BENCHMARKS,
+    **openvins_sim.BENCHMARKS,
+    **speed.BENCHMARKS,
+}

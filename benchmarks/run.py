@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run benchmarks: `SLAM_GRAPH_DATA=FOLDER python -m benchmarks.run [--only NAME ...] [--gate]`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks import baseline, report
+from benchmarks.registry import BENCHMARKS
+from benchmarks.suite import Outcome, data_folder, require
+from slam_graph.errors import SlamGraphError
+from slam_graph.output.files import write_text
+
+FAILED = 1
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run what is asked for.
+
+    Returns:
+        0; 1 if something could not be measured, or with `--gate` if a bar is missed or a figure
+        got worse.
+    """
+    options = parser().parse_args(arguments)
+    if options.list:
+        width = max(map(len, BENCHMARKS))
+        for name, benchmark in BENCHMARKS.items():
+            print(f"{name:{width}}  {benchmark.summary}")
+        return 0
+    try:
+        before = baseline.read_baseline(options.baseline)
+        results = execute(options.only or list(BENCHMARKS))
+    except SlamGraphError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return FAILED
+    print("\n".join(report.lines(results, before)))
+    write(options, results, before)
+    if options.gate:
+        return gate(results, before)
+    return FAILED if any(outcome.failure for outcome in results.values()) else 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = argparse.ArgumentParser(prog="python -m benchmarks.run", description=__doc__)
+    add = made.add_argument
+    add("--list", action="store_true", help="list the benchmarks and leave")
+    add("--only", nargs="+", metavar="NAME", choices=list(BENCHMARKS), help="run only these")
+    add("--json", type=Path, metavar="FILE", help="write all figures as JSON")
+    add("--markdown", type=Path, metavar="FILE", help="write the tables as Markdown")
+    add("--gate", action="store_true", help="exit 1 if a bar is missed or a figure got worse")
+    add("--update-baseline", action="store_true", help="make what is measured the baseline")
+    add(
+        "--baseline",
+        type=Path,
+        metavar="FILE",
+        default=baseline.BASELINE_FILE,
+        help="compare with this baseline (default: %(default)s)",
+    )
+    return made
+
+
+def execute(names: Sequence[str]) -> dict[str, Outcome]:
+    """Run benchmarks by their names, after a look whether all that they need is there.
+
+    Raises:
+        DataError: if a recording is missing. What fails later is told in its outcome, so that the
+            others are not lost.
+    """
+    data = data_folder()
+    for name in names:
+        require(BENCHMARKS[name], data)
+    results = {}
+    for name in names:
+        print(f"{name} …", file=sys.stderr, flush=True)
+        try:
+            results[name] = BENCHMARKS[name].run(data)
+        except SlamGraphError as error:
+            results[name] = Outcome(failure=str(error))
+    return results
+
+
+def write(options: argparse.Namespace, results: report.Results, before: baseline.Baseline) -> None:
+    """Write the files that are asked for."""
+    if options.json:
+        write_text(options.json, [json.dumps(report.table(results), indent=2), "\n"])
+    if options.markdown:
+        write_text(options.markdown, [line + "\n" for line in report.markdown(results, before)])
+    if options.update_baseline:
+        measured = report.measured(results)
+        baseline.write_baseline(
+            baseline.updated(before, measured, results.keys()), options.baseline
+        )
+
+
+def gate(results: report.Results, before: baseline.Baseline) -> int:
+    """Say what keeps the gate shut; 0 if nothing does."""
+    faults = [f"{name}: {outcome.failure}" for name, outcome in results.items() if outcome.failure]
+    faults += baseline.complaints(report.measured(results), before, results.keys())
+    for fault in faults:
+        print(f"gate: {fault}", file=sys.stderr)
+    print(f"gate: {len(faults)} faults" if faults else "gate: passed", file=sys.stderr)
+    return FAILED if faults else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A whole run of the pipeline, and its errors at exactly the times of its states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.association import select
+from slam_graph.evaluation.choices import PoseRelation
+from slam_graph.geometry.alignment import AlignmentMode
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.pipeline import run
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.visualization.viewer import NullViewer
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Root-mean-square errors of a trajectory.
+
+    Attributes:
+        position_m: of the position.
+        orientation_deg: of the orientation.
+        span_s: time from the first pose to the last.
+    """
+
+    position_m: float
+    orientation_deg: float
+    span_s: float
+
+    @staticmethod
+    def of(truth: Trajectory, estimate: Trajectory, alignment: AlignmentMode) -> Errors:
+        """The errors of an estimate.
+
+        The truth is interpolated at the times of the estimate: where the stamps of the two differ
+        by a few milliseconds, taking the nearest pose would add the motion in between.
+        """
+        true, valid = interpolate(truth, estimate.stamps_ns)
+        own = select(estimate, np.flatnonzero(valid))
+
+        def rmse(relation: PoseRelation) -> float:
+            return ape(true, own, relation, alignment).statistics.rmse
+
+        stamps = estimate.stamps_ns
+        return Errors(rmse("trans_part"), rmse("angle_deg"), float(stamps[-1] - stamps[0]) * 1e-9)
+
+    @staticmethod
+    def unknown() -> Errors:
+        """Of a run that gave no trajectory to judge."""
+        return Errors(math.nan, math.nan, 0.0)
+
+
+class Run:
+    """A run of the pipeline over a recording, as it ships and with its own progress counted.
+
+    Attributes:
+        result: what it found out.
+        truth: ground truth; every recording of a benchmark has one.
+        frames_waited: number of frames before the first one that had a state.
+    """
+
+    def __init__(
+        self,
+        recording: Path | str,
+        algorithm: str,
+        cameras: int | None = None,
+        groundtruth: Path | None = None,
+        overrides: Iterable[str] = (),
+    ) -> None:
+        config = load_config(None, overrides, algorithm=algorithm, cameras=cameras)
+        sequence = open_dataset(recording, cameras=cameras, groundtruth=groundtruth)
+        counter = _StateCounter()
+        with threadpool_limits(limits=1, user_api="blas"):
+            self.result = run(sequence, config, viewer=counter)
+        self.frames_waited = counter.waited
+        truth = self.result.truth
+        assert truth is not None, f"{recording} has no ground truth"
+        self.truth = truth
+
+    @property
+    def ok(self) -> bool:
+        """Whether it came to its end with an estimate; if not, none of its errors counts."""
+        return self.result.status == "ok"
+
+    @property
+    def seconds_to_start(self) -> float:
+        """From the first frame to the first state; NaN if there was none."""
+        stamps = self.result.trajectory.stamps_ns
+        return float(stamps[0] - self.result.start_ns) * 1e-9 if len(stamps) else math.nan
+
+    @property
+    def frames_lost(self) -> float:
+        """Frames from the first state to the end of the recording without one; NaN if all."""
+        states = len(self.result.history)
+        return self.result.info.frames - self.frames_waited - states if states else math.nan
+
+    def errors(self, alignment: AlignmentMode) -> Errors:
+        """The errors of the causal estimate."""
+        if not self.ok:
+            return Errors.unknown()
+        return Errors.of(self.truth, self.result.trajectory, alignment)
+
+    def notes(self) -> list[str]:
+        """What a reader should know of the run: how it ended if not well, what it survived."""
+        result, name = self.result, self.result.config.algorithm.name
+        lines = [] if self.ok else [f"{name}: {result.status}: {result.message}"]
+        faults = {k: n for k, n in result.warnings.items() if k.startswith(("image", "camera"))}
+        return lines + [f"{name}: survived {n} × {kind}" for kind, n in faults.items()]
+
+
+class _StateCounter(NullViewer):
+    """Counts the frames before the first state."""
+
+    def __init__(self) -> None:
+        self.waited = 0
+        self._started = False
+
+    def show(
+        self,
+        frame: CameraFrame | FeatureFrame,
+        features: FeatureFrame,
+        state: object,
+        points: object,
+    ) -> None:
+        """Look whether there is a state."""
+        self._started |= state is not None
+        self.waited += not self._started
+
+
+def within(trajectory: Trajectory, span: Trajectory) -> Trajectory:
+    """The part of a trajectory between the first and the last pose of another."""
+    stamps = trajectory.stamps_ns
+    inside = (stamps >= span.stamps_ns[0]) & (stamps <= span.stamps_ns[-1])
+    return select(trajectory, np.flatnonzero(inside))

@@ -1,0 +1,219 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""One timed run on one core, in a process of its own; prints what it measured as JSON.
+
+python -m benchmarks.speed_worker shipped|interleaved RECORDING ALGORITHM
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slam_graph.config import RunConfig, load_config
+from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.packets import FrameStream
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.pipeline import run
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.visualization.viewer import NullViewer
+
+CAMERAS = 2
+
+REFERENCE_POINTS = 200
+REFERENCE_WINDOW = (21, 21)
+REFERENCE_LEVELS = 3
+
+Image = NDArray[np.uint8]
+Table = dict[str, Any]
+
+
+def shipped(recording: Path, config: RunConfig) -> Table:
+    """The run as it ships, with all files written at the end: its time and its peak of memory."""
+    sequence = open_dataset(recording, cameras=CAMERAS)
+    began_s = time.process_time()
+    result = run(sequence, config)
+    cpu_s = time.process_time() - began_s
+    result.check()
+    with tempfile.TemporaryDirectory() as folder:
+        result.save(folder)
+    return {
+        "recorded_s": result.recorded_s,
+        "wall_s": result.wall_s,
+        "cpu_s": cpu_s,
+        "peak_mb": peak_memory_mb(),
+    }
+
+
+def interleaved(recording: Path, config: RunConfig) -> Table:
+    """The run with every frame followed by the reference: milliseconds of both."""
+    sequence = DecodedInTurn(recording, cameras=CAMERAS)
+    reference = Reference()
+    began_s = time.process_time()
+    result = run(sequence, config, viewer=reference, progress=reference)
+    cpu_s = time.process_time() - began_s
+    result.check()
+    stages = {name: result.timing.column(name).tolist() for name in result.timing.stages()}
+    stages["frame"] = reference.frames.wall
+    stages["decoding"] = sequence.decoding.wall
+    return {
+        "reference": reference.flows.cpu,
+        "frame": reference.frames.cpu,
+        "decoding": sequence.decoding.cpu,
+        "stages": stages,
+        "wall_s": result.wall_s,
+        "cpu_s": cpu_s,
+    }
+
+
+class Watch:
+    """Times the same thing again and again.
+
+    Attributes:
+        wall: milliseconds of each time.
+        cpu: milliseconds that this thread was computing in it; others cannot lengthen these.
+    """
+
+    def __init__(self) -> None:
+        self.wall: list[float] = []
+        self.cpu: list[float] = []
+        self.start()
+
+    def start(self) -> None:
+        """Begin."""
+        self._since = time.perf_counter(), time.thread_time()
+
+    def stop(self) -> None:
+        """Note the time since the beginning."""
+        wall_s, cpu_s = time.perf_counter() - self._since[0], time.thread_time() - self._since[1]
+        self.wall.append(1e3 * wall_s)
+        self.cpu.append(1e3 * cpu_s)
+
+
+class DecodedInTurn(EurocSequence):
+    """An EuRoC folder whose images are decoded when their turn comes, not ahead in a thread.
+
+    On one core the thread only takes the time of whatever else runs; in turn it can be told apart.
+
+    Attributes:
+        decoding: the time that it took for each frame.
+    """
+
+    def __init__(self, path: Path, cameras: int | None = None) -> None:
+        super().__init__(path, cameras)
+        self.decoding = Watch()
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """All frames."""
+        for index in range(len(self._groups.stamps_ns)):
+            self.decoding.start()
+            images = self._read_frame(index)
+            self.decoding.stop()
+            yield self._report(index, images)
+
+
+class Reference(NullViewer):
+    """Times frames, and between them a Lucas-Kanade flow from the last left image to this one.
+
+    Attributes:
+        flows: the time of the reference, for each frame with an image before it.
+        frames: the time of each frame: reading, front end, back end and what lies between.
+    """
+
+    def __init__(self) -> None:
+        self.flows = Watch()
+        self.frames = Watch()
+        self._last: Image | None = None
+
+    def open(self, rig: object, truth: object) -> None:
+        """The first frame begins."""
+        self.frames.start()
+
+    def advance(self, stamp_ns: int, initialized: bool) -> None:
+        """A frame is done."""
+        self.frames.stop()
+
+    def show(
+        self,
+        frame: CameraFrame | FeatureFrame,
+        features: FeatureFrame,
+        state: object,
+        points: object,
+    ) -> None:
+        """Time the reference; then the next frame begins."""
+        image = frame.images[0] if isinstance(frame, CameraFrame) else None
+        if image is not None:
+            if self._last is not None:
+                time_flow(self._last, image, self.flows)
+            self._last = image
+        self.frames.start()
+
+
+def time_flow(before: Image, after: Image, watch: Watch) -> None:
+    """Time the flow of exactly 200 corners, with OpenCV's other defaults."""
+    corners = cv2.goodFeaturesToTrack(before, REFERENCE_POINTS, 1e-3, 10).reshape(-1, 2)
+    points = np.resize(corners, (REFERENCE_POINTS, 2)).astype(np.float32)
+    watch.start()
+    cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        points,
+        np.empty_like(points),
+        winSize=REFERENCE_WINDOW,
+        maxLevel=REFERENCE_LEVELS,
+    )
+    watch.stop()
+
+
+def peak_memory_mb() -> float:
+    """High-water mark of resident memory of this program.
+
+    `getrusage` would also count what the parent process took before this program replaced its copy;
+    it is what remains where there is no /proc.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def hold_to_one_core() -> None:
+    """Keep all threads of this process, and those it will start, on one core."""
+    cv2.setNumThreads(1)
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    core = {max(os.sched_getaffinity(0))}
+    for thread in os.listdir("/proc/self/task"):
+        os.sched_setaffinity(int(thread), core)
+
+
+MODES: dict[str, Callable[[Path, RunConfig], Table]] = {
+    "shipped": shipped,
+    "interleaved": interleaved,
+}
+
+
+def main(mode: str, recording: str, algorithm: str) -> None:
+    """Measure and print."""
+    hold_to_one_core()
+    config = load_config(algorithm=algorithm, cameras=CAMERAS)
+    with threadpool_limits(limits=1):
+        print(json.dumps(MODES[mode](Path(recording), config)))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a benchmark is, and where it finds recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.metric import Metric
+from slam_graph.errors import DataError
+
+DATA_VARIABLE = "SLAM_GRAPH_DATA"
+
+ALGORITHMS = ("msckf", "swf")
+"""The algorithms that every benchmark of a whole run compares."""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a benchmark found.
+
+    Attributes:
+        metrics: figures; their keys lack the name of the benchmark.
+        notes: lines that a reader should know beside the figures.
+        failure: why it could not be measured; empty if it could.
+    """
+
+    metrics: list[Metric] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """A benchmark that can be run by its name.
+
+    Attributes:
+        summary: one line for `--list`.
+        needs: folders that it reads, below the folder of recordings.
+        run: measures; takes the folder of recordings.
+    """
+
+    summary: str
+    needs: tuple[str, ...]
+    run: Callable[[Path], Outcome]
+
+
+def data_folder() -> Path:
+    """The folder of recordings.
+
+    Raises:
+        DataError: if the environment does not name one.
+    """
+    named = os.environ.get(DATA_VARIABLE)
+    if not named:
+        raise DataError(
+            f"{DATA_VARIABLE} is not set: it names the folder of recordings; "
+            f"run `{DATA_VARIABLE}=FOLDER python -m benchmarks.run`"
+        )
+    if not Path(named).is_dir():
+        raise DataError(f"{DATA_VARIABLE}={named}: no such folder")
+    return Path(named).resolve()
+
+
+def require(benchmark: Benchmark, data: Path) -> None:
+    """Make sure that the recordings of a benchmark are there before anything runs.
+
+    Raises:
+        DataError: naming what is missing.
+    """
+    for need in benchmark.needs:
+        if not (data / need).exists():
+            raise DataError(f"{data / need}: not there; {DATA_VARIABLE} must name a folder with it")

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Standing still: when it is detected, and that the platform then stays where it is."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from flight import AT_REST, packets, rig, room
+from gtsam.symbol_shorthand import V, X
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import BackendConfig, ZeroVelocityConfig
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.imu import ImuBuffer
+from slam_graph.backend.zero_velocity import StandstillDetector, zero_velocity_factors
+from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.geometry.history import StateHistory
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.pipeline import run
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
+
+FloatArray = NDArray[np.float64]
+Motion = Callable[[float], FloatArray]
+CONFIG = ZeroVelocityConfig()
+FRAME_S = 0.05
+
+
+def decisions(
+    drift_px: Motion,
+    gyro_std: float = 0.01,
+    accel_std: float = 0.05,
+    features: int = 40,
+    length_s: float = 2.0,
+    config: ZeroVelocityConfig = CONFIG,
+) -> tuple[list[bool], StandstillDetector]:
+    """What the detector says frame by frame of features that move together, with 0.15 px noise."""
+    rng = np.random.default_rng(0)
+    stamps = np.arange(0.0, length_s + 1e-9, 0.005)
+    imu = ImuBuffer()
+    gyro = np.array([0.02, -0.01, 0.03]) + rng.normal(0.0, gyro_std, (len(stamps), 3))
+    accel = np.array([0.3, 0.2, 9.8]) + rng.normal(0.0, accel_std, (len(stamps), 3))
+    imu.add(ImuData(np.round(stamps * 1e9).astype(np.int64), gyro, accel))
+    detector, said = StandstillDetector(config), []
+    home = rng.uniform(50.0, 400.0, (features, 2))
+    for t_s in np.arange(0.0, length_s + 1e-9, FRAME_S).tolist():
+        pixels = home + drift_px(t_s) + rng.normal(0.0, 0.15, home.shape)
+        seen = FeatureObservations(np.arange(features), pixels, pixels / 400.0)
+        stamp_ns = round(t_s * 1e9)
+        said.append(detector.is_still(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,))))
+    return said, detector
+
+
+def no_drift(_: float) -> FloatArray:
+    return np.zeros(2)
+
+
+def test_still_is_still_once_the_window_is_full() -> None:
+    said, detector = decisions(no_drift)
+    needed = round(CONFIG.window_s / FRAME_S)
+    assert said == [False] * needed + [True] * (len(said) - needed)
+    assert detector.since_ns == 0
+
+
+def test_a_slow_hover_is_not_still() -> None:
+    """Two pixels a second are less than the noise from frame to frame, not over the window."""
+    said, detector = decisions(lambda t_s: np.array([2.0 * t_s, 0.5 * t_s]))
+    assert not any(said)
+    assert detector.since_ns is None
+
+
+def test_running_motors_may_shake_a_platform_on_the_ground() -> None:
+    said, _ = decisions(no_drift, gyro_std=0.1, accel_std=1.5)
+    assert all(said[round(CONFIG.window_s / FRAME_S) :])
+
+
+@pytest.mark.parametrize(("gyro_std", "accel_std"), [(0.5, 0.05), (0.01, 4.0)])
+def test_a_hard_shake_is_not_still(gyro_std: float, accel_std: float) -> None:
+    """The images alone do not decide: they may show the inside of what moves."""
+    said, _ = decisions(no_drift, gyro_std=gyro_std, accel_std=accel_std)
+    assert not any(said)
+
+
+def test_a_sudden_start_ends_it_and_it_begins_anew() -> None:
+    def jump(t_s: float) -> FloatArray:
+        return np.array([4.0 if t_s > 1.0 else 0.0, 0.0])
+
+    said, detector = decisions(jump, length_s=2.5)
+    jumped = round(1.0 / FRAME_S) + 1
+    full = round(CONFIG.window_s / FRAME_S)
+    assert all(said[full:jumped])
+    assert not any(said[jumped : jumped + full - 1])
+    assert all(said[jumped + full :])
+    assert detector.since_ns is not None
+    assert detector.since_ns >= 1_000_000_000
+
+
+@pytest.mark.parametrize("features", [0, 4])
+def test_too_few_features_are_no_evidence(features: int) -> None:
+    assert not any(decisions(no_drift, features=features)[0])
+
+
+def test_it_can_be_switched_off() -> None:
+    assert not any(decisions(no_drift, config=ZeroVelocityConfig(enabled=False))[0])
+
+
+def test_without_imu_there_is_no_evidence() -> None:
+    seen = FeatureObservations(np.arange(20), np.ones((20, 2)), np.ones((20, 2)))
+    detector = StandstillDetector(CONFIG)
+    stamps = [round(t_s * 1e9) for t_s in np.arange(0.0, 2.0, 0.1).tolist()]
+    assert not any(detector.is_still(ImuBuffer(), t, FeatureFrame(t, (seen,))) for t in stamps)
+
+
+def test_the_factors_hold_the_pose_and_stop_the_velocity() -> None:
+    pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
+    values = gtsam.Values()
+    for i in (3, 4):
+        values.insert(X(i), pose)
+        values.insert(V(i), np.zeros(3))
+    factors = zero_velocity_factors(3, 4, CONFIG)
+    assert sum(f.error(values) for f in factors) == 0.0
+    values.update(V(4), np.array([CONFIG.velocity_sigma, 0.0, 0.0]))
+    assert sum(f.error(values) for f in factors) == pytest.approx(0.5)
+    values.update(X(4), pose.retract(np.array([0, 0, 0, 0, CONFIG.position_sigma, 0.0])))
+    assert sum(f.error(values) for f in factors) == pytest.approx(1.0)
+
+
+# --- the estimator at rest ------------------------------------------------------------------------
+
+
+def distance_m(trajectory: Trajectory) -> float:
+    """Largest distance from the first position."""
+    return float(np.max(np.linalg.norm(trajectory.positions - trajectory.positions[0], axis=1)))
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_a_platform_at_rest_stays_within_millimetres(cameras: int) -> None:
+    """Ten seconds after the start, with the noise and biases of a real IMU."""
+    rng, mounted = np.random.default_rng(3), rig(cameras)
+    estimator = Estimator(mounted, load_config().algorithm, BackendConfig())
+    history = StateHistory()
+    state = None
+    for packet in packets(AT_REST, mounted, room(150, rng), 12.0, rng, 20.0, 0.2):
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        state = estimator.add_frame(packet.frame)
+        if state is not None:
+            history.append(state)
+            assert state.covariance is not None
+            assert np.all(np.linalg.eigvalsh(state.covariance) > 0)
+    trajectory = history.trajectory()
+    assert trajectory.stamps_ns[-1] - trajectory.stamps_ns[0] > 10_000_000_000
+    assert distance_m(trajectory) < 1e-3
+    assert state is not None
+    assert np.linalg.norm(state.velocity) < 5e-3
+    tilt = state.world_T_body.rotation().matrix()[2]
+    truth = AT_REST.rotation(np.zeros(1)).as_matrix()[0][2]
+    np.testing.assert_allclose(tilt, truth, atol=0.02)
+
+
+def test_the_first_seconds_of_the_wheel_are_at_rest() -> None:
+    """By its ground truth the platform is rocked by 3 mm there."""
+    result = run(open_dataset("demo"), load_config(duration_s=4.8))
+    trajectory = result.trajectory
+    assert trajectory.stamps_ns[-1] - trajectory.stamps_ns[0] > 2_000_000_000
+    assert distance_m(trajectory) < 5e-3
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_real_images_before_take_off(data_dir: Path, cameras: int) -> None:
+    """The motors start up and shake the picture by more than a pixel."""
+    sequence = open_dataset(data_dir / "euroc" / "V1_01_easy_static_2s", cameras=cameras)
+    config = load_config(overrides=["backend.zero_velocity.max_disparity_px=1.5"])
+    result = run(sequence, config)
+    assert result.status == "ok"
+    trajectory = result.trajectory
+    assert trajectory.stamps_ns[-1] - trajectory.stamps_ns[0] >= 1_000_000_000
+    assert distance_m(trajectory) < 2e-3
+    assert trajectory.velocities is not None
+    assert np.linalg.norm(trajectory.velocities, axis=1).max() < 0.01

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whole recordings through the estimator, measured against the truth."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_graph.config import algorithm_names, load_config
+from slam_graph.datasets.base import Sequence
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.choices import PoseRelation
+from slam_graph.geometry.alignment import AlignmentMode
+from slam_graph.output.run_result import RunResult
+from slam_graph.pipeline import run
+
+
+def rmse(
+    sequence: Sequence, result: RunResult, alignment: AlignmentMode, relation: PoseRelation
+) -> float:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    return float(ape(truth, result.trajectory, relation, alignment).statistics.rmse)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("algorithm", ["msckf", "swf"])
+def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
+    """Monocular, at rest for five seconds, without being told the start state."""
+    truth = data_dir / "euroc_inertial" / "V1_01_easy"
+    sequence = open_dataset("demo", groundtruth=truth)
+    result = run(sequence, load_config(algorithm=algorithm))
+    assert result.status == "ok"
+    stamps = result.trajectory.stamps_ns
+    assert stamps[-1] - stamps[0] >= 25_000_000_000
+    assert rmse(sequence, result, "se3", "trans_part") <= 0.15
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("algorithm", "cameras", "position_m", "angle_deg"),
+    [
+        ("msckf", 1, 0.06, 0.5),
+        ("msckf", 2, 0.05, 0.3),
+        ("swf", 2, 0.05, 0.3),
+    ],
+)
+def test_a_simulation_from_a_given_start(
+    data_dir: Path, algorithm: str, cameras: int, position_m: float, angle_deg: float
+) -> None:
+    """The first 30 s, not aligned: the world is that of the start state."""
+    sequence = open_dataset(data_dir / "openvins_sim" / "euroc_V1_01", cameras=cameras)
+    result = run(sequence, load_config(algorithm=algorithm, duration_s=30.0))
+    assert result.status == "ok"
+    assert result.start_was_given
+    assert result.coverage > 0.99
+    assert rmse(sequence, result, "none", "trans_part") <= position_m
+    assert rmse(sequence, result, "none", "angle_deg") <= angle_deg
+
+
+# --- what every algorithm must do -----------------------------------------------------------------
+
+CONTRACT: dict[str, Any] = {"start_s": 3.5, "duration_s": 5.0, "min_coverage": 0.3}
+"""Of the wheel's tracks: a start from rest, the take-off, and three seconds of flight."""
+
+
+@pytest.fixture(scope="module")
+def contract_runs() -> dict[str, RunResult]:
+    """The runs that are shared by the tests below."""
+    return {}
+
+
+@pytest.fixture(params=algorithm_names())
+def contract_run(request: pytest.FixtureRequest, contract_runs: dict[str, RunResult]) -> RunResult:
+    name = str(request.param)
+    if name not in contract_runs:
+        contract_runs[name] = run(open_dataset("demo"), load_config(algorithm=name, **CONTRACT))
+    return contract_runs[name]
+
+
+def test_every_algorithm_gives_sane_states(contract_run: RunResult) -> None:
+    contract_run.check()
+    trajectory = contract_run.trajectory
+    assert len(trajectory) > 50
+    assert np.all(np.diff(trajectory.stamps_ns) > 0)
+    assert trajectory.velocities is not None
+    assert trajectory.gyro_biases is not None
+    assert trajectory.accel_biases is not None
+    for values in (
+        trajectory.positions,
+        trajectory.quaternions,
+        trajectory.velocities,
+        trajectory.gyro_biases,
+        trajectory.accel_biases,
+    ):
+        assert np.isfinite(values).all()
+    np.testing.assert_allclose(np.linalg.norm(trajectory.quaternions, axis=1), 1.0, atol=1e-9)
+    travelled = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
+    assert 0.5 < travelled < 5.0
+
+
+def test_every_algorithm_gives_positive_definite_covariances(contract_run: RunResult) -> None:
+    sigmas = contract_run.history.sigmas()
+    assert np.isfinite(sigmas).all()
+    assert np.all(sigmas > 0)
+    covariances = contract_run.history.pose_covariances()
+    np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-9, atol=1e-15)
+    assert np.all(np.linalg.eigvalsh(covariances) > 0)
+
+
+def test_every_algorithm_is_deterministic(contract_run: RunResult) -> None:
+    """Two runs give the same states to the last bit."""
+    algorithm = contract_run.config.algorithm
+    again = run(open_dataset("demo"), load_config(algorithm=algorithm.name, **CONTRACT))
+    for name in ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases"):
+        one, two = (getattr(r.trajectory, name) for r in (contract_run, again))
+        np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(contract_run.history.sigmas(), again.history.sigmas())

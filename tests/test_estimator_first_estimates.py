@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""First-estimates Jacobians keep the prior from knowing what no measurement can see.
+
+Cameras and IMU do not see where the world's origin is, nor its heading (Kelly & Sukhatme 2011). A
+change of these four moves every variable in a known direction, and along these directions the
+information of the prior can only be lost, never gained.
+"""
+
+import gtsam
+import numpy as np
+import pytest
+from flight import Flight, packets, rig, room
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from slam_graph.backend.config import BackendConfig, InitializationConfig
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.imu import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.square_root import Layout
+from slam_graph.backend.state import State, dims_of
+from slam_graph.config import load_config
+from slam_graph.sensors.measurements import FeatureFrame
+
+FloatArray = NDArray[np.float64]
+CONFIG = BackendConfig(initialization=InitializationConfig(mode="given", fix_gauge=False))
+WEAK = np.array([0.1, 0.5, 0.3, 0.1, 0.02])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def unseen_directions(values: gtsam.Values, layout: Layout) -> FloatArray:
+    """Tangents (n, 4) of a shift and a turn of the world."""
+    directions = np.zeros((layout.size, 4))
+    for key, columns in layout.columns.items():
+        kind, block = chr(gtsam.Symbol(key).chr()), directions[columns]
+        if kind == "x":
+            pose = values.atPose3(key)
+            world_to_body = pose.rotation().matrix().T
+            block[3:, :3] = world_to_body
+            block[:3, 3] = world_to_body @ UP
+            block[3:, 3] = world_to_body @ np.cross(UP, pose.translation())
+        elif kind == "v":
+            block[:, 3] = np.cross(UP, values.atVector(key))
+        elif kind == "l":
+            block[:, :3] = np.eye(3)
+            block[:, 3] = np.cross(UP, values.atPoint3(key))
+    return directions
+
+
+def claimed_information(estimator: Estimator) -> FloatArray:
+    """Information (4, 4) of the prior on the position and heading of the world."""
+    assert estimator.window is not None
+    prior = estimator.window.prior
+    rows = prior.R @ unseen_directions(estimator.window.state.first, prior.layout)
+    return rows.T @ rows
+
+
+def claims_over_time(name: str, first_estimates: bool, cameras: int) -> list[float]:
+    """After each frame, the largest factor by which a claim exceeds that of the start."""
+    rng = np.random.default_rng(2)
+    algorithm: AlgorithmConfig = load_config(
+        algorithm=name,
+        overrides=[f"algorithm.marginalization.first_estimates={str(first_estimates).lower()}"],
+    ).algorithm
+    flight, mounted = Flight(), rig(cameras)
+    estimator = Estimator(mounted, algorithm, CONFIG)
+    estimator.start(flight.nav_state(0.0, WEAK))
+    start = claimed_information(estimator)
+    growth = []
+    for packet in packets(flight, mounted, room(250, rng), 6.0, rng):
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        assert estimator.add_frame(packet.frame) is not None
+        growth.append(float(eigh(claimed_information(estimator), start, eigvals_only=True)[-1]))
+    assert estimator.window is not None
+    kinds = {chr(gtsam.Symbol(key).chr()) for key in estimator.window.prior.layout.dims}
+    assert kinds == {"x", "v", "b", "l"}
+    assert estimator.window.prior.layout.size > 100
+    return growth
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("name", ["msckf", "swf"])
+def test_with_first_estimates_nothing_unseen_is_claimed(name: str, cameras: int) -> None:
+    assert max(claims_over_time(name, True, cameras)) < 1.0 + 1e-6
+
+
+def test_without_first_estimates_the_claims_grow() -> None:
+    growth = claims_over_time("msckf", False, 1)
+    assert growth[0] < 1.0 + 1e-6
+    assert growth[-1] > 10.0
+
+
+def test_the_dynamics_do_not_see_these_directions() -> None:
+    """The law behind the tests above, at values that do not fit the measurements."""
+    flight = Flight()
+    params = preintegration_params(rig().imu, 9.81)
+    pim = preintegrate(flight.imu(0.0, 0.3), gtsam.imuBias.ConstantBias(), params)
+    state = State()
+    state.insert_imu_state(0, flight.nav_state(0.2))
+    state.insert_imu_state(1, flight.nav_state(0.7))
+    jacobian = gtsam.JacobianFactor(imu_factor(0, 1, pim).linearize(state.first))
+    layout = Layout(dims_of(jacobian.keys()))
+    A, b = jacobian.jacobian()
+    assert np.linalg.norm(b) > 100.0
+    change = A @ unseen_directions(state.first, layout)
+    np.testing.assert_allclose(change, 0.0, atol=1e-9 * np.abs(A).max())
