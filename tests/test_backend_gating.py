@@ -89,6 +89,13 @@ def tracked_cost(
     return cost, cost.linearize(), P, layout
 
 
+def known(covariance: FloatArray, layout: Layout) -> SquareRootInformation:
+    """What is known before: a mean of zero with this covariance."""
+    Rd = np.zeros((layout.size + 1, layout.size + 1), order="F")
+    Rd[:-1, :-1] = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    return SquareRootInformation(layout, Rd)
+
+
 @pytest.fixture(scope="module")
 def solved() -> list[tuple[Trial, Cost, Linearization]]:
     """Many scenes, each with its new features linearised."""
@@ -158,7 +165,9 @@ def test_the_gate_passes_its_share_of_correct_features(
     config = CONFIG.model_copy(update={"gating": gating})
     passed: list[bool] = []
     for case, cost, linear in solved:
-        tracked, fresh = replace(cost, config=config).gate(linear, case.covariance, case.layout)
+        tracked, fresh = replace(cost, config=config).gate(
+            linear, known(case.covariance, case.layout)
+        )
         assert len(tracked) == 0
         passed += fresh.tolist()
     error = np.sqrt(confidence * (1 - confidence) / len(passed))
@@ -176,7 +185,7 @@ def test_wrong_features_are_rejected_and_right_ones_are_not() -> None:
         rows = np.flatnonzero(bad[case.obs.feature] & (case.obs.slots == 3))
         case.obs.pixels[rows] += 15.0 * rng.choice([-1.0, 1.0], (len(rows), 2))
         cost, linear = fresh_cost(case)
-        fresh = cost.gate(linear, case.covariance, case.layout)[1]
+        fresh = cost.gate(linear, known(case.covariance, case.layout))[1]
         caught, wrong = caught + int((~fresh[bad]).sum()), wrong + int(bad.sum())
         spared, right = spared + int(fresh[~bad].sum()), right + int((~bad).sum())
     assert wrong > 50
@@ -193,7 +202,7 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
     cost, _, P, layout = tracked_cost(case, rng)
     assert cost.tracked is not None
     case.obs.pixels[bad] += 60.0
-    tracked, fresh = cost.gate(cost.linearize(), P, layout)
+    tracked, fresh = cost.gate(cost.linearize(), known(P, layout))
     assert len(fresh) == 0
     assert not tracked[bad].any()
     assert tracked[~bad].mean() > 0.8

@@ -16,7 +16,7 @@ from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.marginalization import marginalize
-from slam_graph.backend.policies import GaussNewtonPolicy, MarginalizationPolicy
+from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 from slam_graph.backend.state import State, dims_of
@@ -127,7 +127,6 @@ def test_the_loop_is_a_kalman_filter(first_estimates: bool, max_steps: int) -> N
     """Predict, update, marginalise over twenty steps; also with new linearisation points."""
     steps = GaussNewtonPolicy(max_steps=max_steps, tolerance=0.0)
     rng = np.random.default_rng(4)
-    policy = MarginalizationPolicy(first_estimates=first_estimates)
     state = State()
     start = Flight().nav_state(0.0)
     state.insert_imu_state(0, start)
@@ -147,7 +146,7 @@ def test_the_loop_is_a_kalman_filter(first_estimates: bool, max_steps: int) -> N
         dynamics = linear_factor(state, [*old, *new], transition, F @ old_point + u - new_point, Q)
         measurement = linear_factor(state, new, H, z - H @ new_point, R)
         cost = cost_of(state, prior, [dynamics, measurement])
-        prior = marginalize(minimize(cost, steps), state, new, policy)
+        prior = marginalize(minimize(cost, steps), state, new, first_estimates)
 
         x, P = F @ x + u, F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, NewFeatures
 from slam_graph.backend.marginalization import marginalize
-from slam_graph.backend.policies import MarginalizationPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.state import State, dim, dims_of, imu_state_keys
@@ -182,9 +181,7 @@ def test_the_prior_is_a_function_of_the_offsets(state: State, first_estimates: b
     state.update(wide, delta(KEYS))
     keep = [X(1), L(5)]
     expected = posterior.marginal(keep)
-    prior = marginalize(
-        posterior, state, keep, MarginalizationPolicy(first_estimates=first_estimates)
-    )
+    prior = marginalize(posterior, state, keep, first_estimates)
     assert not state.estimate.exists(X(0))
     assert state.estimate.exists(X(1))
     offset = state.offset(prior.layout)

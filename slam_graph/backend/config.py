@@ -59,13 +59,13 @@ class ZeroVelocityConfig(Settings):
 
     enabled: bool = True
     """Whether standing still is detected and used."""
-    window_s: float = Field(0.5, gt=0)
+    window_s: float = Field(1.0, gt=0)
     """Length of the window over which nothing may have moved."""
     max_gyro_std: float = Field(0.2, gt=0)
     """Largest standard deviation of the angular rate, rad/s."""
     max_accel_std: float = Field(2.5, gt=0)
     """Largest standard deviation of the specific force, m/s²."""
-    max_disparity_px: float = Field(0.5, gt=0)
+    max_disparity_px: float = Field(1.0, gt=0)
     """Largest median motion of the features over the window, and between two frames."""
     velocity_sigma: float = Field(0.01, gt=0)
     """How still a still platform is: standard deviation of its velocity, m/s."""

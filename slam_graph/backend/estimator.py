@@ -25,7 +25,6 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.propagation import Propagation
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import SquareRootInformation
-from slam_graph.backend.state import imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.diagnostics import Diagnostics
@@ -94,7 +93,7 @@ class Estimator:
             posterior = self._minimize(constructed)
         with self._timed("marginalization"):
             marginalize_step(window, constructed, posterior, self.algorithm.marginalization)
-        return window.current(posterior.covariance_of(imu_state_keys(window.frame)))
+        return window.current(posterior)
 
     def _minimize(self, constructed: ConstructedCost) -> SquareRootInformation:
         """Take the steps; without the features if these leave something undetermined."""
@@ -158,20 +157,20 @@ class Estimator:
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = stamp_ns
+        self._imu.forget_before(stamp_ns - IMU_HISTORY_NS)
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
-            state: NavState | None = None
             still = self._standstill.is_still(self._imu, stamp_ns, frame)
             if self.window is None:
                 with self._timed("start"):
                     self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
-                if self.window is not None:
-                    current = imu_state_keys(self.window.frame)
-                    state = self.window.current(self.window.prior.covariance_of(current))
             elif stamp_ns > self.window.stamp_ns:
-                state = self._step(self.window, stamp_ns, frame, still)
-            self._imu.forget_before(stamp_ns - IMU_HISTORY_NS)
-            return state
+                return self._step(self.window, stamp_ns, frame, still)
+            elif stamp_ns == self.window.stamp_ns:
+                self.window.tracks.add(self.window.frame, frame)
+            if self.window is None or stamp_ns < self.window.stamp_ns:
+                return None
+            return self.window.current(self.window.prior)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features in the state."""

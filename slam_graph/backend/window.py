@@ -75,8 +75,9 @@ class Window:
             keys += imu_state_keys(i)
         return keys
 
-    def current(self, covariance: FloatArray) -> NavState:
-        """The state of the current frame, with its covariance (15, 15)."""
+    def current(self, information: SquareRootInformation) -> NavState:
+        """The state of the current frame, with its covariance (15, 15) under some information."""
+        covariance = information.covariance_of(imu_state_keys(self.frame))
         return self.state.nav_state(self.frame, self.stamp_ns, covariance)
 
     def points(self) -> FloatArray:
