@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph simulate`: a sequence that never happened, with its exact truth."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from slam_graph.cli.config import ConfigFile, Overrides
+from slam_graph.cli.data import Json
+from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.progress import ProgressBar
+
+if TYPE_CHECKING:
+    from slam_graph.simulation.config import SimulationConfig
+    from slam_graph.simulation.sequence import SimulatedSequence
+
+Kind = Literal["tracks", "images"]
+
+
+def simulate(
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Folder to write.")],
+    kind: Annotated[
+        Kind | None, typer.Option("--kind", help="Feature tracks, or an EuRoC folder of images.")
+    ] = None,
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            "--trajectory",
+            metavar="figure8|rooms|random|PATH",
+            help="A made-up trajectory, or a ground truth or EuRoC folder to fly along.",
+        ),
+    ] = None,
+    real_imu: Annotated[
+        bool | None, typer.Option("--real-imu", help="Use the IMU that was recorded there.")
+    ] = None,
+    cameras: Annotated[
+        int | None, typer.Option("--cameras", help="Number of cameras of the rig.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Kalibr YAML of the rig.")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option("--start", help="Seconds into a recorded trajectory.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option("--duration", help="Seconds to fly.")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Frames in a second.")] = None,
+    features: Annotated[
+        int | None, typer.Option("--features", help="Most features in an image.")
+    ] = None,
+    pixel_sigma: Annotated[
+        float | None, typer.Option("--pixel-sigma", help="Noise of features, pixels.")
+    ] = None,
+    outliers: Annotated[
+        float | None, typer.Option("--outliers", help="Share of wrong observations.")
+    ] = None,
+    loss: Annotated[
+        float | None, typer.Option("--loss", help="Probability that a track ends at a frame.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """Simulate a flight: IMU, and feature tracks or rendered images, with their exact truth.
+
+    OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
+    """
+    from slam_graph.simulation.simulator import simulate as make
+    from slam_graph.simulation.writers import refuse_existing, write
+
+    tracks = {
+        "features": features,
+        "pixel_sigma": pixel_sigma,
+        "outliers": outliers,
+        "loss": loss,
+    }
+    said = {
+        "kind": kind,
+        "trajectory": trajectory,
+        "real_imu": real_imu,
+        "cameras": cameras,
+        "calibration": None if calibration is None else str(calibration),
+        "start_s": start,
+        "duration_s": duration,
+        "rate_hz": rate,
+        "seed": seed,
+        "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
+    }
+    refuse_existing(output)
+    sequence = make(_settings(config, set_ or [], said))
+    info = sequence.info()
+    with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
+        write(sequence, output, None if bar is None else lambda t: bar.advance(t, True))
+    _report(sequence, output, as_json)
+
+
+def _settings(file: Path | None, overrides: list[str], options: dict[str, Any]) -> SimulationConfig:
+    """The settings: file under options under overrides."""
+    from slam_graph.config_tree import ConfigTree, override, read_tree, validate
+    from slam_graph.simulation.config import SimulationConfig
+
+    tree = ConfigTree()
+    if file is not None:
+        tree.merge(read_tree(file))
+    said = {name: value for name, value in options.items() if value is not None}
+    tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
+    for text in overrides:
+        tree.merge(override(text))
+    return validate(SimulationConfig, tree)
+
+
+def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:
+    info = sequence.info()
+    if as_json:
+        echo_json({"folder": str(output), **asdict(info)})
+        return
+    rows = {
+        "folder": str(output),
+        "content": f"{info.frames} frames of {info.content}, {info.cameras} cameras",
+        "duration": f"{(info.end_ns - info.start_ns) * 1e-9:.2f} s",
+        "IMU": f"{info.imu_samples} samples",
+    }
+    echo_table(rows.items())

@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Flights that were recorded: the path to fly along, the rig, and the IMU that flew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import Rig
+from slam_graph.simulation.config import SimulationConfig
+from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
+
+LEAD_NS = 100_000_000
+"""How long before the first frame and after the last one a motion and its IMU go on."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFlight:
+    """A recorded flight, or the part of it that is asked for.
+
+    Attributes:
+        path: where it is from.
+        truth: its poses.
+        rig: its sensors, if it says.
+        sequence: the recording itself, if the path is of one.
+    """
+
+    path: Path
+    truth: Trajectory
+    rig: Rig | None
+    sequence: EurocSequence | None
+
+    @staticmethod
+    def read(path: Path, config: SimulationConfig, diagnostics: Diagnostics) -> RecordedFlight:
+        """The part of the recording at `path` that the settings ask for.
+
+        Raises:
+            DataError: if there is none, or no IMU where the settings ask for the recorded one.
+        """
+        if not path.exists():
+            raise DataError(
+                f"{path}: no such trajectory; give figure8, rooms, random, or an existing path"
+            )
+        truth = read_groundtruth(path, diagnostics)
+        start_ns = int(truth.stamps_ns[0]) + round(config.start_s * 1e9)
+        end_ns = int(truth.stamps_ns[-1])
+        if config.duration_s is not None:
+            end_ns = min(end_ns, start_ns + round(config.duration_s * 1e9) + 2 * LEAD_NS)
+        folder = path / "mav0" if (path / "mav0").is_dir() else path
+        sequence = None
+        if (folder / "imu0" / "data.csv").is_file() and any(folder.glob("cam[0-9]*")):
+            sequence = EurocSequence(path, diagnostics=diagnostics)
+        elif config.real_imu:
+            raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
+        rig = None if sequence is None else sequence.rig
+        return RecordedFlight(path, _part(truth, start_ns, end_ns, path), rig, sequence)
+
+    def motion(self, smooth: SplineMotion) -> RecordedMotion:
+        """The recorded poses themselves; velocities of a smooth fit where none were recorded."""
+        truth = self.truth
+        if truth.velocities is None:
+            truth = Trajectory(
+                truth.stamps_ns,
+                truth.positions,
+                truth.quaternions,
+                smooth.velocities(truth.stamps_ns),
+            )
+        return RecordedMotion(int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]), truth)
+
+    def samples(self, motion: Motion) -> ImuData:
+        """The recorded IMU over a motion."""
+        assert self.sequence is not None
+        data = ImuData.concatenate(list(self.sequence.imu_blocks(motion.start_ns - LEAD_NS)))
+        data = data[: int(np.searchsorted(data.stamps_ns, motion.end_ns + LEAD_NS))]
+        if not len(data) or data.stamps_ns[0] > motion.start_ns + LEAD_NS:
+            raise DataError(f"{self.path}: the recorded IMU does not cover the trajectory")
+        return data
+
+
+def _part(truth: Trajectory, start_ns: int, end_ns: int, path: Path) -> Trajectory:
+    rows = slice(
+        int(np.searchsorted(truth.stamps_ns, start_ns)),
+        int(np.searchsorted(truth.stamps_ns, end_ns)) + 1,  # so that the end is covered
+    )
+    if min(rows.stop, len(truth)) - rows.start < 2:
+        raise DataError(f"{path}: the trajectory is over before start_s and duration_s begin")
+    columns: dict[str, Any] = {
+        name: values[rows]
+        for name in Trajectory.__dataclass_fields__
+        if (values := getattr(truth, name)) is not None
+    }
+    return Trajectory(**columns)

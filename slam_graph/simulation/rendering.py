@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rendered images: for every pixel a ray to the nearest wall, and the texture that it hits.
+
+Rays are those of the camera model itself, so distortion is exact; textures are interpolated at
+floating-point places (OpenCV's warps round to 1/32 of a pixel and more).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.sensors.measurements import CameraFrame
+from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.simulation.config import ImageConfig, random_stream
+from slam_graph.simulation.motion import FloatArray, Motion
+from slam_graph.simulation.textures import Atlas, Grey
+from slam_graph.simulation.views import normalized
+from slam_graph.simulation.world import Panel, World
+
+NEAREST_M = 1e-3
+LIGHT = np.array([0.25, 0.45, 0.86])
+"""Where the light comes from: walls of different direction differ in brightness."""
+
+
+class Renderer:
+    """Takes images of a world; every image depends on its time and the seed alone.
+
+    Args:
+        rig: the cameras.
+        world: walls.
+        atlas: their textures.
+        config: noise, exposure, blur.
+        seed: of the simulation.
+    """
+
+    def __init__(
+        self, rig: Rig, world: World, atlas: Atlas, config: ImageConfig, seed: int
+    ) -> None:
+        self._cameras = [_RayCamera(mounted) for mounted in rig.cameras]
+        self._world = world
+        self._atlas = atlas
+        self._config = config
+        self._seed = seed
+        start = np.random.default_rng(random_stream(seed, "exposure"))
+        self._phase = float(start.uniform(0.0, 2.0 * np.pi))
+
+    def frame(self, motion: Motion, exposure_ns: int, offset_ns: int = 0) -> CameraFrame:
+        """The images of all cameras.
+
+        Args:
+            motion: of the platform.
+            exposure_ns: middle of the exposure on the clock of the IMU.
+            offset_ns: what the clock of the IMU shows more than that of the cameras.
+        """
+        stamps = self._instants(motion, exposure_ns)
+        rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
+        gain = self._gain(exposure_ns - motion.start_ns)
+        images = []
+        for number, camera in enumerate(self._cameras):
+            sharp = [self.radiance(number, R, p) for R, p in zip(rotations, positions, strict=True)]
+            values = gain * np.mean(sharp, axis=0)
+            if self._config.noise_sigma > 0:
+                since_ns = exposure_ns - motion.start_ns
+                seed = random_stream(self._seed, "pixels", number, since_ns)
+                noise = np.random.default_rng(seed).standard_normal(values.shape, np.float32)
+                values += np.float32(self._config.noise_sigma) * noise
+            image = np.rint(values).clip(0, 255).astype(np.uint8)
+            images.append(image.reshape(camera.height, camera.width))
+        return CameraFrame(exposure_ns - offset_ns, tuple(images))
+
+    def radiance(self, camera: int, world_R_body: FloatArray, position: FloatArray) -> Grey:
+        """What each pixel of a camera sees, (height · width,), for a pose of the body."""
+        lens = self._cameras[camera]
+        R = world_R_body @ lens.body_R_camera
+        eye = position + world_R_body @ lens.position
+        rays = lens.rays @ R.T.astype(np.float32)
+        hit = cast(self._world, eye, rays)
+        # a pixel covers distance / focal length, and more on a wall that is seen at an angle
+        footprint = hit.distance * lens.stretch / (lens.focal_px * np.sqrt(hit.slant))
+        level = np.log2(footprint * np.float32(1.0 / self._atlas.texel_m))
+        shade = np.array([_shade(panel) for panel in self._world.panels], np.float32)
+        grey = shade[hit.panel] * self._atlas.sample(hit.panel, level, hit.a, hit.b)
+        return np.where(lens.lit, grey, np.float32(0.0))
+
+    def _instants(self, motion: Motion, exposure_ns: int) -> NDArray[np.int64]:
+        """Times of the sharp images of which a blurred one is the mean."""
+        if self._config.exposure_s == 0.0:
+            return np.array([exposure_ns], np.int64)
+        count = self._config.blur_samples
+        parts = (np.arange(count) + 0.5) / count - 0.5
+        shifts = np.round(parts * self._config.exposure_s * 1e9).astype(np.int64)
+        return np.clip(exposure_ns + shifts, motion.start_ns, motion.end_ns)
+
+    def _gain(self, since_ns: int) -> np.float32:
+        config = self._config
+        turn = 2.0 * np.pi * since_ns * 1e-9 / config.exposure_period_s + self._phase
+        return np.float32(1.0 + config.exposure_change * np.sin(turn))
+
+
+class _RayCamera:
+    """The rays of all pixels of a camera.
+
+    Attributes:
+        rays: (H W, 3) unit vectors in the camera frame.
+        stretch: (H W,) how much more of the view a pixel takes in than one in the middle.
+        focal_px: mean focal length.
+        lit: (H W,) which pixels see anything; not those beyond what the camera model reaches.
+    """
+
+    def __init__(self, mounted: RigCamera) -> None:
+        camera, pose = mounted.camera, mounted.body_T_camera
+        self.width, self.height = camera.width, camera.height
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+        plane, self.lit = normalized(camera, pixels)
+        rays = np.column_stack([plane, np.ones(len(plane))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        self.rays = rays.astype(np.float32)
+        self.focal_px = np.float32(0.5 * (camera.fx + camera.fy))
+        grid = rays.reshape(self.height, self.width, 3)
+        sides = [np.linalg.norm(np.gradient(grid, axis=axis), axis=2) for axis in (0, 1)]
+        stretch = (np.sqrt(sides[0] * sides[1]) * self.focal_px).ravel().astype(np.float32)
+        self.stretch = np.maximum(stretch, np.float32(1e-3))  # pixels that are not lit have none
+        self.body_R_camera = pose.rotation().matrix()
+        self.position = np.asarray(pose.translation())
+
+
+class Hits:
+    """Where N rays hit.
+
+    Attributes:
+        panel: (N,) numbers of the panels; 0 where nothing is hit.
+        distance: (N,) m, along the ray.
+        slant: (N,) cosine of the angle between ray and normal.
+        a, b: (N,) place on the panel, across and along, m.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.panel = np.zeros(count, np.intp)
+        self.distance = np.full(count, np.float32(1e6))
+        self.slant: Grey = np.ones(count, np.float32)
+        self.a: Grey = np.zeros(count, np.float32)
+        self.b: Grey = np.zeros(count, np.float32)
+
+
+def cast(world: World, eye: FloatArray, rays: Grey) -> Hits:
+    """The nearest panel that each ray hits.
+
+    Args:
+        world: the panels; those seen from behind let rays through.
+        eye: (3,) where the rays begin.
+        rays: (N, 3) unit vectors.
+    """
+    hits = Hits(len(rays))
+    for index, panel in enumerate(world.panels):
+        away = panel.corner - eye
+        height = float(away @ panel.normal)
+        if height >= -NEAREST_M:
+            continue
+        frame = np.stack([panel.normal, panel.across, panel.along]).astype(np.float32)
+        slope, across, along = frame @ rays.T
+        with np.errstate(divide="ignore"):
+            distance = np.float32(height) / slope
+        near = np.flatnonzero((distance > 0) & (distance < hits.distance))
+        t = distance[near]
+        a = t * across[near] - np.float32(away @ panel.across)
+        b = t * along[near] - np.float32(away @ panel.along)
+        inside = (a >= 0) & (a <= panel.size[0]) & (b >= 0) & (b <= panel.size[1])
+        near, t, a, b = near[inside], t[inside], a[inside], b[inside]
+        hits.panel[near], hits.distance[near], hits.slant[near] = index, t, -slope[near]
+        hits.a[near], hits.b[near] = a, b
+    return hits
+
+
+def _shade(panel: Panel) -> float:
+    return 0.8 + 0.2 * float(panel.normal @ LIGHT)

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Textures of walls: band-limited noise in pyramids of resolutions, packed into one array."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.simulation.config import random_stream
+from slam_graph.simulation.world import World
+
+Grey = NDArray[np.float32]
+
+LEVELS = 7
+"""Of a pyramid: each has half the resolution of the one before, the last one 1/64."""
+
+FINEST_WAVE_TEXELS = 4
+"""Distance of the nodes of the finest noise; linear interpolation of texels is accurate then."""
+
+COARSEST_WAVE_M = 0.7
+FADING = 0.9
+"""Amplitude of each octave of noise relative to the next coarser one."""
+
+MEAN_GREY, CONTRAST = 118.0, 75.0
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """The pyramids of all panels.
+
+    Attributes:
+        texels: (T,) uint8, all levels of all panels, row by row.
+        offsets: (P * LEVELS,) where each level of each panel begins.
+        widths, heights: (P * LEVELS,) of each level, in texels.
+        texel_m: size of a texel of the finest level, m.
+    """
+
+    texels: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int64]
+    heights: NDArray[np.int64]
+    texel_m: float
+
+    def sample(self, panel: NDArray[np.intp], level: Grey, a: Grey, b: Grey) -> Grey:
+        """Grey values, interpolated linearly between texels and between levels.
+
+        Args:
+            panel: (N,) numbers of the panels.
+            level: (N,) of the pyramid; what is outside is clipped.
+            a: (N,) places on the panel, across, m.
+            b: (N,) along, m.
+        """
+        level = np.clip(level, 0.0, LEVELS - 1.001)
+        fine = level.astype(np.intp)
+        x, y = a / np.float32(self.texel_m) - 0.5, b / np.float32(self.texel_m) - 0.5
+        lower = self._within(panel * LEVELS + fine, fine, x, y)
+        upper = self._within(panel * LEVELS + fine + 1, fine + 1, x, y)
+        mixed: Grey = lower + (level - fine).astype(np.float32) * (upper - lower)
+        return mixed
+
+    def _within(self, row: NDArray[np.intp], level: NDArray[np.intp], x: Grey, y: Grey) -> Grey:
+        """Grey values within levels, at places counted in texels of the finest one.
+
+        The middle of texel i of a level is at that of texel i · 2^level of the finest one, because
+        `cv2.pyrDown` keeps every other one.
+        """
+        scale = np.ldexp(np.float32(1.0), -level)
+        width = self.widths[row]
+        x = np.clip(x * scale, 0, (width - 1.001).astype(np.float32))
+        y = np.clip(y * scale, 0, (self.heights[row] - 1.001).astype(np.float32))
+        column, line = x.astype(np.int64), y.astype(np.int64)
+        u, v = x - column.astype(np.float32), y - line.astype(np.float32)
+        place = self.offsets[row] + line * width + column
+        top = _mix(self.texels[place], self.texels[place + 1], u)
+        place += width
+        return _mix(top, _mix(self.texels[place], self.texels[place + 1], u), v)
+
+
+def _mix(a: NDArray[np.uint8] | Grey, b: NDArray[np.uint8] | Grey, weight: Grey) -> Grey:
+    start = a.astype(np.float32)
+    mixed: Grey = start + weight * (b.astype(np.float32) - start)
+    return mixed
+
+
+def paint(world: World, texel_m: float, seed: int) -> Atlas:
+    """Textures for all panels of a world, so different that places can be told apart.
+
+    Args:
+        world: its panels.
+        texel_m: size of a texel, m.
+        seed: of the simulation.
+    """
+    images: list[NDArray[np.uint8]] = []
+    for index, panel in enumerate(world.panels):
+        rng = np.random.default_rng(random_stream(seed, "texture", index))
+        width, height = (max(round(side / texel_m), 2) for side in panel.size)
+        images += _pyramid(_noise(width, height, texel_m, rng))
+    sizes = np.array([image.shape for image in images], np.int64)
+    ends = np.cumsum(sizes[:, 0] * sizes[:, 1])
+    return Atlas(
+        texels=np.concatenate([image.ravel() for image in images]),
+        offsets=np.concatenate([[0], ends[:-1]]),
+        widths=sizes[:, 1],
+        heights=sizes[:, 0],
+        texel_m=texel_m,
+    )
+
+
+def _noise(width: int, height: int, texel_m: float, rng: np.random.Generator) -> Grey:
+    """Noise of many wavelengths (height, width), its contrast evened out."""
+    total: Grey = np.zeros((height, width), np.float32)
+    wave, amplitude = COARSEST_WAVE_M / texel_m, 1.0
+    while wave >= FINEST_WAVE_TEXELS:
+        nodes = rng.normal(size=(int(height / wave) + 4, int(width / wave) + 4))
+        smooth = cv2.resize(
+            nodes.astype(np.float32), None, fx=wave, fy=wave, interpolation=cv2.INTER_CUBIC
+        )
+        total += np.float32(amplitude) * smooth[:height, :width]
+        wave, amplitude = wave / 2.0, amplitude * FADING
+    total -= total.mean()
+    total *= np.float32(0.9) / max(float(total.std()), 1e-6)
+    return np.float32(MEAN_GREY) + np.float32(CONTRAST) * np.tanh(total)
+
+
+def _pyramid(finest: Grey) -> list[NDArray[np.uint8]]:
+    levels, image = [], finest
+    for _ in range(LEVELS):
+        levels.append(np.rint(image).clip(0, 255).astype(np.uint8))
+        height, width = image.shape
+        size = (max((width + 1) // 2, 2), max((height + 1) // 2, 2))
+        image = np.asarray(cv2.pyrDown(image, dstsize=size), dtype=np.float32)
+    return levels

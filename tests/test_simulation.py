@@ -1,0 +1,386 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of simulated motions, IMU streams and feature tracks."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from flight import FISHEYE, FORWARD
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.measurements import FeatureFrame, ImuData
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.simulation.config import SimulatedImuConfig, SimulationConfig, TrackConfig
+from slam_graph.simulation.imu import SimulatedImu
+from slam_graph.simulation.landmarks import on_walls
+from slam_graph.simulation.motion import GRAVITY, SplineMotion
+from slam_graph.simulation.rigs import euroc_rig
+from slam_graph.simulation.sequence import SimulatedTracks
+from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.splines import continuous, fit, stamps_between, through_waypoints
+from slam_graph.simulation.tracks import TrackSimulator
+from slam_graph.simulation.world import box, three_rooms
+
+SHAPES = ("figure8", "rooms", "random")
+PERFECT = {"noise_scale": 0.0, "gyro_bias_sigma": 0.0, "accel_bias_sigma": 0.0}
+
+
+def tracks(**options: Any) -> SimulatedTracks:
+    sequence = simulate(SimulationConfig(**{"duration_s": 6.0, **options}))
+    assert isinstance(sequence, SimulatedTracks)
+    return sequence
+
+
+def spline_of(sequence: SimulatedTracks) -> SplineMotion:
+    motion = sequence.flight.motion
+    assert isinstance(motion, SplineMotion)
+    return motion
+
+
+def frames(sequence: SimulatedTracks) -> list[FeatureFrame]:
+    return [frame for frame in sequence.frames() if isinstance(frame, FeatureFrame)]
+
+
+def check_derivatives(motion: SplineMotion) -> None:
+    """Velocity, acceleration and angular rate against central differences."""
+    step_ns = 100_000
+    stamps = np.arange(motion.start_ns + 10**7, motion.end_ns - 10**7, 37_000_003)
+    before, after, width_s = stamps - step_ns, stamps + step_ns, 2e-9 * step_ns
+    slope = (motion.positions(after) - motion.positions(before)) / width_s
+    np.testing.assert_allclose(motion.velocities(stamps), slope, atol=1e-6)
+    slope = (motion.velocities(after) - motion.velocities(before)) / width_s
+    np.testing.assert_allclose(motion.accelerations(stamps), slope, atol=1e-3)
+    turn = (motion.rotations(before).inv() * motion.rotations(after)).as_rotvec() / width_s
+    np.testing.assert_allclose(motion.angular_rates(stamps), turn, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_derivatives_are_those_of_the_poses(shape: str) -> None:
+    motion = spline_of(tracks(trajectory=shape, duration_s=40.0))
+    check_derivatives(motion)
+    stamps = np.arange(motion.start_ns, motion.end_ns, 10**6)
+    jumps = np.linalg.norm(np.diff(motion.accelerations(stamps), axis=0), axis=1)
+    assert np.max(jumps) < 0.1  # continuous: 100 m/s³ at most
+    assert np.max(np.linalg.norm(motion.accelerations(stamps), axis=1)) < 15.0
+    assert np.max(np.linalg.norm(motion.angular_rates(stamps), axis=1)) < 5.0
+
+
+def test_a_hovering_platform_does_not_move_at_all() -> None:
+    motion = spline_of(tracks(flight={"hover_s": 2.0, "hover_every_s": 10.0}, duration_s=25.0))
+    stamps = np.arange(motion.start_ns, motion.start_ns + 2 * 10**9, 10**7)
+    for begin_s in (0.0, 12.0):
+        at = stamps + round(begin_s * 1e9)
+        assert np.ptp(motion.positions(at), axis=0).max() < 1e-12
+        assert np.abs(motion.velocities(at)).max() < 1e-12
+        assert np.abs(motion.angular_rates(at)).max() < 1e-12
+        force = motion.specific_forces(at)
+        np.testing.assert_allclose(np.linalg.norm(force, axis=1), 9.81, atol=1e-9)
+    moving = np.array([motion.start_ns + 6 * 10**9])
+    assert np.linalg.norm(motion.velocities(moving)) > 0.3
+
+
+def test_a_spline_goes_through_its_waypoints() -> None:
+    rng = np.random.default_rng(5)
+    times_s = np.cumsum(rng.uniform(0.3, 0.8, 20))
+    quaternions = continuous(np.cumsum(rng.normal(size=(20, 4)), axis=0) + np.array([0, 0, 0, 9.0]))
+    poses = np.column_stack([rng.normal(size=(20, 3)), quaternions])
+    poses[8:11] = poses[8]
+    spline = through_waypoints(times_s, poses)
+    np.testing.assert_allclose(spline(times_s), poses, atol=1e-12)
+    rest = np.linspace(times_s[8], times_s[10], 50)
+    assert np.ptp(spline(rest), axis=0).max() < 1e-12
+    for order, tolerance in ((1, 1e-3), (2, 0.1)):
+        sides = spline(times_s[1:-1] - 1e-6, order), spline(times_s[1:-1] + 1e-6, order)
+        np.testing.assert_allclose(*sides, atol=tolerance)
+
+
+def test_a_fitted_spline_follows_a_recording_and_its_derivatives() -> None:
+    truth = spline_of(tracks(trajectory="random", duration_s=20.0))
+    stamps = stamps_between(truth.start_ns, truth.end_ns, 200.0)
+    signs = np.where(np.arange(len(stamps)) % 7 == 0, -1.0, 1.0)  # q and -q are one rotation
+    quaternions = truth.rotations(stamps).as_quat() * signs[:, None]
+    motion = fit(Trajectory(stamps, truth.positions(stamps), quaternions))
+    check_derivatives(motion)
+    np.testing.assert_allclose(motion.positions(stamps), truth.positions(stamps), atol=1e-3)
+    error = (motion.rotations(stamps).inv() * truth.rotations(stamps)).magnitude()
+    assert np.max(error) < 1e-3
+    np.testing.assert_allclose(motion.velocities(stamps), truth.velocities(stamps), atol=0.05)
+
+
+def test_a_recording_with_a_gap_is_refused() -> None:
+    truth = spline_of(tracks())
+    stamps = np.delete(stamps_between(truth.start_ns, truth.end_ns, 100.0), slice(200, 300))
+    with pytest.raises(DataError, match=r"gap of 1\.01 s"):
+        fit(Trajectory(stamps, truth.positions(stamps), truth.rotations(stamps).as_quat()))
+
+
+def integrate(imu: ImuData, motion: SplineMotion) -> tuple[NDArray[Any], NDArray[Any], Rotation]:
+    """Position, velocity and attitude at the last sample, by the midpoint rule."""
+    steps_s = np.diff(imu.stamps_ns) * 1e-9
+    turns = 0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * steps_s[:, None]
+    forces = 0.5 * (imu.accel[1:] + imu.accel[:-1])
+    forces = Rotation.from_rotvec(0.5 * turns).apply(forces)  # felt halfway through the step
+    first = imu.stamps_ns[:1]
+    p, v, R = motion.positions(first)[0], motion.velocities(first)[0], motion.rotations(first)[0]
+    for turn, force, dt in zip(Rotation.from_rotvec(turns), forces, steps_s, strict=True):
+        acceleration = R.apply(force) + GRAVITY
+        p = p + v * dt + 0.5 * acceleration * dt**2
+        v = v + acceleration * dt
+        R = R * turn
+    return p, v, R
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_perfect_imu_integrates_to_the_trajectory(shape: str) -> None:
+    errors = []
+    for rate_hz in (200.0, 400.0):
+        imu = PERFECT | {"rate_hz": rate_hz}
+        sequence = tracks(trajectory=shape, duration_s=11.0, imu=imu)
+        motion, data = spline_of(sequence), sequence.imu()[: round(10 * rate_hz) + 1]
+        p, v, R = integrate(data, motion)
+        end = data.stamps_ns[-1:]
+        assert end[0] - motion.start_ns == 10 * 10**9
+        np.testing.assert_allclose(v, motion.velocities(end)[0], atol=1e-3)
+        assert (R.inv() * motion.rotations(end)[0]).magnitude() < 2e-5
+        errors.append(float(np.linalg.norm(p - motion.positions(end)[0])))
+    assert errors[0] < 4e-3
+    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.1)  # what is left is the rule's
+
+
+@pytest.fixture(scope="module")
+def noisy_imu() -> SimulatedImu:
+    """Ten minutes at rest, sampled at 200 Hz."""
+    pose = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    spline = through_waypoints(np.array([0.0, 600.0]), np.stack([pose, pose]))
+    motion = SplineMotion(10**9, 601 * 10**9, spline)
+    return SimulatedImu(motion, ImuNoise(), SimulatedImuConfig(), 3)
+
+
+def test_noise_has_the_densities_of_the_calibration(noisy_imu: SimulatedImu) -> None:
+    data = ImuData.concatenate(list(noisy_imu.blocks()))
+    gyro_bias, accel_bias = noisy_imu.biases(data.stamps_ns)
+    noise, rate = noisy_imu.noise, noisy_imu.rate_hz
+    assert len(data) == noisy_imu.samples == 120_001
+    white = data.gyro - gyro_bias
+    np.testing.assert_allclose(white.std(axis=0), noise.gyro_noise_density * rate**0.5, rtol=0.01)
+    white = data.accel - accel_bias - [0, 0, 9.81]
+    np.testing.assert_allclose(white.std(axis=0), noise.accel_noise_density * rate**0.5, rtol=0.01)
+    assert np.abs(np.corrcoef(white[1:, 0], white[:-1, 0])[0, 1]) < 0.01
+    for bias, density in (
+        (gyro_bias, noise.gyro_random_walk),
+        (accel_bias, noise.accel_random_walk),
+    ):
+        for lag_s in (0.005, 0.1, 1.0):  # the spread of a random walk grows with the root of time
+            way = bias[round(lag_s * rate) :] - bias[: -round(lag_s * rate)]
+            assert np.sqrt(np.mean(way**2)) == pytest.approx(density * lag_s**0.5, rel=0.15)
+
+
+def test_the_imu_is_the_same_wherever_reading_begins(noisy_imu: SimulatedImu) -> None:
+    whole = ImuData.concatenate(list(noisy_imu.blocks()))
+    later = ImuData.concatenate(list(noisy_imu.blocks(after_ns=123_456_789_012)))
+    first = int(np.searchsorted(whole.stamps_ns, 123_456_789_012))
+    np.testing.assert_array_equal(later.stamps_ns, whole.stamps_ns[first:])
+    np.testing.assert_array_equal(later.accel, whole.accel[first:])
+    some = whole.stamps_ns[1::1999]
+    gyro_bias, _ = noisy_imu.biases(some)
+    np.testing.assert_allclose(gyro_bias, noisy_imu.biases(whole.stamps_ns)[0][1::1999])
+
+
+def landmarks_of(sequence: SimulatedTracks, frame: FeatureFrame, camera: int) -> NDArray[Any]:
+    """Points in the frame of a camera, for tracks that keep their landmarks' numbers."""
+    at = np.array([frame.stamp_ns])
+    motion = sequence.flight.motion
+    R, p = motion.rotations(at).as_matrix()[0], motion.positions(at)[0]
+    body_T_camera = sequence.rig.cameras[camera].body_T_camera.matrix()
+    points = sequence.landmarks.at(frame.cameras[camera].ids, frame.stamp_ns)[0]
+    return ((points - p) @ R - body_T_camera[:3, 3]) @ body_T_camera[:3, :3]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tracks_without_noise_are_projections_of_their_landmarks(shape: str) -> None:
+    exact = {"pixel_sigma": 0.0, "keep_ids": True}
+    sequence = tracks(trajectory=shape, tracks=exact, landmarks={"moving_points": 60})
+    moving = 0
+    for frame in frames(sequence)[::7]:
+        for camera, seen in enumerate(frame.cameras):
+            points = landmarks_of(sequence, frame, camera)
+            assert np.all((points[:, 2] > 0.3) & (points[:, 2] < 40.0))
+            model = sequence.rig.cameras[camera].camera
+            np.testing.assert_allclose(seen.pixels, model.project(points), atol=1e-9)
+            np.testing.assert_allclose(seen.normalized, points[:, :2] / points[:, 2:], atol=1e-9)
+            assert np.all((seen.pixels >= 8) & (seen.pixels <= (751 - 8, 479 - 8)))
+            moving += int(np.sum(seen.ids >= len(sequence.landmarks.points)))
+    assert moving > 0 or shape != "figure8"  # the box flies past the camera there
+
+
+def test_both_cameras_of_a_pair_see_the_same_points() -> None:
+    sequence = tracks(tracks={"pixel_sigma": 0.0})
+    left, right = sequence.rig.cameras
+    left_T_right = left.body_T_camera.between(right.body_T_camera)
+    t = left_T_right.translation()
+    skew = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    E = skew @ left_T_right.rotation().matrix()
+    for frame in frames(sequence)[::10]:
+        first, second = frame.cameras
+        common, i, j = np.intersect1d(first.ids, second.ids, return_indices=True)
+        assert len(common) == len(second) > 0.8 * len(first)
+        a = np.column_stack([first.normalized[i], np.ones(len(i))])
+        b = np.column_stack([second.normalized[j], np.ones(len(j))])
+        assert np.abs(np.einsum("ij,jk,ik->i", a, E, b)).max() < 1e-10
+
+
+def test_the_number_of_features_is_kept_and_they_are_spread() -> None:
+    sequence = tracks(tracks={"features": 80, "loss": 0.1}, duration_s=10.0)
+    for frame in frames(sequence):
+        seen = frame.cameras[0]
+        assert len(seen) == 80
+        assert len(np.unique(seen.ids)) == 80
+        quarters = (seen.pixels[:, 0] > 376) + 2 * (seen.pixels[:, 1] > 240)
+        assert np.bincount(quarters, minlength=4).min() >= 10
+
+
+def lengths(sequence: SimulatedTracks) -> NDArray[np.int64]:
+    ids = np.concatenate([frame.cameras[0].ids for frame in frames(sequence)])
+    return np.unique(ids, return_counts=True)[1]
+
+
+def test_tracks_are_lost_as_often_as_is_asked_for() -> None:
+    still = {"flight": {"hover_s": 9.0}, "duration_s": 8.0}
+    assert np.all(lengths(tracks(**still)) == 161)  # nothing moves: nothing is lost
+    lossy = tracks(**still, tracks={"loss": 0.05})
+    expected = 150 + 160 * 150 * 0.05
+    assert len(lengths(lossy)) == pytest.approx(expected, rel=0.1)
+    assert np.max(lengths(tracks(tracks={"max_length": 12}))) == 12
+
+
+def test_a_lost_landmark_comes_back_with_a_new_identity_or_the_old_one() -> None:
+    def gaps(keep: bool) -> int:
+        held = {"loss": 0.05, "keep_ids": keep}
+        found: dict[int, list[int]] = {}
+        few = {"density": 1.0}
+        for index, frame in enumerate(frames(tracks(tracks=held, landmarks=few))):
+            for name in frame.cameras[0].ids.tolist():
+                found.setdefault(name, []).append(index)
+        return sum(np.ptp(seen) + 1 != len(seen) for seen in found.values())
+
+    assert gaps(keep=False) == 0
+    assert gaps(keep=True) > 10
+
+
+def test_noise_and_outliers_are_of_the_size_that_is_asked_for() -> None:
+    base = tracks(tracks={"pixel_sigma": 0.7, "outliers": 0.1, "keep_ids": True})
+    errors = []
+    for frame in frames(base):
+        for camera, seen in enumerate(frame.cameras):
+            model = base.rig.cameras[camera].camera
+            errors.append(seen.pixels - model.project(landmarks_of(base, frame, camera)))
+    residuals = np.concatenate(errors)
+    wrong = np.linalg.norm(residuals, axis=1) > 5.0
+    assert np.mean(wrong) == pytest.approx(0.1, rel=0.05)
+    assert residuals[~wrong].std() == pytest.approx(0.7, rel=0.02)
+    assert np.abs(residuals[~wrong].mean(axis=0)).max() < 0.02
+
+
+def test_walls_hide_what_is_behind_them() -> None:
+    world = three_rooms()
+    eye = np.array([0.0, 0.0, 1.5])
+    through_door, behind_wall = [9.0, 0.2, 1.4], [9.0, -3.0, 1.4]
+    same_room, above_door = [3.0, 3.0, 1.0], [4.5, 0.0, 3.1]
+    points = np.array([through_door, behind_wall, same_room, above_door])
+    assert world.hidden(eye, points).tolist() == [False, True, False, True]
+
+
+def test_panels_of_a_box_face_inwards() -> None:
+    low, high = np.array([-1.0, -2.0, 0.0]), np.array([3.0, 1.0, 2.5])
+    for panel in box(low, high):
+        u, v = panel.size
+        middle = panel.corner + 0.5 * (u * panel.across + v * panel.along)
+        assert (0.5 * (low + high) - middle) @ panel.normal > 0
+        end = panel.corner + u * panel.across + v * panel.along
+        assert np.all((end >= low - 1e-12) & (end <= high + 1e-12))
+
+
+def test_cameras_that_look_elsewhere_have_features_of_their_own() -> None:
+    behind = gtsam.Rot3(np.diag([-1.0, -1.0, 1.0]) @ FORWARD)
+    rig = Rig(
+        (
+            RigCamera(FISHEYE, gtsam.Pose3(gtsam.Rot3(FORWARD), np.array([0.1, 0, 0]))),
+            RigCamera(FISHEYE, gtsam.Pose3(behind, np.array([-0.1, 0, 0]))),
+            RigCamera(FISHEYE, gtsam.Pose3(gtsam.Rot3(FORWARD), np.array([0.1, 0.1, 0]))),
+        )
+    )
+    flight = tracks().flight
+    landmarks = on_walls(flight.world, 30.0, np.random.default_rng(0))
+    simulator = TrackSimulator(rig, flight.world, landmarks, TrackConfig(features=50), 0)
+    assert simulator.groups == [[0, 2], [1]]
+    for frame in simulator.frames(flight.motion, flight.exposures_ns[:40]):
+        assert [len(frame.cameras[c]) for c in (0, 1)] == [50, 50]
+        assert len(np.intersect1d(frame.cameras[0].ids, frame.cameras[1].ids)) == 0
+        assert len(np.intersect1d(frame.cameras[0].ids, frame.cameras[2].ids)) > 35
+
+
+def test_a_time_offset_shifts_the_stamps_of_frames_but_not_what_they_see() -> None:
+    config, plain = SimulationConfig(duration_s=2.0), tracks(duration_s=2.0)
+    cameras = tuple(replace(mounted, time_offset_s=0.01) for mounted in euroc_rig().cameras)
+    flight = replace(plain.flight, rig=Rig(cameras))
+    late = SimulatedTracks("late", config, flight, plain.landmarks)
+    for a, b in zip(frames(plain), frames(late), strict=True):
+        assert a.stamp_ns - b.stamp_ns == 10_000_000
+        np.testing.assert_array_equal(a.cameras[1].pixels, b.cameras[1].pixels)
+    np.testing.assert_array_equal(late.groundtruth().stamps_ns, plain.groundtruth().stamps_ns)
+
+
+def test_landmarks_ahead_are_enough_everywhere() -> None:
+    sequence = tracks(trajectory="random", landmarks={"kind": "ahead"}, duration_s=15.0)
+    counts = [len(frame.cameras[0]) for frame in frames(sequence)]
+    assert min(counts) > 100
+    assert max(counts) == 150
+
+
+def test_the_start_is_the_truth_or_in_error_as_its_covariance_says() -> None:
+    exact = tracks().initial_state()
+    truth = tracks().groundtruth()
+    np.testing.assert_array_equal(exact.world_T_body.translation(), truth.positions[0])
+    assert exact.covariance is not None
+    squares = []
+    for seed in range(40):
+        state = tracks(start={"error": True}, seed=seed).initial_state()
+        plain = tracks(seed=seed).initial_state()
+        pose_error = plain.world_T_body.localCoordinates(state.world_T_body)
+        rest = [
+            getattr(state, n) - getattr(plain, n) for n in ("velocity", "accel_bias", "gyro_bias")
+        ]
+        error = np.concatenate([pose_error, *rest])
+        squares.append(error @ np.linalg.solve(exact.covariance, error) / 15)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_hundred_seconds_of_stereo_are_simulated_in_no_time() -> None:
+    sequence = tracks(trajectory="rooms", duration_s=100.0)
+    began = time.process_time()
+    count = sum(1 for _ in sequence.packets())
+    assert count == 2001
+    assert time.process_time() - began < 10.0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"real_imu": True}, ConfigError, "'figure8' is made up"),
+        ({"start_s": 3.0, "trajectory": "rooms"}, ConfigError, "'rooms' is made up"),
+        ({"trajectory": "nowhere"}, DataError, "nowhere: no such trajectory"),
+        ({"cameras": 3}, DataError, "asked for 3 cameras, the rig has 2"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said_in_one_line(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        tracks(**options)
