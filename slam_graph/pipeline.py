@@ -17,7 +17,7 @@ from slam_graph.known_start import KnownStart
 from slam_graph.output.run_result import RunResult
 from slam_graph.output.timing import Stopwatch, milliseconds
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
-from slam_graph.supervision import check_sane, estimate, outcome
+from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
 from slam_graph.visualization.viewer import NullViewer, Viewer
 
 __all__ = ["Progress", "RunResult", "run"]
@@ -87,7 +87,11 @@ def run(
     estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
-    with outcome(result, estimator, sequence.diagnostics), _watched(viewer, result):
+    with (
+        outcome(result, estimator, sequence.diagnostics),
+        _watched(viewer, result),
+        interrupts_between_frames() as frame_done,
+    ):
         for packet, clock in _packets(sequence, result):
             features = frontend.track(packet.frame)
             clock.lap("frontend", milliseconds(frontend.frame_stats))
@@ -104,6 +108,7 @@ def run(
             recorder.write(packet.imu, features)
             progress.advance(features.stamp_ns, estimator.initialized)
             viewer.show(packet.frame, features, state, points)
+            frame_done()
     return result
 
 

@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 import numpy as np
 
@@ -114,3 +117,36 @@ def _judge(result: RunResult, estimator: Estimator) -> None:
             f"the estimate covers {result.coverage:.1%} of the {result.recorded_s:.1f} s asked "
             f"for, less than min_coverage = {asked:.1%}"
         )
+
+
+@contextmanager
+def interrupts_between_frames() -> Iterator[Callable[[], None]]:
+    """Let Ctrl-C take effect when a frame is done, not in the middle of its book-keeping.
+
+    A second Ctrl-C takes effect at once. Outside the main thread, which alone gets signals, this
+    changes nothing.
+
+    Yields:
+        To be called after each frame; raises KeyboardInterrupt if there was one.
+    """
+    pending = False
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        nonlocal pending
+        if pending:
+            raise KeyboardInterrupt
+        pending = True
+
+    def frame_done() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield frame_done
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield frame_done
+        frame_done()
+    finally:
+        signal.signal(signal.SIGINT, before)

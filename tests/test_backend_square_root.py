@@ -95,6 +95,25 @@ def test_a_marginal_is_the_schur_complement(seed: int) -> None:
     np.testing.assert_allclose(cost_at(marginal, best[k]), cost_at(gauss, best), rtol=1e-9)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("unmoved", [1, 15, 16, 17, 47, 60])
+def test_what_stands_before_an_eliminated_variable_stays_in_place(seed: int, unmoved: int) -> None:
+    """However many rows that is: they are worked on in blocks."""
+    rng = np.random.default_rng(seed)
+    layout = Layout({**dict.fromkeys(range(unmoved), 3), **{100 + k: 6 for k in range(5)}})
+    gauss = SquareRootInformation(
+        layout, triangularize(random_rows(rng, 2 * layout.size, layout.size))
+    )
+    keep = [*range(unmoved), *rng.permutation([100, 102, 103]).tolist()]
+    marginal, k = gauss.marginal(keep), layout.indices(keep)
+    assert list(marginal.layout.dims) == keep
+    assert np.all(np.tril(marginal.Rd, -1) == 0.0)
+    np.testing.assert_allclose(marginal.solution(), gauss.solution()[k], atol=1e-9)
+    np.testing.assert_allclose(marginal.covariance(), gauss.covariance()[np.ix_(k, k)], atol=1e-9)
+    best = gauss.solution()
+    np.testing.assert_allclose(cost_at(marginal, best[k]), cost_at(gauss, best), rtol=1e-9)
+
+
 def test_a_marginal_over_all_variables_only_reorders() -> None:
     gauss = gaussian(np.random.default_rng(2))
     keys = list(DIMS)[::-1]

@@ -173,10 +173,10 @@ class Estimator:
             return self.window.current(self.window.prior)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
-        """Ids (N,) and world positions (N, 3) of the features in the state."""
+        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
         if self.window is None:
             return np.zeros(0, np.int64), np.zeros((0, 3))
-        return self.window.features, self.window.points()
+        return self.window.points()
 
     def _usable(self, frame: FeatureFrame) -> FeatureFrame:
         """The frame with all cameras of the rig, without observations that are not finite."""

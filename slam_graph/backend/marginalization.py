@@ -54,6 +54,7 @@ def _keep_landmarks(window: Window, constructed: ConstructedCost) -> None:
     fresh = constructed.cost.fresh
     if fresh is None:
         return
+    window.used = fresh.obs.ids, fresh.points
     again = ~constructed.leaving
     window.landmarks = fresh.obs.ids[again], fresh.points[again]
     if len(constructed.leaving):

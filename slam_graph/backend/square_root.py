@@ -21,6 +21,8 @@ FloatArray = NDArray[np.float64]
 
 BLOCK_SIZE = 32
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
+ROWS_AT_ONCE = 48
+"""Height of the blocks from which variables are eliminated that stand behind them."""
 
 
 class Layout:
@@ -156,14 +158,68 @@ class SquareRootInformation:
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
-        gone = [k for k in self.layout.dims if k not in set(keep)]
-        order = self.layout.indices([*gone, *keep])
-        width = self.layout.size - sum(self.layout.dims[k] for k in keep)
+        staying = set(keep)
+        gone = [k for k in self.layout.dims if k not in staying]
         layout = Layout({k: self.layout.dims[k] for k in keep})
-        permuted = np.empty_like(self.Rd)
-        permuted[:, :-1] = self.Rd[:, order]
-        permuted[:, -1] = self.Rd[:, -1]
-        return SquareRootInformation(layout, triangularize(permuted)[width:, width:])
+        width = self.layout.size - layout.size
+        first = self._unmoved(keep)
+        order = self.layout.indices([*gone, *keep])
+        order = np.append(np.concatenate([order[:width], order[width + first :]]), -1)
+        tail = triangularize(self.Rd[first:, order])
+        Rd = np.zeros((layout.size + 1, layout.size + 1), order="F")
+        Rd[first:, first:] = tail[width:, width:]
+        _eliminate_behind(Rd, self.Rd[:first], order[:width], order[width:], tail[:width])
+        return SquareRootInformation(layout, Rd)
+
+    def _unmoved(self, keep: Sequence[int]) -> int:
+        """How many leading columns stay where they are."""
+        columns = 0
+        for mine, kept in zip(self.layout.dims, keep, strict=False):
+            if mine != kept:
+                break
+            columns += self.layout.dims[mine]
+        return columns
+
+
+def _eliminate_behind(
+    Rd: FloatArray,
+    rows: FloatArray,
+    gone: NDArray[np.intp],
+    others: NDArray[np.intp],
+    conditional: FloatArray,
+) -> None:
+    """Eliminate variables from the rows of others that stand before them.
+
+    The rows that determine the eliminated variables are carried upwards, block by block: a rotation
+    with each block takes the eliminated columns out of it, another restores its triangle. That
+    costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
+
+    Args:
+        Rd: gets the result in its first rows.
+        rows: (n, …) the rows [R d] of the variables that stand before.
+        gone: columns of the eliminated variables in `rows`.
+        others: columns behind that stay, the right-hand side included.
+        conditional: (w, w + …) triangular rows over the eliminated columns and the others.
+    """
+    n, w = len(rows), len(gone)
+    if n == 0:
+        return
+    carried = np.hstack([conditional[:, :w], np.zeros((w, n)), conditional[:, w:]])
+    for start in range((n - 1) // ROWS_AT_ONCE * ROWS_AT_ONCE, -1, -ROWS_AT_ONCE):
+        stop = min(start + ROWS_AT_ONCE, n)
+        block = rows[start:stop]
+        stacked = np.vstack(
+            [
+                np.hstack([carried[:, :w], carried[:, w + start :]]),
+                np.hstack([block[:, gone], block[:, start:n], block[:, others]]),
+            ]
+        )
+        Q, R = np.linalg.qr(stacked[:, :w], mode="complete")
+        stacked = Q.T @ stacked[:, w:]
+        carried = np.hstack([R[:w], np.zeros((w, start)), stacked[:w]])
+        Q, _ = np.linalg.qr(stacked[w:, : stop - start])
+        Rd[start:stop, start:] = Q.T @ stacked[w:]
+        Rd[start:stop, start:stop] = np.triu(Rd[start:stop, start:stop])
 
 
 def triangularize(Ab: FloatArray) -> FloatArray:

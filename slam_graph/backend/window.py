@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from slam_graph.backend.square_root import SquareRootInformation
-from slam_graph.backend.state import State, imu_state_keys
+from slam_graph.backend.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.tracks import TrackWindow, is_in
 from slam_graph.geometry.trajectory import NavState
 
@@ -47,6 +47,7 @@ class Window:
         features: ids (N,) of the features in the state, ascending.
         landmarks: ids (N,) and world positions (N, 3) of the features that are in the cost without
             being in the state.
+        used: the same of all features that the last step estimated outside the state.
     """
 
     frame: int
@@ -61,15 +62,18 @@ class Window:
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
     features: IntArray = field(default_factory=_no_ids)
     landmarks: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
+    used: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
 
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
         """Keys of some features, past poses and past IMU states, and of the current IMU state.
 
-        They are in this order, and features that are no longer tracked come first: what no new
-        measurement touches stands to the left, where an update need not go.
+        They are in this order, and features that are no longer tracked come first, as they were:
+        what no new measurement touches stands to the left, where an update need not go.
         """
-        lost = ~is_in(features, self.tracks.seen)
-        keys = [L(int(j)) for j in np.concatenate([features[lost], features[~lost]])]
+        tracked = is_in(features, self.tracks.seen)
+        lost = {L(int(j)) for j in features[~tracked]}
+        keys = [key for key in self.prior.layout.dims if key in lost]
+        keys += [L(int(j)) for j in features[tracked]]
         keys += [X(i) for i in past if i not in moving]
         for i in (*moving, self.frame):
             keys += imu_state_keys(i)
@@ -80,7 +84,12 @@ class Window:
         covariance = information.covariance_of(imu_state_keys(self.frame))
         return self.state.nav_state(self.frame, self.stamp_ns, covariance)
 
-    def points(self) -> FloatArray:
-        """World positions (N, 3) of the features in the state."""
-        points = [self.state.estimate.atPoint3(L(j)) for j in self.features.tolist()]
-        return np.array(points).reshape(-1, 3)
+    def points(self) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and world positions (N, 3) of all features that the last step estimated."""
+        in_state = stacked_points(self.state.estimate, self.features.tolist())
+        ids, points = self.used
+        other = ~is_in(ids, self.features)
+        return (
+            np.concatenate([self.features, ids[other]]),
+            np.concatenate([in_state, points[other]]),
+        )
