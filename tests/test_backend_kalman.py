@@ -116,7 +116,9 @@ def test_more_steps_do_not_move_a_linear_solution(
         keys = [V(0), B(0)]
         state.freeze(keys)
         cost = cost_of(state, gaussian(keys, mean, P), [linear_factor(state, keys, H, z, R)])
-        solutions.append((minimize(cost, policy).posterior.covariance(), _vector(state.estimate, 0)))
+        solutions.append(
+            (minimize(cost, policy).posterior.covariance(), _vector(state.estimate, 0))
+        )
     np.testing.assert_allclose(solutions[1][1], solutions[0][1], atol=1e-8)
     np.testing.assert_allclose(solutions[1][0], solutions[0][0], atol=1e-8)
 
