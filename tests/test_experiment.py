@@ -158,7 +158,7 @@ def test_what_cannot_be_done_is_said_and_does_not_stop_the_rest(tmp_path: Path) 
         RecordTask(source=source, seed=0, config=load_config(), root=tmp_path)
         for source in (broken, sources[0])
     ]
-    outcomes = dict((task.source.recording, said) for task, said in LocalProcesses(2).do(tasks))
+    outcomes = {task.source.recording: said for task, said in LocalProcesses(2).do(tasks)}
     assert outcomes == {"no_such_folder": "no_such_folder: no such file or folder", None: None}
     assert tasks[1].is_done()
 

@@ -109,7 +109,7 @@ class DaskCluster:
             futures = client.map(do_in_process, texts, pure=False, retries=0)
             named = {future.key: task for future, task in zip(futures, tasks, strict=True)}
             try:
-                for future in as_completed(futures):
+                for future in as_completed(futures, loop=client.loop):
                     lost = future.exception()
                     said = future.result() if lost is None else f"{type(lost).__name__}: {lost}"
                     yield named[future.key], said
