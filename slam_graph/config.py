@@ -52,6 +52,16 @@ def algorithm_tree(name: str) -> ConfigTree:
     return read_tree(config_folder() / "algorithms" / f"{name}.yaml")
 
 
+def is_algorithm_file(path: Path) -> bool:
+    """Whether a YAML file holds the table of one algorithm rather than the settings of a run.
+
+    Raises:
+        ConfigError: if it cannot be read.
+    """
+    keys = read_tree(path).values.keys()
+    return bool(keys & AlgorithmConfig.model_fields.keys()) and "algorithm" not in keys
+
+
 def _named_algorithm(value: Any) -> Any:
     """Read the table of an algorithm that is given by its name."""
     return validate(AlgorithmConfig, algorithm_tree(value)) if isinstance(value, str) else value

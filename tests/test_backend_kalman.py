@@ -88,7 +88,7 @@ def test_one_step_is_the_kalman_update(seed: int) -> None:
     H, z = rng.normal(size=(7, 15)), rng.normal(size=7)
     cost = cost_of(state, gaussian(keys, mean, P), [linear_factor(state, keys, H, z, R)])
     before = state.copy()
-    posterior = minimize(cost, ONE_STEP)
+    posterior = minimize(cost, ONE_STEP).posterior
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     expected = mean + K @ (z - H @ mean)
     I_KH = np.eye(15) - K @ H
@@ -116,7 +116,9 @@ def test_more_steps_do_not_move_a_linear_solution(
         keys = [V(0), B(0)]
         state.freeze(keys)
         cost = cost_of(state, gaussian(keys, mean, P), [linear_factor(state, keys, H, z, R)])
-        solutions.append((minimize(cost, policy).covariance(), _vector(state.estimate, 0)))
+        solutions.append(
+            (minimize(cost, policy).posterior.covariance(), _vector(state.estimate, 0))
+        )
     np.testing.assert_allclose(solutions[1][1], solutions[0][1], atol=1e-8)
     np.testing.assert_allclose(solutions[1][0], solutions[0][0], atol=1e-8)
 
@@ -146,7 +148,7 @@ def test_the_loop_is_a_kalman_filter(first_estimates: bool, max_steps: int) -> N
         dynamics = linear_factor(state, [*old, *new], transition, F @ old_point + u - new_point, Q)
         measurement = linear_factor(state, new, H, z - H @ new_point, R)
         cost = cost_of(state, prior, [dynamics, measurement])
-        prior = marginalize(minimize(cost, steps), state, new, first_estimates)
+        prior = marginalize(minimize(cost, steps).posterior, state, new, first_estimates)
 
         x, P = F @ x + u, F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)

@@ -147,6 +147,18 @@ def test_config_dump_is_a_configuration(tmp_path: Path) -> None:
     assert "unknown key 'backend.noise.pixel_sigmo'" in one_line(faulty.stderr)
 
 
+def test_a_file_of_an_algorithm_is_checked_as_one(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("name: own\ncost:\n  max_past_poses: 7\n")
+    assert slam_graph("config", "check", own).stdout.endswith("ok\n")
+    own.write_text("name: own\ncost:\n  max_past_pose: 7\n")
+    faulty = slam_graph("config", "check", own)
+    assert faulty.returncode == 2
+    line = one_line(faulty.stderr)
+    assert f"{own}:3" in line
+    assert "max_past_poses" in line
+
+
 def test_config_schema_knows_every_setting() -> None:
     schema = json.loads(slam_graph("config", "schema").stdout)
     assert "algorithm" in schema["properties"]

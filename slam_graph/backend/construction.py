@@ -136,8 +136,8 @@ class CostConstruction:
         if len(ids) == 0:
             return None
         obs = window.tracks.observations(ids)
-        points, good = self._points(window, obs)
         lasting = is_in(ids, choice.lasting)
+        points, good = self._points(window, obs, lasting)
         if self.policy.features == "window":
             window.tracks.consume(ids[lasting & good])
         else:  # a lasting one that is not good may yet become so
@@ -145,7 +145,9 @@ class CostConstruction:
         self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~good & ~lasting))
         return NewFeatures(obs, points, lasting).subset(good)
 
-    def _points(self, window: Window, obs: Observations) -> tuple[FloatArray, BoolArray]:
+    def _points(
+        self, window: Window, obs: Observations, lasting: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
         """Positions (J, 3) of features, those of the last step where there are, and their worth."""
         poses = stacked_poses(window.state.estimate, obs.frames)
         result = triangulate(obs, self.rig, *poses, self.config.triangulation)
@@ -153,7 +155,8 @@ class CostConstruction:
         known = is_in(obs.ids, known_ids)
         points = result.points.copy()
         points[known] = known_points[np.searchsorted(known_ids, obs.ids[known])]
-        return points, result.good
+        wide = result.parallax_rad > self.policy.state_feature_parallax_rad
+        return points, result.good & (wide | ~lasting)
 
     def _leave_out(
         self,

@@ -23,6 +23,7 @@ from slam_graph.backend.feature_factors import (
     ReducedFeatures,
     WhitenedObservations,
     reduce_features,
+    robust_loss,
     whiten,
 )
 from slam_graph.backend.gating import squared_mahalanobis, threshold
@@ -120,19 +121,22 @@ class Cost:
             features = replace(features, obs=features.obs.without_idle_frames())
         return Cost(self.state, self.rig, self.config, self.prior, factors, None, features)
 
-    def error(self, linear: Linearization) -> float:
-        """Half the squared norm of all whitened residuals at the current estimates.
-
-        Args:
-            linear: of this cost at the current estimates.
-        """
-        total = 0.5 * float(np.sum(self.prior_at_estimate().Rd[:, -1] ** 2))
+    def value(self) -> float:
+        """The cost at the current estimates: half the squared residuals, under the robust loss."""
+        offset = self.state.offset(self.prior.layout)
+        total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
+        total += 0.5 * float(self.prior.Rd[-1, -1] ** 2)
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
-        if linear.tracked is not None:
-            total += 0.5 * float(np.sum(linear.tracked.r**2))
-        if linear.fresh is not None:
-            total += 0.5 * float(np.sum(linear.fresh.r_2**2) + np.sum(linear.fresh.r_1**2))
+        if self.tracked is not None and len(self.tracked):
+            total += self._loss(self.tracked, None)
+        if self.fresh is not None and len(self.fresh.obs):
+            total += self._loss(self.fresh.obs, self.fresh.points)
         return total
+
+    def _loss(self, obs: Observations, points: FloatArray | None) -> float:
+        residuals, _ = self.rig.residuals(obs, self._geometry(self.state.estimate, obs, points))
+        errors = np.linalg.norm(residuals, axis=1) / self.config.noise.pixel_sigma
+        return float(np.sum(robust_loss(errors, self.config.gating)))
 
     # --- linearisation -------------------------------------------------------------------------
 
@@ -149,15 +153,20 @@ class Cost:
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
         first, estimate = (
-            Geometry(
-                *stacked_poses(values, obs.frames),
-                stacked_points(values, obs.ids.tolist()) if points is None else points,
-            )
+            self._geometry(values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
         return whiten(
             obs, self.rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating
         )
+
+    def _geometry(
+        self, values: gtsam.Values, obs: Observations, points: FloatArray | None
+    ) -> Geometry:
+        """Poses and points of observations; the points of features of the state if not given."""
+        if points is None:
+            points = stacked_points(values, obs.ids.tolist())
+        return Geometry(*stacked_poses(values, obs.frames), points)
 
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""

@@ -17,14 +17,13 @@ from threadpoolctl import ThreadpoolController
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.construction import ConstructedCost, CostConstruction
-from slam_graph.backend.gauss_newton import minimize
+from slam_graph.backend.gauss_newton import Minimum, minimize
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.initialization import Initializer, start_from
 from slam_graph.backend.marginalization import marginalize_step
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.propagation import Propagation
 from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.diagnostics import Diagnostics
@@ -50,6 +49,7 @@ class Estimator:
     Attributes:
         window: variables, prior and tracks; None as long as there is no state.
         timings: seconds that each module took in the last step.
+        costs: the cost before the first Gauss-Newton step of the last frame and after each.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class Estimator:
         self.diagnostics = diagnostics or Diagnostics()
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
+        self.costs: tuple[float, ...] = ()
         projection = RigProjection(rig)
         self._propagation = Propagation(rig.imu, self.config, self.diagnostics)
         self._construction = CostConstruction(
@@ -90,12 +91,14 @@ class Estimator:
         with self._timed("cost"):
             constructed = self._construction.construct(window, still)
         with self._timed("gauss_newton"):
-            posterior = self._minimize(constructed)
+            minimum = self._minimize(constructed)
+            self.costs = minimum.costs
         with self._timed("marginalization"):
-            marginalize_step(window, constructed, posterior, self.algorithm.marginalization)
-        return window.current(posterior)
+            policy = self.algorithm.marginalization
+            marginalize_step(window, constructed, minimum.posterior, policy)
+        return window.current(minimum.posterior)
 
-    def _minimize(self, constructed: ConstructedCost) -> SquareRootInformation:
+    def _minimize(self, constructed: ConstructedCost) -> Minimum:
         """Take the steps; without the features if these leave something undetermined."""
         policy = self.algorithm.gauss_newton
         try:

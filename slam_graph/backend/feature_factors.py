@@ -118,6 +118,16 @@ def robust_weights(error: FloatArray, gating: GatingConfig) -> FloatArray:
     return np.ones_like(error)
 
 
+def robust_loss(error: FloatArray, gating: GatingConfig) -> FloatArray:
+    """The loss (N,) whose weights are `robust_weights`; half the square without one."""
+    width = gating.robust_width
+    if gating.robust_loss == "huber":
+        return np.where(error <= width, 0.5 * error**2, width * (error - 0.5 * width))
+    if gating.robust_loss == "cauchy":
+        return np.asarray(0.5 * width**2 * np.log1p((error / width) ** 2), dtype=np.float64)
+    return 0.5 * error**2
+
+
 def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:
     """Stack the observations of each feature and eliminate its position by Householder QR."""
     F = len(obs.frames)

@@ -10,6 +10,8 @@ back, and takes a step only if it lowers the cost.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from slam_graph.backend.cost import Cost, Linearization
@@ -20,9 +22,20 @@ INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e6
 
 
-def minimize(
-    cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None = None
-) -> SquareRootInformation:
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """What the steps have come to.
+
+    Attributes:
+        posterior: over an increment of the final estimates, linearised where the last step was.
+        costs: the cost before the first step and after each step that was taken.
+    """
+
+    posterior: SquareRootInformation
+    costs: tuple[float, ...]
+
+
+def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None = None) -> Minimum:
     """Take steps on a cost.
 
     Args:
@@ -30,15 +43,12 @@ def minimize(
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
 
-    Returns:
-        The posterior over an increment of the final estimates, linearised where the last step was.
-
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
     """
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
-    layout = cost.layout()
+    layout, costs = cost.layout(), [cost.value()]
     for step in range(policy.max_steps):
         if linear is None or step > 0:
             linear = cost.linearize()
@@ -46,9 +56,10 @@ def minimize(
         delta = posterior.solution()
         cost.apply(delta, linear, layout)
         posterior = posterior.shifted(delta)
+        costs.append(cost.value())
         if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
             break
-    return posterior
+    return Minimum(posterior, tuple(costs))
 
 
 def linearized(cost: Cost) -> SquareRootInformation:
@@ -64,28 +75,29 @@ def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInfo
 
 def _levenberg_marquardt(
     cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
-) -> SquareRootInformation:
+) -> Minimum:
     layout = cost.layout()
     linear = linear or cost.linearize()
-    system, error, damping = _system(cost, linear, layout), cost.error(linear), INITIAL_DAMPING
+    system, costs, damping = _system(cost, linear, layout), [cost.value()], INITIAL_DAMPING
     for _ in range(policy.max_steps):
         delta = _damped(system, damping).solution()
         before = cost.snapshot()
         cost.apply(delta, linear, layout)
-        trial = cost.linearize()
-        trial_error = cost.error(trial)
-        if not trial_error < error:
+        value = cost.value()
+        if not value < costs[-1]:
             cost.restore(before)
             damping *= 10.0
             if damping > MAX_DAMPING:
                 break
             continue
-        gain, error, linear = error - trial_error, trial_error, trial
+        gain = costs[-1] - value
+        costs.append(value)
+        linear = cost.linearize()
         system = _system(cost, linear, layout)
         damping = max(0.1 * damping, 1e-9)
-        if gain < policy.tolerance * error:
+        if gain < policy.tolerance * value:
             break
-    return system
+    return Minimum(system, tuple(costs))
 
 
 def _damped(system: SquareRootInformation, damping: float) -> SquareRootInformation:

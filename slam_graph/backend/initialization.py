@@ -160,7 +160,7 @@ class Initializer:
                 return "features that fit the motion"
             minimize(cost, BATCH)
             features = self._keep_features(cost, window)
-            posterior = minimize(cost, FINAL)
+            posterior = minimize(cost, FINAL).posterior
             normalized_cost = _normalized_cost(cost)
         except np.linalg.LinAlgError:
             return "motion that shows gravity and scale"

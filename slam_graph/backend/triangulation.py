@@ -32,11 +32,13 @@ class Triangulation:
         good: (J,) passed all checks: in front of every camera that saw it, not too near or far,
             and seen with enough parallax.
         reprojection_px: (J,) root mean square reprojection error.
+        parallax_rad: (J,) largest angle between the first ray and any other.
     """
 
     points: FloatArray
     good: NDArray[np.bool_]
     reprojection_px: FloatArray
+    parallax_rad: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,13 +77,14 @@ def triangulate(
     nearest = np.full(len(obs.ids), np.inf)
     np.minimum.at(nearest, obs.feature, depths)
     anchor_depth = depths[rays.anchor]
+    parallax = _parallax(obs, rays, points)
     good = (
         np.all(np.isfinite(points), axis=1)
         & (nearest > config.min_depth_m)
         & (anchor_depth < config.max_depth_m)
-        & (_parallax(obs, rays, points) > config.min_parallax_rad)
+        & (parallax > config.min_parallax_rad)
     )
-    return Triangulation(points, good, np.sqrt(squares / count))
+    return Triangulation(points, good, np.sqrt(squares / count), parallax)
 
 
 def _rays(

@@ -49,8 +49,14 @@ def check(
     set_: Overrides = None,
     algorithm: Algorithm = None,
 ) -> None:
-    """Check a configuration; a fault is said with its file and line, and the exit code is 2."""
-    from slam_graph.config import load_config
+    """Check a configuration, or the table of an algorithm.
 
-    load_config(file, set_ or (), algorithm=algorithm)
+    A fault is said with its file and line, and the exit code is 2.
+    """
+    from slam_graph.config import is_algorithm_file, load_config
+
+    if is_algorithm_file(file):
+        load_config(None, set_ or (), algorithm=str(file))
+    else:
+        load_config(file, set_ or (), algorithm=algorithm)
     typer.echo(f"{file}: ok")
