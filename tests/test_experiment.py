@@ -61,6 +61,7 @@ def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path
         assert all(0.0 < row["ate_m"][mode] < 0.1 for mode in ALIGNMENTS)
         assert row["nees"]["position"] > 0.0
         assert row["ms_per_frame"] > 0.0
+        assert row["steps"] == 1.0
         assert 50.0 < row["peak_memory_mb"] < 1000.0
     markdown = (folder / "report.md").read_text()
     html = (folder / "report.html").read_text()
@@ -88,6 +89,8 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
             np.testing.assert_allclose(series[f"translation_m_{mode}"], expected.values, atol=1e-12)
         assert np.all(np.diff(series["distance_m"]) >= 0.0)
         assert len(series["nees_position"]) == len(series["nees_time_s"]) > 0
+        assert len(series["steps"]) == len(result.steps) > 0
+        assert np.all(series["cost_before"] >= 0.0)
         assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.frames
     table = json.loads(file.with_suffix(".json").read_text())
     ours = table["metrics"]["accuracy"]["none"]["ate"]

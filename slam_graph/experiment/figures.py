@@ -70,9 +70,13 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         for part in ("orientation", "position")
     ]
     yield from _drawn(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
-    cost = Panel(TIME[1], "ms a frame", _curves(runs, "frame_time_s", f"ms_{STAGE}"))
-    file = folder / f"{data}_cost.png"
-    yield from _drawn(file, f"{data}: cost of the back end{mean}", [cost])
+    panels = [
+        Panel(TIME[1], "ms a frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(TIME[1], "steps a frame", _curves(runs, "step_time_s", "steps")),
+        Panel(TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
+        Panel(TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
+    ]
+    yield from _drawn(folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels)
 
 
 def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:

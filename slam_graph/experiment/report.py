@@ -22,7 +22,7 @@ COLUMNS = (
     "orientation [deg]",
     "NEES orientation",
     "NEES position",
-    "steps at most",
+    "steps",
     "ms a frame",
     "first → last third",
     "peak MB",
@@ -34,7 +34,8 @@ EXPLANATION = (
     "ATE is the root mean square of the position error of the causal estimate after no alignment, "
     "after alignment of yaw and position, and of the whole pose; orientation is after alignment "
     "of yaw and position. A NEES should be 3. Numbers are means over the seeds whose runs ended "
-    "well; peak memory is the largest. Milliseconds are those of the back end, and the arrow goes "
+    "well; peak memory is the largest. Steps are those of Gauss-Newton a frame, without those that "
+    "damping took back. Milliseconds are those of the back end, and the arrow goes "
     "from the median of the first third of the frames to that of the last: a growing cost shows "
     "there."
 )
@@ -75,7 +76,7 @@ def cells(row: Table) -> tuple[str, ...]:
         _number(row["orientation_deg"]["yaw"], 3),
         _number(row["nees"]["orientation"], 2),
         _number(row["nees"]["position"], 2),
-        str(row["max_steps"]),
+        _number(row["steps"], 2),
         _number(row["ms_per_frame"], 2),
         ends,
         _number(row["peak_memory_mb"], 0),

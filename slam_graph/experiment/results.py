@@ -8,6 +8,8 @@ covariance too, or all F that were read:
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
 - `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
 - `nees_time_s`, `nees_orientation`, `nees_position` (K,);
+- `step_time_s`, `steps`, `cost_before`, `cost_after` (S,): Gauss-Newton steps of the S frames that
+  took some;
 - `frame_time_s`, `ms_STAGE` (F,): milliseconds of each stage; NaN where it did not run.
 """
 
@@ -55,6 +57,7 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
         "schema_version": SCHEMA_VERSION,
         **about,
         "metrics": metrics,
+        "mean_steps": float(result.steps.steps.mean()) if len(result.steps) else None,
         "config": result.config.model_dump(mode="json"),
     }
     write_text(path, [json.dumps(table, indent=1, allow_nan=False), "\n"])
@@ -82,6 +85,9 @@ def series_of(result: RunResult) -> Series:
         f"ms_{stage}": result.timing.column(stage) for stage in result.timing.stages()
     }
     series["frame_time_s"] = (result.timing.stamps_ns - result.start_ns) * 1e-9
+    series["step_time_s"] = (result.steps.stamps_ns - result.start_ns) * 1e-9
+    series["steps"] = result.steps.steps
+    series["cost_before"], series["cost_after"] = result.steps.costs.T
     truth = result.truth_of_run()
     if truth is not None and len(result.history) > 0:
         series |= _error_series(truth, result)

@@ -47,7 +47,7 @@ def _row(data: str, algorithm: str, tasks: list[RunTask]) -> Table:
             part: _mean(good, lambda m, part=part: m["nees"][part]["mean"])  # type: ignore[misc]
             for part in ("orientation", "position")
         },
-        "max_steps": tasks[0].config.algorithm.gauss_newton.max_steps,
+        "steps": _average(r["mean_steps"] for r in results if r["mean_steps"] is not None),
         "ms_per_frame": _mean(good, lambda m: m["timing"]["stages"][STAGE]["mean_ms"]),
         "ms_first_third": _average(first for first, _ in ends),
         "ms_last_third": _average(last for _, last in ends),
