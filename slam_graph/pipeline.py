@@ -99,6 +99,8 @@ def run(
             estimator.add_imu(packet.imu)
             state = estimate(estimator, features)
             clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
+            if "gauss_newton" in estimator.timings:
+                result.steps.append(features.stamp_ns, estimator.costs)
             ids, points = estimator.landmarks()
             if state is not None:
                 check_sane(state, config.limits)

@@ -22,6 +22,7 @@ LAYERS = (
     {"output"},
     {"known_start", "supervision"},
     {"pipeline"},
+    {"experiment"},
     {"cli"},
 )
 """Each layer may import the layers before it; the parts of one layer do not know each other."""

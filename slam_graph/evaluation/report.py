@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -53,18 +53,10 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
         truth: the true trajectory.
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
-            given); otherwise it is aligned in yaw and position, which nothing tells it, over the
-            whole run: the truth's own orientation at one time may be off by far more than the
-            estimate's uncertainty there. What never moves is aligned by its first pose.
+            given); otherwise it is aligned as `truth_from_estimate` says.
     """
     estimate = history.trajectory()
-    similarity, alignment = Similarity.identity(), "none"
-    if not aligned:
-        true, own = synchronize(truth, estimate)
-        try:
-            similarity, alignment = align_yaw(true.positions, own.positions), "yaw"
-        except DataError:
-            similarity, alignment = align_first_pose(true, own), "first_pose"
+    similarity, alignment = truth_from_estimate(truth, estimate, aligned)
     result = nees(estimate, history.pose_covariances(), truth, similarity)
     if len(result.stamps_ns) == 0:
         return None
@@ -80,6 +72,32 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
             "inside_bounds": float(np.mean((values >= low) & (values <= high))),
         }
     return table
+
+
+def truth_from_estimate(
+    truth: Trajectory, estimate: Trajectory, aligned: bool
+) -> tuple[Similarity, AlignmentMode | Literal["first_pose"]]:
+    """The map under which an estimate's consistency is judged, and its name.
+
+    An estimate that does not live in the world of the truth is aligned in yaw and position, which
+    nothing tells it, over the whole run: the truth's own orientation at one time may be off by far
+    more than the estimate's uncertainty there. What never moves is aligned by its first pose.
+
+    Args:
+        truth: the true trajectory.
+        estimate: the trajectory to judge.
+        aligned: whether the estimate lives in the world of the truth already.
+
+    Raises:
+        DataError: if the two share no time.
+    """
+    if aligned:
+        return Similarity.identity(), "none"
+    true, own = synchronize(truth, estimate)
+    try:
+        return align_yaw(true.positions, own.positions), "yaw"
+    except DataError:
+        return align_first_pose(true, own), "first_pose"
 
 
 def _errors_under(

@@ -20,6 +20,7 @@ from slam_graph.evaluation.association import select
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.output.point_map import PointMap
+from slam_graph.output.steps import StepLog
 from slam_graph.output.timing import TimingLog
 from slam_graph.sensors.rig import Rig
 
@@ -45,6 +46,7 @@ class RunResult:
         history: the causal estimate of every frame.
         points: the map.
         timing: milliseconds of every stage of every frame.
+        steps: Gauss-Newton steps of every frame, and the cost before and after.
         frames: number of frames that were read.
         features: sums over all frames of what the front end counts, by name.
         wall_s: time that the run took.
@@ -65,6 +67,7 @@ class RunResult:
     history: StateHistory = field(default_factory=StateHistory)
     points: PointMap = field(default_factory=PointMap)
     timing: TimingLog = field(default_factory=TimingLog)
+    steps: StepLog = field(default_factory=StepLog)
     frames: int = 0
     features: Counter[str] = field(default_factory=Counter)
     wall_s: float = 0.0

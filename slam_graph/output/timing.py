@@ -51,6 +51,11 @@ class TimingLog:
         for stage, column in self._columns.items():
             column.append(milliseconds.get(stage, np.nan))
 
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
     def column(self, stage: str) -> NDArray[np.float64]:
         """(N,) milliseconds of a stage."""
         return np.array(self._columns[stage])

@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph compare`: several algorithms on the tracks of one front end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slam_graph.cli.config import ConfigFile, Overrides
+from slam_graph.cli.data import Json
+from slam_graph.cli.output import echo_json, echo_table
+
+if TYPE_CHECKING:
+    from slam_graph.experiment.comparison import Comparison
+    from slam_graph.experiment.executors import Executor
+    from slam_graph.experiment.tasks import Task
+
+INTERRUPTED = 130
+
+
+def compare(
+    data: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DATA...",
+            help="Recordings, or simulations: sim:figure8, sim:rooms, sim:random, or sim:PATH of a "
+            "recorded flight with its IMU.",
+        ),
+    ],
+    algorithms: Annotated[
+        str, typer.Option("--algorithms", help="Names or YAML files, with commas between.")
+    ] = "msckf,swf,okvis,ekf,iekf",
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, help="How many seeds to run everything with.")
+    ] = 1,
+    output: Annotated[
+        Path, typer.Option("--output", help="Folder of tracks, results and report.")
+    ] = Path("results/comparison"),
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Processes at a time; all cores if not said."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to do the work."),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds to run; all if not said.")
+    ] = None,
+    cameras: Annotated[
+        str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
+    ] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    sim_set: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sim-set", metavar="KEY=VALUE", help="Set one value of all simulations; repeatable."
+        ),
+    ] = None,
+    groundtruth: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--groundtruth", metavar="DATA=PATH", help="True trajectory of a recording; repeatable."
+        ),
+    ] = None,
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """Run several algorithms on the same feature tracks, and report how they compare.
+
+    Given the same OUTPUT again, only what has not been done yet is done.
+    """
+    from slam_graph.config import load_config
+    from slam_graph.experiment.comparison import compare as run_comparison
+    from slam_graph.experiment.comparison import load_configs
+    from slam_graph.experiment.report import write_report
+    from slam_graph.experiment.sources import find_sources
+
+    said = {"duration_s": duration, "cameras": cameras}
+    names = [name for name in algorithms.split(",") if name]
+    configs = load_configs(
+        names, lambda name: load_config(config, set_ or (), algorithm=name, **said)
+    )
+    sources = find_sources(data, duration, sim_set or (), _truths(groundtruth or []))
+    executor = _executor(workers, scheduler)
+    try:
+        comparison = run_comparison(
+            sources, configs, seeds, output, executor, _tell if progress else _ignore
+        )
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; what is done is kept in {output}: say the same again", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    rows, files = write_report(comparison)
+    if as_json:
+        names_of_files = [str(file) for file in files]
+        echo_json({"rows": rows, "failures": comparison.failures, "files": names_of_files})
+    else:
+        _echo(comparison, rows, files)
+    _leave(comparison)
+
+
+def _truths(texts: list[str]) -> dict[str, str]:
+    """The paths of true trajectories, by the data that they belong to."""
+    pairs = [text.rpartition("=") for text in texts]
+    for text, (name, _, path) in zip(texts, pairs, strict=True):
+        if not name or not path:
+            raise typer.BadParameter(f"'{text}' is not of the form DATA=PATH")
+    return {name: path for name, _, path in pairs}
+
+
+def _executor(workers: int | None, scheduler: str | None) -> Executor:
+    from slam_graph.experiment.executors import DaskCluster, LocalProcesses
+
+    if scheduler is None:
+        return LocalProcesses(workers)
+    if workers is not None:
+        raise typer.BadParameter("--workers is for this machine; a cluster has its own")
+    return DaskCluster(scheduler)
+
+
+def _tell(task: Task, failure: str | None, count: int, total: int) -> None:
+    """Say on stderr that a task has ended."""
+    ending = "" if failure is None else f": failed: {failure}"
+    typer.echo(f"{count}/{total} {task.name}{ending}", err=True)
+
+
+def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
+    """Say nothing."""
+
+
+def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Path]) -> None:
+    """Print the table, and where the files are."""
+    from slam_graph.experiment.report import COLUMNS, cells
+
+    echo_table([("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)])
+    if comparison.skipped:
+        typer.echo(f"\n{comparison.skipped} tasks had been done before")
+    typer.echo(f"\n{comparison.folder}/")
+    typer.echo("  " + " ".join(file.name for file in files))
+
+
+def _leave(comparison: Comparison) -> None:
+    """Exit code 1 if something could not be done; a run that diverged is a result."""
+    from slam_graph.errors import DataError
+
+    if comparison.failures:
+        name, reason = next(iter(comparison.failures.items()))
+        raise DataError(
+            f"{len(comparison.failures)} tasks could not be done; the first: {name}: {reason}"
+        )

@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The experiment: same tracks for all, done once, reported whole, here and on a Dask cluster."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam_graph import pipeline
+from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.evaluation.ape import ape
+from slam_graph.experiment.comparison import load_configs, plan
+from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
+from slam_graph.experiment.figures import binned_mean
+from slam_graph.experiment.results import ALIGNMENTS, peak_memory_mb
+from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import RecordTask, RunTask
+
+COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
+STATIC = ("--set", "backend.initialization.mode=static")
+SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tracks.features=50")]
+TIMEOUT_S = 100
+
+
+def compare(*arguments: str | Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Two algorithms on six simulated seconds."""
+    folder = tmp_path_factory.mktemp("simulated")
+    done = compare(
+        "sim:figure8", *SHORT_SIM, "--algorithms", "msckf,swf", "--output", folder, "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    return folder, json.loads(done.stdout)
+
+
+def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path, dict]) -> None:
+    folder, printed = simulated
+    assert [(row["data"], row["algorithm"]) for row in printed["rows"]] == [
+        ("sim_figure8", "msckf"),
+        ("sim_figure8", "swf"),
+    ]
+    for row in printed["rows"]:
+        assert row["status"] == {"ok": 1}
+        assert all(0.0 < row["ate_m"][mode] < 0.1 for mode in ALIGNMENTS)
+        assert row["nees"]["position"] > 0.0
+        assert row["ms_per_frame"] > 0.0
+        assert row["steps"] == 1.0
+        assert 50.0 < row["peak_memory_mb"] < 1000.0
+    markdown = (folder / "report.md").read_text()
+    html = (folder / "report.html").read_text()
+    for name in ("msckf", "swf"):
+        assert f"| {name} |" in markdown
+        assert f"<td>{name}</td>" in html
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", markdown)
+    assert len(pictures) == len(ALIGNMENTS) + 2
+    assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
+    assert html.count("data:image/png;base64,") == len(pictures)
+
+
+def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
+    simulated: tuple[Path, dict],
+) -> None:
+    folder, _ = simulated
+    (tracks,) = (folder / "tracks").iterdir()
+    result = pipeline.run(open_dataset(tracks), load_config(algorithm="swf"))
+    truth = result.truth_of_run()
+    assert truth is not None
+    file = folder / "runs" / "sim_figure8_seed0" / "swf.npz"
+    with np.load(file, allow_pickle=False) as series:
+        for mode in ALIGNMENTS:
+            expected = ape(truth, result.trajectory, "trans_part", mode)
+            np.testing.assert_allclose(series[f"translation_m_{mode}"], expected.values, atol=1e-12)
+        assert np.all(np.diff(series["distance_m"]) >= 0.0)
+        assert len(series["nees_position"]) == len(series["nees_time_s"]) > 0
+        assert len(series["steps"]) == len(result.steps) > 0
+        assert np.all(series["cost_before"] >= 0.0)
+        assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.frames
+    table = json.loads(file.with_suffix(".json").read_text())
+    ours = table["metrics"]["accuracy"]["none"]["ate"]
+    assert ours == result.metrics["accuracy"]["none"]["ate"]
+
+
+def test_what_is_done_is_not_done_again_but_other_settings_are(
+    simulated: tuple[Path, dict],
+) -> None:
+    folder, _ = simulated
+    names = ("msckf", "swf")
+    files = [folder / "runs" / "sim_figure8_seed0" / f"{name}.json" for name in names]
+    before = [file.stat().st_mtime_ns for file in files]
+    arguments = ("sim:figure8", *SHORT_SIM, "--output", folder)
+    again = compare(*arguments, "--algorithms", "msckf,swf")
+    assert again.returncode == 0
+    assert again.stderr == ""
+    assert "3 tasks had been done before" in again.stdout
+    assert [file.stat().st_mtime_ns for file in files] == before
+
+    changed = compare(*arguments, "--algorithms", "swf", "--set", "algorithm.cost.max_past_poses=4")
+    assert changed.stderr.splitlines() == ["1/1 swf on sim_figure8, seed 0"]
+    assert files[0].stat().st_mtime_ns == before[0]
+    assert files[1].stat().st_mtime_ns > before[1]
+
+
+@pytest.mark.data
+def test_a_recording_of_tracks_with_its_truth(data_dir: Path, tmp_path: Path) -> None:
+    truth = data_dir / "euroc_inertial" / "V1_01_easy"
+    options = ("--groundtruth", f"demo={truth}", "--duration", "8", "--seeds", "3", *STATIC)
+    done = compare("demo", *options, "--algorithms", "msckf,swf", "--output", tmp_path, "--json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["rows"]
+    assert [row["seeds"] for row in rows] == [1, 1]  # a seed would change nothing
+    assert all(row["status"] == {"ok": 1} and row["ate_m"]["yaw"] < 0.1 for row in rows)
+
+
+def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
+    arguments = [
+        "sim:figure8",
+        *SHORT_SIM,
+        "--seeds",
+        "3",
+        "--algorithms",
+        "msckf",
+        "--workers",
+        "1",
+    ]
+    process = subprocess.Popen(
+        [*COMMAND, *arguments, "--output", tmp_path], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    first = process.stderr.readline()
+    assert first == "1/3 tracks of sim_figure8, seed 0\n"
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted; what is done is kept" in said
+    (kept,) = (tmp_path / "tracks").iterdir()  # and nothing half done
+    assert kept.name.startswith("sim_figure8_seed0_")
+
+
+def test_what_cannot_be_done_is_said_and_does_not_stop_the_rest(tmp_path: Path) -> None:
+    sources = find_sources(["sim:figure8"], 1.0)
+    broken = sources[0].model_copy(update={"simulation": None, "recording": "no_such_folder"})
+    tasks = [
+        RecordTask(source=source, seed=0, config=load_config(), root=tmp_path)
+        for source in (broken, sources[0])
+    ]
+    outcomes = {task.source.recording: said for task, said in LocalProcesses(2).do(tasks)}
+    assert outcomes == {"no_such_folder": "no_such_folder: no such file or folder", None: None}
+    assert tasks[1].is_done()
+
+
+def test_seeds_and_algorithms_make_the_plan(tmp_path: Path) -> None:
+    sources = find_sources(["sim:figure8", "demo"], 6.0)
+    configs = load_configs(["msckf", "ekf"], lambda name: load_config(algorithm=name))
+    recordings, runs = plan(sources, configs, 3, tmp_path)
+    assert len(recordings) == 4
+    assert len(runs) == 8
+    assert len({task.folder for task in recordings}) == 4
+    assert len({(task.key, task.seed) for task in runs}) == 8
+    again = RunTask.model_validate_json(runs[0].model_dump_json())
+    assert again.key == runs[0].key
+    first = sources[0].open(0, cameras=1).groundtruth()
+    assert first is not None
+    assert len(first) == 121
+
+
+@pytest.mark.parametrize(
+    ("names", "truths", "message"),
+    [
+        (["sim:no_such"], {}, "no_such: no such file or folder, and not one of figure8"),
+        (["sim:rooms", "sim:rooms"], {}, "another source is called 'sim_rooms' too"),
+        (["sim:rooms"], {"demo": "x"}, "no recording in DATA is called 'demo'"),
+    ],
+)
+def test_faults_in_what_is_named(names: list[str], truths: dict, message: str) -> None:
+    with pytest.raises((ConfigError, DataError), match=re.escape(message)):
+        find_sources(names, None, (), truths)
+
+
+def test_bins_average_what_is_known() -> None:
+    x, y = np.array([0.1, 0.2, 0.3, 1.5, 2.5]), np.array([1.0, 3.0, np.nan, 5.0, np.nan])
+    means = binned_mean(x, y, np.array([0.0, 1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(means, [2.0, 5.0, np.nan])
+
+
+def test_peak_memory_is_of_this_process_and_never_falls() -> None:
+    before = peak_memory_mb()
+    assert before is not None
+    block = np.ones(8_000_000)
+    after = peak_memory_mb()
+    assert after is not None
+    assert before <= after
+    assert block.nbytes / 2**20 < after
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """Address of a real Dask scheduler with one real worker, on loopback."""
+    file = tmp_path / "scheduler.json"
+    environment = {**os.environ, **ONE_THREAD}
+    dask = [sys.executable, "-m", "dask"]
+    options = ["--scheduler-file", str(file), "--no-dashboard"]
+    commands = (
+        [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", *options],
+        [*dask, "worker", "--nthreads", "2", "--local-directory", str(tmp_path), *options],
+    )
+    processes = [
+        subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for command in commands
+    ]
+    try:
+        deadline = time.monotonic() + 30
+        while not file.is_file() or not file.read_text().strip():
+            assert time.monotonic() < deadline, "no scheduler"
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+        for process in reversed(processes):
+            process.wait(20)
+
+
+def test_a_dask_cluster_does_the_same(
+    scheduler: str, simulated: tuple[Path, dict], tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    folder = tmp_path / "results"
+    options = ("--algorithms", "msckf", "--scheduler", scheduler, "--output", folder, "--json")
+    done = compare("sim:figure8", *SHORT_SIM, *options)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(done.stdout)["rows"]
+    local = simulated[1]["rows"][0]
+    assert row["ate_m"] == pytest.approx(local["ate_m"], rel=1e-9)
+
+
+def test_no_scheduler_is_said_in_one_line() -> None:
+    pytest.importorskip("distributed")
+    task = RecordTask(
+        source=find_sources(["sim:figure8"], 1.0)[0], seed=0, config=load_config(), root=Path()
+    )
+    with pytest.raises(DataError, match="no Dask scheduler answers at 'nowhere'"):
+        next(DaskCluster("nowhere").do([task]))
+
+
+def test_without_dask_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"pip install 'slam-graph\[compare\]'"):
+        DaskCluster("tcp://127.0.0.1:8786")
