@@ -80,7 +80,9 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
 
 
 @contextmanager
-def outcome(result: RunResult, estimator: EstimatorLike, diagnostics: Diagnostics) -> Iterator[None]:
+def outcome(
+    result: RunResult, estimator: EstimatorLike, diagnostics: Diagnostics
+) -> Iterator[None]:
     """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
     began = time.perf_counter()
     try:

@@ -60,9 +60,7 @@ class ProjectionFactors:
             model, factor, body_T_camera = self._cameras[int(obs.camera[row])]
             x, j = X(obs.frames[int(obs.frame[row])]), L(int(obs.ids[obs.feature[row]]))
             pixel = obs.pixels[row]
-            factors.append(
-                factor(pixel, self._noise, x, j, model, False, False, body_T_camera)
-            )
+            factors.append(factor(pixel, self._noise, x, j, model, False, False, body_T_camera))
         return factors
 
 
@@ -73,8 +71,9 @@ def joint_prior(prior: SquareRootInformation, at: gtsam.Values) -> gtsam.Nonline
         prior: ‖R δ - d‖² over exactly these three variables.
         at: the point from which δ is counted.
     """
-    blocks: list[Any] = []
-    for key, columns in prior.layout.columns.items():
-        blocks += [key, np.asfortranarray(prior.R[:, columns])]
+    (x, A_x), (v, A_v), (b, A_b) = (
+        (key, prior.R[:, columns]) for key, columns in prior.layout.columns.items()
+    )
     noise = gtsam.noiseModel.Unit.Create(prior.layout.size)
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*blocks, prior.d, noise), at)
+    gaussian = gtsam.JacobianFactor(x, A_x, v, A_v, b, A_b, prior.d, noise)
+    return gtsam.LinearContainerFactor(gaussian, at)

@@ -7,7 +7,7 @@ All eliminate by QR: see docs/engine.md on why Cholesky ends early here. Orderin
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import gtsam
@@ -27,7 +27,7 @@ class NativeSolver(Protocol):
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: Mapping[int, float],
+        stamps_s: dict[int, float],
     ) -> None:
         """Add factors and variables and solve.
 
@@ -76,7 +76,7 @@ def _isam2_params(policy: SmootherPolicy) -> gtsam.ISAM2Params:
     params = gtsam.ISAM2Params()
     params.setRelinearizeThreshold(policy.relinearize_threshold)
     params.relinearizeSkip = policy.relinearize_skip
-    params.setFactorization("QR")
+    params.setFactorization(policy.factorization.upper())
     params.findUnusedFactorSlots = True
     return params
 
@@ -92,10 +92,10 @@ class FixedLagIsam2:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: Mapping[int, float],
+        stamps_s: dict[int, float],
     ) -> None:
         """See `NativeSolver`."""
-        self._smoother.update(graph_of(factors), values, dict(stamps_s))
+        self._smoother.update(graph_of(factors), values, stamps_s)
         self._estimate = self._smoother.calculateEstimate()
 
     def estimate(self, keys: Iterable[int]) -> gtsam.Values:
@@ -121,7 +121,7 @@ class FixedLagBatch:
     def __init__(self, policy: SmootherPolicy) -> None:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(policy.max_iterations)
-        params.setLinearSolverType("MULTIFRONTAL_QR")
+        params.setLinearSolverType(f"MULTIFRONTAL_{policy.factorization.upper()}")
         self._smoother = gtsam.BatchFixedLagSmoother(policy.lag_s, params)
         self._estimate = gtsam.Values()
 
@@ -129,10 +129,10 @@ class FixedLagBatch:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: Mapping[int, float],
+        stamps_s: dict[int, float],
     ) -> None:
         """See `NativeSolver`."""
-        self._smoother.update(graph_of(factors), values, dict(stamps_s))
+        self._smoother.update(graph_of(factors), values, stamps_s)
         self._estimate = self._smoother.calculateEstimate()
 
     def estimate(self, keys: Iterable[int]) -> gtsam.Values:
@@ -164,7 +164,7 @@ class FullIsam2:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: Mapping[int, float],
+        stamps_s: dict[int, float],
     ) -> None:
         """See `NativeSolver`."""
         self._isam2.update(graph_of(factors), values)

@@ -68,9 +68,11 @@ class SmootherPolicy(Settings):
     """How GTSAM's own smoothers are used, where one of them is the engine."""
 
     lag_s: float = Field(4.0, gt=0)
-    """How long states stay in a fixed lag; `isam2` keeps them all, and starts features within it."""
+    """How long states stay in a fixed lag; `isam2` keeps all, and starts features in it."""
     spacing_s: float = Field(0.09, ge=0)
     """Least time between two states in the graph; frames between them are predicted by the IMU."""
+    factorization: Literal["cholesky", "qr"] = "cholesky"
+    """How variables are eliminated: fast, or with the square root of the condition number."""
     relinearize_threshold: float = Field(0.01, gt=0)
     """Variables of which the tangent moved by more are linearised anew (iSAM2)."""
     relinearize_skip: int = Field(1, ge=1)

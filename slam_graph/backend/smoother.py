@@ -171,7 +171,9 @@ class SmootherEstimator(Estimator):
         self._frames[ahead.frame] = ahead.stamp_ns
         self._frames = {i: stamp for i, stamp in self._frames.items() if stamp > oldest_ns}
         keys = [X(i) for i in self._frames] + [L(j) for j in self._features.active.tolist()]
-        self._estimate = self._solver.estimate([*keys, *imu_state_keys(ahead.frame)])
+        self._estimate = self._solver.estimate(
+            dict.fromkeys([*keys, *imu_state_keys(ahead.frame)])
+        )
         self._frames = {i: t for i, t in self._frames.items() if self._estimate.exists(X(i))}
         self._features.retain(self._estimate)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
@@ -65,9 +65,7 @@ class SmootherFeatures:
         self._config = config
         self._diagnostics = diagnostics
         self._rig = RigProjection(rig)
-        self._factors = ProjectionFactors(
-            rig, pixel_noise(config.noise.pixel_sigma, config.gating)
-        )
+        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, config.gating))
         angle = max(policy.min_parallax_rad, config.triangulation.min_parallax_rad)
         self._triangulation = config.triangulation.model_copy(update={"min_parallax_rad": angle})
 
@@ -94,7 +92,8 @@ class SmootherFeatures:
         again = again.rows(self._gate(again, estimate, covariance))
         ids = np.unique(again.ids[again.feature])
         self._add(new, again, ids)
-        entering, points = self._entering(tracks, frame, estimate, self._policy.max_features - len(ids))
+        room = self._policy.max_features - len(ids)
+        entering, points = self._entering(tracks, frame, estimate, room)
         for j, point in zip(entering.ids.tolist(), points, strict=True):
             new.points.insert(L(j), point)
         self._add(new, entering, entering.ids)
