@@ -72,6 +72,23 @@ def _stacked(joint: gtsam.JointMarginal, keys: Sequence[int]) -> FloatArray:
     return np.asarray(0.5 * (full + full.T), dtype=np.float64)
 
 
+def _covariance_of_graph(
+    graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, keys: Sequence[int]
+) -> FloatArray:
+    """Joint marginal covariance from a graph: what is asked for is eliminated last, in the root."""
+    linear = graph.linearize(at)
+    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys))
+    root = linear.eliminateMultifrontal(order).roots()[0].conditional()
+    size = sum(dim(key) for key in keys)
+    ends = np.cumsum([dim(key) for key in root.keys()])  # noqa: SIM118
+    columns = dict(zip(root.keys(), ends, strict=True))  # noqa: SIM118
+    order_in_root = np.concatenate([np.arange(columns[k] - dim(k), columns[k]) for k in keys])
+    order_in_root -= int(ends[-1]) - size
+    inverse = np.linalg.inv(root.R()[-size:, -size:])
+    covariance: FloatArray = (inverse @ inverse.T)[np.ix_(order_in_root, order_in_root)]
+    return covariance
+
+
 def _isam2_params(policy: SmootherPolicy) -> gtsam.ISAM2Params:
     params = gtsam.ISAM2Params()
     params.setRelinearizeThreshold(policy.relinearize_threshold)
@@ -104,7 +121,7 @@ class FixedLagIsam2:
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """See `NativeSolver`."""
-        return self._smoother.getFactors()
+        return gtsam.NonlinearFactorGraph(self._smoother.getFactors())
 
     def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
         """See `NativeSolver`."""
@@ -112,7 +129,7 @@ class FixedLagIsam2:
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `NativeSolver`."""
-        return _stacked(self._smoother.getISAM2().jointMarginalCovariance(list(keys)), keys)
+        return _covariance_of_graph(self._smoother.getFactors(), self._estimate, keys)
 
 
 class FixedLagBatch:
@@ -141,7 +158,7 @@ class FixedLagBatch:
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """See `NativeSolver`."""
-        return self._smoother.getFactors()
+        return gtsam.NonlinearFactorGraph(self._smoother.getFactors())
 
     def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
         """See `NativeSolver`."""
@@ -149,9 +166,7 @@ class FixedLagBatch:
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """See `NativeSolver`."""
-        linear = self._smoother.getFactors().linearize(self._estimate)
-        marginals = gtsam.Marginals(linear, self._estimate)
-        return _stacked(marginals.jointMarginalCovariance(list(keys)), keys)
+        return _covariance_of_graph(self._smoother.getFactors(), self._estimate, keys)
 
 
 class FullIsam2:

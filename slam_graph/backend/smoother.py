@@ -117,16 +117,20 @@ class SmootherEstimator(Estimator):
             both.insert(new.points)
             self._solver.update([*ahead.factors, *new.factors], both, {**stamps, **seen})
             return
-        except RuntimeError:
-            self.diagnostics.warn("features_degenerate", "one frame goes without its features")
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:120]
+            message = f"one frame goes without its features ({reason})"
+            self.diagnostics.warn("features_degenerate", message)
         try:
             self._solver = SOLVERS[self.algorithm.engine](self._policy)
             old_values.insert(values)
             rebuilt = [old_factors.at(k) for k in range(old_factors.size())]
-            factors = [factor for factor in rebuilt if factor is not None]
+            factors = [f for f in rebuilt if f is not None and all(map(old_values.exists, f.keys()))]
             self._solver.update([*factors, *ahead.factors], old_values, {**old_stamps, **stamps})
-        except RuntimeError:
-            self.diagnostics.warn("smoother_restarted", "all but the last state is given up")
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:120]
+            message = f"all but the last state is given up ({reason})"
+            self.diagnostics.warn("smoother_restarted", message)
             self._solver = self._begun(window)
             self._solver.update(ahead.factors, values, stamps)
 
