@@ -81,7 +81,10 @@ class SmootherPolicy(Settings):
     """Levenberg-Marquardt steps at most in one update (`fixed_lag_batch`)."""
     max_features: int = Field(40, ge=1)
     """How many features are tracked in the graph at once."""
-    min_feature_frames: int = Field(3, ge=2)
+    robust_loss: Literal["none", "huber", "cauchy"] = "cauchy"
+    """Loss on reprojection residuals, instead of that of `backend.gating`: an outlier that is in
+    the graph stays there, so its weight must be able to vanish."""
+    min_feature_frames: int = Field(5, ge=2)
     """How many states must have seen a feature before it may become a variable."""
     min_parallax_rad: float = Field(0.02, ge=0)
     """Smallest angle between two rays to such a feature."""

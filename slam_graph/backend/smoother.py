@@ -91,6 +91,9 @@ class SmootherEstimator(Estimator):
     ) -> NewObservations:
         """What the images add; nothing at a standstill, of which they only bring their errors."""
         if still:
+            tracks.retain([])
+            tracks.add(ahead.frame, frame)  # where a later feature may begin
+            tracks.consume(self._features.active)
             return NewObservations()
         tracks.retain(list(self._frames))
         tracks.add(ahead.frame, frame)

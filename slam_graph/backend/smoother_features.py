@@ -65,7 +65,8 @@ class SmootherFeatures:
         self._config = config
         self._diagnostics = diagnostics
         self._rig = RigProjection(rig)
-        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, config.gating))
+        gating = config.gating.model_copy(update={"robust_loss": policy.robust_loss})
+        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, gating))
         angle = max(policy.min_parallax_rad, config.triangulation.min_parallax_rad)
         self._triangulation = config.triangulation.model_copy(update={"min_parallax_rad": angle})
 
