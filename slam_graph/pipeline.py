@@ -84,9 +84,7 @@ def run(
     frontend = build_frontend(
         result.rig, config.frontend, config.seed, sequence.diagnostics, result.info.content
     )
-    estimator = build_estimator(
-        result.rig, config.algorithm, config.backend, sequence.diagnostics
-    )
+    estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
     with (

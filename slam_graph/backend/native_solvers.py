@@ -7,8 +7,8 @@ All eliminate by QR: see docs/engine.md on why Cholesky ends early here. Orderin
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -18,6 +18,8 @@ from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.state import dim
 
 FloatArray = NDArray[np.float64]
+Stamps = Mapping[Any, float]
+"""Time of each key, in seconds."""
 
 
 class NativeSolver(Protocol):
@@ -27,7 +29,7 @@ class NativeSolver(Protocol):
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: dict[int, float],
+        stamps_s: Stamps,
     ) -> None:
         """Add factors and variables and solve.
 
@@ -81,7 +83,7 @@ def _covariance_of_graph(
     root = linear.eliminateMultifrontal(order).roots()[0].conditional()
     size = sum(dim(key) for key in keys)
     ends = np.cumsum([dim(key) for key in root.keys()])  # noqa: SIM118
-    columns = dict(zip(root.keys(), ends, strict=True))  # noqa: SIM118
+    columns = dict(zip(root.keys(), ends, strict=True))
     order_in_root = np.concatenate([np.arange(columns[k] - dim(k), columns[k]) for k in keys])
     order_in_root -= int(ends[-1]) - size
     inverse = np.linalg.inv(root.R()[-size:, -size:])
@@ -109,7 +111,7 @@ class FixedLagIsam2:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: dict[int, float],
+        stamps_s: Stamps,
     ) -> None:
         """See `NativeSolver`."""
         self._smoother.update(graph_of(factors), values, stamps_s)
@@ -146,7 +148,7 @@ class FixedLagBatch:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: dict[int, float],
+        stamps_s: Stamps,
     ) -> None:
         """See `NativeSolver`."""
         self._smoother.update(graph_of(factors), values, stamps_s)
@@ -179,7 +181,7 @@ class FullIsam2:
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         values: gtsam.Values,
-        stamps_s: dict[int, float],
+        stamps_s: Stamps,
     ) -> None:
         """See `NativeSolver`."""
         self._isam2.update(graph_of(factors), values)

@@ -128,7 +128,9 @@ class SmootherEstimator(Estimator):
             self._solver = SOLVERS[self.algorithm.engine](self._policy)
             old_values.insert(values)
             rebuilt = [old_factors.at(k) for k in range(old_factors.size())]
-            factors = [f for f in rebuilt if f is not None and all(map(old_values.exists, f.keys()))]
+            factors = [
+                f for f in rebuilt if f is not None and all(map(old_values.exists, f.keys()))
+            ]
             self._solver.update([*factors, *ahead.factors], old_values, {**old_stamps, **stamps})
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:120]
@@ -178,9 +180,7 @@ class SmootherEstimator(Estimator):
         self._frames[ahead.frame] = ahead.stamp_ns
         self._frames = {i: stamp for i, stamp in self._frames.items() if stamp > oldest_ns}
         keys = [X(i) for i in self._frames] + [L(j) for j in self._features.active.tolist()]
-        self._estimate = self._solver.estimate(
-            dict.fromkeys([*keys, *imu_state_keys(ahead.frame)])
-        )
+        self._estimate = self._solver.estimate(dict.fromkeys([*keys, *imu_state_keys(ahead.frame)]))
         self._frames = {i: t for i, t in self._frames.items() if self._estimate.exists(X(i))}
         self._features.retain(self._estimate)
 
