@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
+    from slam_graph.backend.build import build_estimator
     from slam_graph.backend.estimator import Estimator
     from slam_graph.config import RunConfig, load_config
     from slam_graph.datasets.groundtruth import read_groundtruth
@@ -33,6 +34,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "ape",
+    "build_estimator",
     "load_config",
     "open_dataset",
     "read_groundtruth",
@@ -48,6 +50,7 @@ _HOME = {
     "SlamGraphError": "slam_graph.errors",
     "Trajectory": "slam_graph.geometry.trajectory",
     "ape": "slam_graph.evaluation.ape",
+    "build_estimator": "slam_graph.backend.build",
     "load_config": "slam_graph.config",
     "open_dataset": "slam_graph.datasets.registry",
     "read_groundtruth": "slam_graph.datasets.groundtruth",

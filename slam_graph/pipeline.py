@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.build import build_estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.base import Sequence
 from slam_graph.errors import DataError
@@ -84,7 +84,7 @@ def run(
     frontend = build_frontend(
         result.rig, config.frontend, config.seed, sequence.diagnostics, result.info.content
     )
-    estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
+    estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
     with (

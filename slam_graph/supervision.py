@@ -14,7 +14,7 @@ from types import FrameType
 
 import numpy as np
 
-from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.build import EstimatorLike
 from slam_graph.config import LimitsConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
@@ -29,7 +29,7 @@ class DivergenceError(EstimationError):
     """The estimate left all that is possible."""
 
 
-def estimate(estimator: Estimator, features: FeatureFrame) -> NavState | None:
+def estimate(estimator: EstimatorLike, features: FeatureFrame) -> NavState | None:
     """The state at a frame.
 
     Raises:
@@ -80,7 +80,9 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
 
 
 @contextmanager
-def outcome(result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> Iterator[None]:
+def outcome(
+    result: RunResult, estimator: EstimatorLike, diagnostics: Diagnostics
+) -> Iterator[None]:
     """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
     began = time.perf_counter()
     try:
@@ -103,7 +105,7 @@ def outcome(result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -
     logger.log(level, "%s", result.message or f"{result.frames} frames in {result.wall_s:.1f} s")
 
 
-def _judge(result: RunResult, estimator: Estimator) -> None:
+def _judge(result: RunResult, estimator: EstimatorLike) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked = result.config.min_coverage
     if not estimator.initialized:

@@ -51,14 +51,15 @@ def start_from(given: NavState, config: BackendConfig) -> Window:
     state = State()
     state.insert_imu_state(0, given)
     state.freeze(imu_state_keys(0))
-    return Window(0, given.stamp_ns, state, _prior_of(given))
+    return Window(0, given.stamp_ns, state, prior_of(given))
 
 
-def _prior_of(given: NavState) -> SquareRootInformation:
+def prior_of(given: NavState, frame: int = 0) -> SquareRootInformation:
+    """What the covariance of a state says of a frame, linearised at the state."""
     assert given.covariance is not None
     Rd = np.zeros((16, 16), order="F")
     Rd[:-1, :-1] = np.linalg.cholesky(np.linalg.inv(given.covariance)).T
-    return SquareRootInformation(Layout(dims_of(imu_state_keys(0))), Rd)
+    return SquareRootInformation(Layout(dims_of(imu_state_keys(frame))), Rd)
 
 
 def _prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:

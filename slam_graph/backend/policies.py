@@ -66,14 +66,45 @@ class MarginalizationPolicy(Settings):
     touch a variable that leaves; then the others are linearised anew in the next step."""
 
 
+class SmootherPolicy(Settings):
+    """How GTSAM's own smoothers are used, where one of them is the engine."""
+
+    lag_s: float = Field(4.0, gt=0)
+    """How long states stay in a fixed lag; `isam2` keeps all, and starts features in it."""
+    spacing_s: float = Field(0.09, ge=0)
+    """Least time between two states in the graph; frames between them are predicted by the IMU."""
+    factorization: Literal["cholesky", "qr"] = "cholesky"
+    """How variables are eliminated: fast, or with the square root of the condition number."""
+    relinearize_threshold: float = Field(0.01, gt=0)
+    """Variables of which the tangent moved by more are linearised anew (iSAM2)."""
+    relinearize_skip: int = Field(1, ge=1)
+    """How many updates from one such check to the next (iSAM2)."""
+    max_iterations: int = Field(5, ge=1)
+    """Levenberg-Marquardt steps at most in one update (`fixed_lag_batch`)."""
+    max_features: int = Field(40, ge=1)
+    """How many features are tracked in the graph at once."""
+    robust_loss: Literal["none", "huber", "cauchy"] = "cauchy"
+    """Loss on reprojection residuals, instead of that of `backend.gating`: an outlier that is in
+    the graph stays there, so its weight must be able to vanish."""
+    min_feature_frames: int = Field(5, ge=2)
+    """How many states must have seen a feature before it may become a variable."""
+    min_parallax_rad: float = Field(0.02, ge=0)
+    """Smallest angle between two rays to such a feature."""
+
+
 class AlgorithmConfig(Settings):
     """One row of the table."""
 
     name: str
     """Name of the algorithm."""
+    engine: Literal["square_root", "fixed_lag_isam2", "fixed_lag_batch", "isam2"] = "square_root"
+    """What solves the problem: this package's own loop under the three policies, or one of GTSAM's
+    smoothers under `smoother`."""
     cost: CostPolicy = CostPolicy()
     """Cost construction."""
     gauss_newton: GaussNewtonPolicy = GaussNewtonPolicy()
     """Gauss-Newton steps."""
     marginalization: MarginalizationPolicy = MarginalizationPolicy()
     """Marginalization."""
+    smoother: SmootherPolicy = SmootherPolicy()
+    """GTSAM's smoothers."""

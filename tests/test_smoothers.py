@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""GTSAM's smoothers as peers of the engine: the same residuals, start and output."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from flight import FISHEYE, RADTAN, Flight, rig, room, scene
+from gtsam.symbol_shorthand import B, L, V, X
+
+from slam_graph.backend.config import BackendConfig, GatingConfig
+from slam_graph.backend.initialization import prior_of
+from slam_graph.backend.native_factors import ProjectionFactors, joint_prior, pixel_noise
+from slam_graph.backend.native_solvers import SOLVERS
+from slam_graph.backend.policies import SmootherPolicy
+from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.state import imu_state_keys
+from slam_graph.backend.static_start import prior_covariance
+from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.evaluation.ape import ape
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.pipeline import run
+from slam_graph.sensors.camera import Camera
+
+PLAIN = replace(RADTAN, distortion="none", coefficients=())
+
+
+@pytest.mark.parametrize("camera", [PLAIN, RADTAN, FISHEYE], ids=["none", "radtan", "equidistant"])
+def test_native_projections_have_the_residuals_of_the_engine(camera: Camera) -> None:
+    rng = np.random.default_rng(3)
+    two = rig(2, camera)
+    obs, at = scene(Flight(), two, room(60, rng), np.linspace(0.0, 4.0, 6), rng)
+    values = gtsam.Values()
+    for i, (rotation, position) in enumerate(zip(at.rotations, at.positions, strict=True)):
+        values.insert(X(obs.frames[i]), gtsam.Pose3(gtsam.Rot3(rotation), position))
+    for j, point in zip(obs.ids.tolist(), at.points, strict=True):
+        values.insert(L(j), point)
+    noise = pixel_noise(2.0, GatingConfig(robust_loss="none"))
+    factors = ProjectionFactors(two, noise).of(obs)
+    assert len(factors) == len(obs) > 100
+    residuals, _ = RigProjection(two).residuals(obs, at)
+    # GTSAM's residual is the prediction minus the measurement
+    plain = [factor for factor in factors if isinstance(factor, gtsam.NoiseModelFactor)]
+    native = np.array([factor.unwhitenedError(values) for factor in plain])
+    np.testing.assert_allclose(-native, residuals, rtol=1e-9, atol=1e-8)
+    errors = np.array([factor.error(values) for factor in factors])
+    np.testing.assert_allclose(errors, 0.5 * np.sum((residuals / 2.0) ** 2, axis=1), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_smoother_gives_back_its_prior(name: str) -> None:
+    """With nothing measured, estimate and joint covariance are those of the prior, correlated."""
+    rng = np.random.default_rng(5)
+    mixed = np.eye(15) + 0.2 * rng.normal(size=(15, 15))
+    covariance = mixed @ prior_covariance(BackendConfig().initialization.prior) @ mixed.T
+    turned = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
+    given = NavState(0, turned, np.ones(3), np.full(3, 0.01), np.full(3, 0.1), covariance)
+    values = gtsam.Values()
+    values.insert(X(0), turned)
+    values.insert(V(0), given.velocity)
+    values.insert(B(0), gtsam.imuBias.ConstantBias(given.accel_bias, given.gyro_bias))
+    keys = imu_state_keys(0)
+    solver = SOLVERS[name](SmootherPolicy())
+    solver.update([joint_prior(prior_of(given), values)], values, dict.fromkeys(keys, 0.0))
+    np.testing.assert_allclose(solver.covariance(keys), covariance, rtol=1e-6, atol=1e-12)
+    assert solver.estimate(keys).atPose3(X(0)).equals(turned, 1e-9)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_wheels_tracks(data_dir: Path, name: str) -> None:
+    """From rest through the take-off into the flight, without being told the start state."""
+    truth = data_dir / "euroc_inertial" / "V1_01_easy"
+    sequence = open_dataset("demo", groundtruth=truth)
+    result = run(sequence, load_config(algorithm=name, duration_s=16.0))
+    assert result.status == "ok"
+    assert np.isfinite(result.history.sigmas()).all()
+    reference = sequence.groundtruth()
+    assert reference is not None
+    error = ape(reference, result.trajectory, "trans_part", "se3").statistics.rmse
+    assert error <= 0.10
