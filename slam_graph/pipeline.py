@@ -99,7 +99,7 @@ def run(
             estimator.add_imu(packet.imu)
             state = estimate(estimator, features)
             clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
-            if "gauss_newton" in estimator.timings:
+            if estimator.costs:
                 result.steps.append(features.stamp_ns, estimator.costs)
             ids, points = estimator.landmarks()
             if state is not None:

@@ -28,6 +28,11 @@ class EstimatorLike(Protocol):
         ...
 
     @property
+    def costs(self) -> tuple[float, ...]:
+        """The cost before the first step of the last frame and after each; empty if not known."""
+        ...
+
+    @property
     def initialized(self) -> bool:
         """Whether there is a state."""
         ...

@@ -154,7 +154,7 @@ class Estimator:
             as there is no state, and for a frame that does not follow those before.
         """
         stamp_ns = frame.stamp_ns + self._time_offset_ns
-        self.timings = {}
+        self.timings, self.costs = {}, ()
         if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """GTSAM's three smoothers behind one interface: two with a fixed lag, and iSAM2 without.
 
-All eliminate by QR: see docs/engine.md on why Cholesky ends early here. Orderings are COLAMD's.
+They eliminate by Cholesky, or by QR if the policy says so. Orderings are COLAMD's.
 """
 
 from __future__ import annotations
