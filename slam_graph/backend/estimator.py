@@ -72,7 +72,7 @@ class Estimator:
             algorithm.cost, projection, self.config, self.diagnostics
         )
         self._initializer = Initializer(
-            projection, self._propagation.params, algorithm, self.config
+            projection, self._propagation.noise.params(), algorithm, self.config
         )
         self._standstill = StandstillDetector(self.config.zero_velocity)
         self._imu = ImuBuffer()
@@ -96,7 +96,9 @@ class Estimator:
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
             marginalize_step(window, constructed, minimum.posterior, policy)
-        return window.current(minimum.posterior)
+        state = window.current(minimum.posterior)
+        self._propagation.learn(state)
+        return state
 
     def _minimize(self, constructed: ConstructedCost) -> Minimum:
         """Take the steps; without the features if these leave something undetermined."""

@@ -74,7 +74,9 @@ class SmootherEstimator(Estimator):
         with self._timed("smoother"):
             self._solve(window, ahead, new)
         with self._timed("covariance"):
-            return self._advance(window, ahead, predicted)
+            state = self._advance(window, ahead, predicted)
+        self._propagation.learn(state)
+        return state
 
     def _predicted(self, ahead: Window) -> NavState:
         """The new state and its covariance before any image is used."""
