@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The noise of the IMU: found where it is larger than the calibration says, left alone elsewhere."""
+"""Adaptive noise: found where the IMU is worse than its calibration, left alone elsewhere."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_large_and_persistent_corrections_raise_them_and_they_fall_back() -> Non
 
 def mean_nees(noise_scale: float, adaptive: bool) -> float:
     """Of the poses (6 is ideal) of a simulated flight with noisier samples than calibrated."""
-    flight = {"duration_s": 10.0, "seed": 3, "imu": {"noise_scale": noise_scale}}
+    flight = {"duration_s": 15.0, "seed": 3, "imu": {"noise_scale": noise_scale}}
     overrides = [
         f"backend.noise.adaptive.enabled={adaptive}",
         "backend.initialization.mode=given",
