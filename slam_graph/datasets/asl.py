@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.datasets.images import FileImages
 from slam_graph.datasets.rows import read_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -54,8 +54,9 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
             folders = folders[:count]
         rig = read_euroc_rig(mav0, [folder.name for folder in folders])
     else:
-        imu = mav0 / "imu0" / "sensor.yaml"
-        noise = read_imu_noise(read_yaml(imu)) if imu.is_file() else None
+        beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
+        imu = next((file for file in beside if file.is_file()), None)
+        noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
         rig = read_kalibr(calibration, fallback=noise)
         if len(rig.cameras) > len(folders):
             raise DataError(
@@ -66,13 +67,13 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
     return rig, folders[: len(rig.cameras)]
 
 
-def list_images(folder: Path, diagnostics: Diagnostics) -> tuple[NDArray[np.int64], list[str]]:
-    """Stamps and file names of a camera; none if its folder holds no images at all."""
+def list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
+    """The images of a camera; none if its folder holds no images at all."""
     index = folder / "data.csv"
     if not index.is_file():
         if (folder / "data").exists():
             raise DataError(f"{index}: missing, but there are images beside it")
-        return np.zeros(0, np.int64), []
+        return FileImages(folder.name, np.zeros(0, np.int64), [])
     stamps: list[int] = []
     names: list[str] = []
     for rows in read_rows(index):
@@ -85,7 +86,8 @@ def list_images(folder: Path, diagnostics: Diagnostics) -> tuple[NDArray[np.int6
             names.append(name)
     if not stamps:
         raise DataError(f"{index}: no images listed in this file")
-    return np.array(stamps, np.int64), names
+    paths = [folder / "data" / name for name in names]
+    return FileImages(folder.name, np.array(stamps, np.int64), paths)
 
 
 def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:
