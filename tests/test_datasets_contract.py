@@ -14,6 +14,7 @@ from recordings_public import (
     write_tum_rgbd,
     write_tum_vi,
 )
+from recordings_ros import write_bag
 
 from slam_graph.datasets.base import Sequence
 from slam_graph.datasets.recording import TrackRecorder
@@ -55,6 +56,22 @@ def tum_rgbd(folder: Path) -> Sequence:
     return open_dataset(write_tum_rgbd(folder / "rgbd_dataset_freiburg1_xyz"))
 
 
+def bag_ros1(folder: Path) -> Sequence:
+    return open_dataset(write_bag(folder, "ros1"))
+
+
+def bag_sqlite(folder: Path) -> Sequence:
+    return open_dataset(write_bag(folder, "sqlite"))
+
+
+def bag_mcap(folder: Path) -> Sequence:
+    return open_dataset(write_bag(folder, "mcap"))
+
+
+def bag_mcap_file(folder: Path) -> Sequence:
+    return open_dataset(write_bag(folder, "mcap_file"))
+
+
 def recording(folder: Path) -> Sequence:
     source = openvins(folder)
     with TrackRecorder(folder / "recorded", source.rig) as recorder:
@@ -74,7 +91,14 @@ MADE_UP: list[Callable[[Path], Sequence]] = [
     kitti_raw,
     kitti_odometry,
     tum_rgbd,
+    bag_ros1,
+    bag_sqlite,
+    bag_mcap,
+    bag_mcap_file,
 ]
+
+ASSUMPTIONS = {"imu_noise_assumed"}
+"""What is counted of recordings without a fault: ROS bags do not carry the noise of their IMU."""
 
 
 @pytest.fixture(params=MADE_UP, ids=lambda make: make.__name__)
@@ -152,7 +176,7 @@ def check_frame(sequence: Sequence, frame: CameraFrame | FeatureFrame, content: 
 
 def test_contract(sequence: Sequence) -> None:
     check_contract(sequence, list(sequence.packets()))
-    assert not sequence.diagnostics.counts
+    assert not sequence.diagnostics.counts.keys() - ASSUMPTIONS
 
 
 def test_two_passes_agree(sequence: Sequence) -> None:

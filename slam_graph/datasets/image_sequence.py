@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from copy import copy
@@ -58,12 +59,77 @@ class ImageStream(Protocol):
         ...
 
 
-class ImageSequence(RecordedSequence):
-    """A recording of images.
+class GroupedSequence(RecordedSequence):
+    """A recording of images, grouped into frames by their stamps.
 
     Frames carry None for the image of a camera that has none at that time (counted as
     `camera_frame_missing`), or one that is damaged or not of the calibrated size
     (`image_unreadable`, `image_wrong_size`).
+
+    Args:
+        name: of the recording.
+        rig: its calibration.
+        camera_names: of the cameras of the rig, for messages.
+        groundtruth: file or folder with the ground truth, or None.
+        diagnostics: where faults are counted.
+
+    Attributes:
+        decode: whether images are decoded; they are all None otherwise.
+    """
+
+    content: ClassVar[Literal["images", "tracks"]] = "images"
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        camera_names: Sequence[str],
+        groundtruth: Path | None,
+        diagnostics: Diagnostics | None,
+    ) -> None:
+        super().__init__(name, rig, groundtruth, diagnostics)
+        self.decode = True
+        self._camera_names = camera_names
+
+    def without_images(self) -> GroupedSequence:
+        """The same recording, its frames without images: quick to run through."""
+        twin = copy(self)
+        twin.decode = False
+        return twin
+
+    @property
+    @abstractmethod
+    def groups(self) -> Groups:
+        """Which images belong together."""
+
+    def _range(self, start_ns: int | None, end_ns: int | None) -> range:
+        """The frames within [start_ns, end_ns]."""
+        stamps = self.groups.stamps_ns
+        first = 0 if start_ns is None else int(np.searchsorted(stamps, start_ns))
+        last = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
+        return range(first, last)
+
+    def _group(self, stamps: Sequence[NDArray[np.int64]], tolerance_s: float) -> Groups:
+        groups = group_by_time(stamps, round(tolerance_s * 1e9))
+        for stamp in groups.skipped:
+            self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
+        return groups
+
+    def _report(self, index: int, images: Sequence[Image | Fault | None]) -> CameraFrame:
+        """Count what is wrong with a frame, and deliver the rest of it."""
+        stamp_ns = int(self.groups.stamps_ns[index])
+        for camera, member in enumerate(self.groups.members[index].tolist()):
+            image = images[camera]
+            if member == ABSENT:
+                name = self._camera_names[camera]
+                self.diagnostics.warn("camera_frame_missing", f"{name} has no image at {stamp_ns}")
+            elif isinstance(image, Fault):
+                self.diagnostics.warn(image.kind, image.message)
+        return CameraFrame(stamp_ns, tuple(None if isinstance(i, Fault) else i for i in images))
+
+
+class ImageSequence(GroupedSequence):
+    """A recording of images that can be read in any order.
 
     Args:
         name: of the recording.
@@ -77,8 +143,6 @@ class ImageSequence(RecordedSequence):
         DataError: if the calibration is for images of another size.
     """
 
-    content: ClassVar[Literal["images", "tracks"]] = "images"
-
     def __init__(
         self,
         name: str,
@@ -88,36 +152,26 @@ class ImageSequence(RecordedSequence):
         diagnostics: Diagnostics | None,
         stereo_tolerance_s: float = STEREO_TOLERANCE_S,
     ) -> None:
-        super().__init__(name, rig, groundtruth, diagnostics)
-        self.decode = True
+        super().__init__(name, rig, [s.name for s in streams], groundtruth, diagnostics)
         self._streams = streams
         for mounted, stream in zip(rig.cameras, streams, strict=True):
             count = min(len(stream.stamps_ns), LOOKED_AT)
             images = (stream.read(k) for k in range(count))
             require_size(images, mounted.camera, stream.name)
-        self._groups = self._group(stereo_tolerance_s)
+        self._groups = self._group([s.stamps_ns for s in streams], stereo_tolerance_s)
 
-    def without_images(self) -> ImageSequence:
-        """The same recording, its frames without images: quick to run through."""
-        twin = copy(self)
-        twin.decode = False
-        return twin
+    @property
+    def groups(self) -> Groups:
+        """Which images belong together."""
+        return self._groups
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """Frames with their images, the next ones decoded in a thread."""
-        stamps = self._groups.stamps_ns
-        first = 0 if start_ns is None else int(np.searchsorted(stamps, start_ns))
-        last = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
-        jobs = (partial(self._read_frame, k) for k in range(first, last))
+        wanted = self._range(start_ns, end_ns)
+        jobs = (partial(self._read_frame, k) for k in wanted)
         with closing(prefetch(jobs)) as results:
-            for k, images in zip(range(first, last), results, strict=True):
+            for k, images in zip(wanted, results, strict=True):
                 yield self._report(k, images)
-
-    def _group(self, tolerance_s: float) -> Groups:
-        groups = group_by_time([s.stamps_ns for s in self._streams], round(tolerance_s * 1e9))
-        for stamp in groups.skipped:
-            self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
-        return groups
 
     def _read_frame(self, index: int) -> list[Image | Fault | None]:
         """The images of one frame; runs in the thread, so it counts nothing itself."""
@@ -133,20 +187,7 @@ class ImageSequence(RecordedSequence):
 
     def _read_image(self, camera: int, member: int) -> Image | Fault:
         stream, model = self._streams[camera], self.rig.cameras[camera].camera
-        image = stream.read(member)
-        return check_size(image, model, partial(stream.where, member))
-
-    def _report(self, index: int, images: list[Image | Fault | None]) -> CameraFrame:
-        """Count what is wrong with a frame, and deliver the rest of it."""
-        stamp_ns = int(self._groups.stamps_ns[index])
-        for camera, member in enumerate(self._groups.members[index].tolist()):
-            image = images[camera]
-            if member == ABSENT:
-                name = self._streams[camera].name
-                self.diagnostics.warn("camera_frame_missing", f"{name} has no image at {stamp_ns}")
-            elif isinstance(image, Fault):
-                self.diagnostics.warn(image.kind, image.message)
-        return CameraFrame(stamp_ns, tuple(None if isinstance(i, Fault) else i for i in images))
+        return check_size(stream.read(member), model, partial(stream.where, member))
 
 
 class FileImageSequence(ImageSequence):

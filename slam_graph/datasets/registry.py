@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -16,6 +17,8 @@ from slam_graph.datasets.kitti_raw import KittiRawSequence, is_kitti_raw
 from slam_graph.datasets.openvins_sim import OpenvinsSimulation
 from slam_graph.datasets.recorded import RecordedSequence
 from slam_graph.datasets.recording import TrackRecordingSequence, is_recording
+from slam_graph.datasets.ros_bag import is_bag
+from slam_graph.datasets.ros_sequence import RosBagSequence
 from slam_graph.datasets.tum_rgbd import TumRgbdSequence, is_tum_rgbd
 from slam_graph.datasets.tum_vi import TumViSequence, is_tum_vi
 from slam_graph.diagnostics import Diagnostics
@@ -74,6 +77,12 @@ DATASETS: dict[str, Format] = {
         KittiOdometrySequence, is_kitti_odometry, "a folder with times.txt, calib.txt and image_0"
     ),
     "tum_rgbd": Format(TumRgbdSequence, is_tum_rgbd, "a folder with rgb.txt and rgb"),
+    "rosbag": Format(
+        RosBagSequence,
+        is_bag,
+        "a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag",
+        lambda sources: partial(RosBagSequence, sources=sources),
+    ),
     "recording": Format(
         TrackRecordingSequence, is_recording, "a folder with meta.yaml, as our recorder writes it"
     ),
