@@ -10,6 +10,7 @@ import pytest
 import yaml
 from recordings import edit_text, write_euroc
 
+from slam_graph.datasets.registry import open_dataset
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration import read_euroc_rig
 from slam_graph.sensors.camera import Camera
@@ -199,3 +200,30 @@ def test_real_calibration(data_dir: Path, tmp_path: Path) -> None:
     assert abs(np.linalg.norm(baseline) - 0.11) < 1e-3
     write_kalibr(rig, tmp_path / "calibration.yaml")
     assert same(read_kalibr(tmp_path / "calibration.yaml"), rig)
+
+
+@pytest.mark.parametrize(
+    ("line", "rolling"),
+    [
+        ("rolling_shutter: true", True),
+        ("shutter: rolling", True),
+        ("shutter_type: Rolling Shutter", True),
+        ("line_delay: 3.0e-05", True),
+        ("readout_time: 0.016", True),
+        ("rolling_shutter: false", False),
+        ("shutter: global", False),
+        ("line_delay: 0.0", False),
+        ("timeshift_cam_imu: 0.0", False),
+    ],
+)
+def test_a_rolling_shutter_is_recognised_and_warned_of(
+    tmp_path: Path, line: str, rolling: bool
+) -> None:
+    path = write_euroc(tmp_path / "flight", cameras=1)
+    edit_text(path / "mav0" / "cam0" / "sensor.yaml", "rate_hz: 20", f"rate_hz: 20\n{line}")
+    sequence = open_dataset(path)
+    assert sequence.rig.cameras[0].rolling_shutter is rolling
+    assert sequence.diagnostics.counts == ({"rolling_shutter": 1} if rolling else {})
+    write_kalibr(sequence.rig, tmp_path / "chain.yaml")
+    again = open_dataset(path, calibration=tmp_path / "chain.yaml")
+    assert again.rig.cameras[0].rolling_shutter is rolling

@@ -74,6 +74,10 @@ class RecordedSequence(ABC):
         self.groundtruth_path: Path | None = None
         self.own_groundtruth: Callable[[], Trajectory] | None = None
         self.diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        rolling = [mounted.name for mounted in rig.cameras if mounted.rolling_shutter]
+        if rolling:
+            what = f"{name}: {', '.join(rolling)}: rows are taken as exposed at one time"
+            self.diagnostics.warn("rolling_shutter", f"{what}; expect errors in fast motion")
         if groundtruth_path is not None:
             self.groundtruth_path = resolve_groundtruth(groundtruth_path)
             check_groundtruth(self.groundtruth_path)

@@ -57,6 +57,22 @@ def read_camera(entry: YamlValue) -> Camera:
         raise DataError(f"{intrinsics.where}: {error}") from None
 
 
+def has_rolling_shutter(entry: YamlValue) -> bool:
+    """Whether the calibration of a camera says that its rows are exposed one after the other.
+
+    Neither EuRoC nor Kalibr's camera chains have a key for it. Taken as such are `rolling_shutter`
+    (true), `shutter` or `shutter_type` (rolling), and `line_delay` or `readout_time` if they are
+    not zero.
+    """
+    flag, kind = entry.get("rolling_shutter"), entry.get("shutter") or entry.get("shutter_type")
+    delays = [entry.get(key) for key in ("line_delay", "readout_time")]
+    return (
+        (flag is not None and flag.text().lower() in ("true", "yes", "1"))
+        or (kind is not None and "rolling" in kind.text().lower())
+        or any(delay is not None and delay.number() != 0.0 for delay in delays)
+    )
+
+
 def read_imu_noise(entry: YamlValue) -> ImuNoise:
     """IMU noise from a mapping with the keys that EuRoC and Kalibr share."""
     return ImuNoise(
@@ -84,18 +100,28 @@ def read_euroc_rig(mav0: Path, cameras: Iterable[str], imu: str = "imu0") -> Rig
         mav0: folder that holds a folder for each sensor.
         cameras: names of the camera folders, in the order of the rig.
         imu: name of the folder of the IMU. Its frame is the body frame of the rig; where its
-            `T_BS` is not the identity, the cameras are re-expressed in it.
+            `T_BS` is not the identity, the cameras are re-expressed in it. Without such a folder
+            the body frame is that of the platform.
 
     Raises:
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
-    imu_entry = read_yaml(mav0 / imu / "sensor.yaml")
-    platform_T_imu = read_body_T_sensor(mav0 / imu / "sensor.yaml")
+    platform_T_imu, noise = gtsam.Pose3(), ImuNoise()
+    if (mav0 / imu).is_dir():
+        noise = read_imu_noise(read_yaml(mav0 / imu / "sensor.yaml"))
+        platform_T_imu = read_body_T_sensor(mav0 / imu / "sensor.yaml")
     mounted = []
     for name in cameras:
         entry = read_yaml(mav0 / name / "sensor.yaml")
         platform_T_camera = entry.require("T_BS").pose()
+        shift = entry.get("timeshift_cam_imu")  # not EuRoC's; our writer adds it
         mounted.append(
-            RigCamera(read_camera(entry), platform_T_imu.between(platform_T_camera), 0.0, name)
+            RigCamera(
+                read_camera(entry),
+                platform_T_imu.between(platform_T_camera),
+                0.0 if shift is None else shift.number(),
+                name,
+                has_rolling_shutter(entry),
+            )
         )
-    return Rig(tuple(mounted), read_imu_noise(imu_entry))
+    return Rig(tuple(mounted), noise)

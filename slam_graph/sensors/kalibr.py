@@ -19,7 +19,7 @@ import gtsam
 import yaml
 
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration import read_camera, read_imu_noise
+from slam_graph.sensors.calibration import has_rolling_shutter, read_camera, read_imu_noise
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 from slam_graph.sensors.yaml_source import YamlValue, read_yaml
 
@@ -63,6 +63,7 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None) -> RigCamera:
         body_T_camera,
         0.0 if shift is None else shift.number(),
         entry.key if name is None else name.text(),
+        has_rolling_shutter(entry),
     )
 
 
@@ -113,7 +114,8 @@ def write_kalibr(rig: Rig, path: Path) -> None:
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
     camera = mounted.camera
-    return {
+    shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
+    return shutter | {
         "name": mounted.name,
         "camera_model": "pinhole",
         "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
