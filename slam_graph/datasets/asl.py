@@ -24,12 +24,19 @@ from slam_graph.sensors.yaml_source import read_yaml
 def find_mav0(path: Path) -> Path:
     """The folder of sensors that a path stands for."""
     for folder in (path / "mav0", path):
-        if (folder / "imu0").is_dir():
+        if (folder / "imu0").is_dir() or (folder / "cam0").is_dir():
             return folder.resolve()
     if not path.is_dir():
         raise DataError(f"{path}: no such folder")
     folder = path / "mav0" if (path / "mav0").is_dir() else path
-    raise DataError(f"{folder}: no folder 'imu0' here; an EuRoC recording has mav0/imu0, mav0/cam0")
+    raise DataError(
+        f"{folder}: no folder 'imu0' or 'cam0' here; an EuRoC recording has mav0/imu0, mav0/cam0"
+    )
+
+
+def imu_file(mav0: Path) -> Path | None:
+    """The samples of the IMU; None where there is no IMU."""
+    return mav0 / "imu0" / "data.csv" if (mav0 / "imu0").is_dir() else None
 
 
 def name_of(mav0: Path) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from slam_graph.datasets.asl import find_mav0, list_images, name_of, read_rig
+from slam_graph.datasets.asl import find_mav0, imu_file, list_images, name_of, read_rig
 from slam_graph.datasets.groundtruth import find_groundtruth
 from slam_graph.datasets.image_sequence import STEREO_TOLERANCE_S, FileImageSequence
 from slam_graph.diagnostics import Diagnostics
@@ -17,7 +17,7 @@ class EurocSequence(FileImageSequence):
     """A recording in the ASL layout: a folder for each sensor, in one folder ``mav0``.
 
     A folder whose cameras are calibrated but hold no images opens with 0 frames, for its IMU and
-    ground truth.
+    ground truth; one without ``imu0`` for its images.
 
     Args:
         path: ``mav0`` or the folder that holds it.
@@ -49,7 +49,7 @@ class EurocSequence(FileImageSequence):
             name_of(self.path),
             rig,
             [list_images(folder, diagnostics) for folder in folders],
-            self.path / "imu0" / "data.csv",
+            imu_file(self.path),
             groundtruth or find_groundtruth(self.path),
             diagnostics,
             stereo_tolerance_s,

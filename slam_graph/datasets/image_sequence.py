@@ -218,6 +218,8 @@ class FileImageSequence(ImageSequence):
         self._imu_file = imu_file
         if imu_file is not None:
             require_rows(imu_file)
+        elif len(self._groups.stamps_ns) == 0:
+            raise DataError(f"{name}: neither images nor an IMU in this recording")
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
