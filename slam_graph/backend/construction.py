@@ -11,7 +11,7 @@ first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam.symbol_shorthand import L
@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
+from slam_graph.backend.gating import Gate, Innovations
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
+from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.state import stacked_poses
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
@@ -45,6 +47,8 @@ class ConstructedCost:
         moving: those of them whose velocity and bias stay.
         features: ids of the features that stay in the state, ascending.
         leaving: (J,) those of the cost's new features that are used for the last time.
+        predicted: what was known of the variables before the images; None if these are left out.
+        innovations: distances of the images from that.
     """
 
     cost: Cost
@@ -53,6 +57,19 @@ class ConstructedCost:
     moving: list[int]
     features: IntArray
     leaving: BoolArray
+    predicted: SquareRootInformation | None = None
+    innovations: Innovations = field(default_factory=Innovations)
+
+    def innovations_under(self, posterior: SquareRootInformation) -> Innovations:
+        """The innovations with the joint distance of all measurements that entered.
+
+        What they add to the least of the cost is rᵀ (H P Hᵀ + I)⁻¹ r of all of them stacked, with
+        the correlations that they have by their common poses.
+        """
+        if self.predicted is None:
+            return Innovations()
+        joint = posterior.residual - self.predicted.residual
+        return replace(self.innovations, passed_distance=joint)
 
     def drop_features(self) -> None:
         """Leave only the prior and the factors."""
@@ -60,7 +77,7 @@ class ConstructedCost:
             new = self.cost.fresh.obs.ids[self.cost.fresh.in_state]
             self.cost.state.remove(L(int(j)) for j in new)
             self.features = self.features[~is_in(self.features, new)]
-        self.cost.tracked = self.cost.fresh = self.linear = None
+        self.cost.tracked = self.cost.fresh = self.linear = self.predicted = None
         self.leaving = np.zeros(0, np.bool_)
 
 
@@ -100,14 +117,17 @@ class CostConstruction:
         leaving_frames = [i for i in window.past if i not in past]
         cost.fresh = self._new_features(window, leaving_frames, len(seen))
         linear = cost.linearize()
-        tracked_ok, fresh_ok = cost.gate(linear, predicted)
-        linear = self._leave_out(window, cost, linear, tracked_ok, fresh_ok)
+        gate = cost.gate(linear, predicted)
+        linear = self._leave_out(window, cost, linear, gate)
         leaving = self._leaving(window, cost, leaving_frames)
         if self.policy.features != "window":
             # a pose that no unused observation refers to has nothing more to give
             useful = window.tracks.frames()
             past = [i for i in past if i in useful]
-        return self._constructed(window, cost, linear, past, self._in_state(window, cost), leaving)
+        features = self._in_state(window, cost)
+        constructed = self._constructed(window, cost, linear, past, features, leaving)
+        constructed.predicted, constructed.innovations = predicted, gate.innovations
+        return constructed
 
     def _constructed(
         self,
@@ -159,24 +179,18 @@ class CostConstruction:
         return points, result.good & (wide | ~lasting)
 
     def _leave_out(
-        self,
-        window: Window,
-        cost: Cost,
-        linear: Linearization,
-        tracked_ok: BoolArray,
-        fresh_ok: BoolArray,
+        self, window: Window, cost: Cost, linear: Linearization, gate: Gate
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
-        rejected = int(np.sum(~tracked_ok) + np.sum(~fresh_ok))
-        self.diagnostics.counts["feature_rejected_by_gate"] += rejected
+        self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
         if linear.tracked is not None and cost.tracked is not None:
-            cost.tracked = cost.tracked.rows(tracked_ok)
+            cost.tracked = cost.tracked.rows(gate.tracked)
         if linear.fresh is not None and cost.fresh is not None:
-            window.tracks.consume(cost.fresh.obs.ids[~fresh_ok])
-            cost.fresh = cost.fresh.subset(fresh_ok)
+            window.tracks.consume(cost.fresh.obs.ids[~gate.fresh])
+            cost.fresh = cost.fresh.subset(gate.fresh)
             for row in np.flatnonzero(cost.fresh.in_state):
                 cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])
-        return linear.subset(tracked_ok, fresh_ok)
+        return linear.subset(gate.tracked, gate.fresh)
 
     def _in_state(self, window: Window, cost: Cost) -> IntArray:
         """The features that stay in the state: those that are tracked, old and new, or all."""

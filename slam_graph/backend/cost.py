@@ -26,7 +26,7 @@ from slam_graph.backend.feature_factors import (
     robust_loss,
     whiten,
 )
-from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.reprojection import Geometry, RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.state import POINT_DIM, State, dims_of, stacked_points, stacked_poses
@@ -125,7 +125,7 @@ class Cost:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""
         offset = self.state.offset(self.prior.layout)
         total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
-        total += 0.5 * float(self.prior.Rd[-1, -1] ** 2)
+        total += 0.5 * self.prior.residual
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
         if self.tracked is not None and len(self.tracked):
             total += self._loss(self.tracked, None)
@@ -212,10 +212,8 @@ class Cost:
 
     # --- gating --------------------------------------------------------------------------------
 
-    def gate(
-        self, linear: Linearization, predicted: SquareRootInformation
-    ) -> tuple[BoolArray, BoolArray]:
-        """Which tracked observations (N,) and new features (J,) pass the χ² test.
+    def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
+        """Which tracked observations and new features pass the χ² test.
 
         Args:
             linear: of this cost.
@@ -223,7 +221,7 @@ class Cost:
         """
         tracked = np.zeros(0, np.bool_)
         fresh = np.zeros(0, np.bool_)
-        confidence = self.config.gating.confidence
+        innovations, confidence = Innovations(), self.config.gating.confidence
         if linear.tracked is not None and self.tracked is not None:
             keys = [X(i) for i in self.tracked.frames]
             keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
@@ -232,12 +230,17 @@ class Cost:
             H = np.concatenate([linear.tracked.by_pose, linear.tracked.by_point], axis=2)
             P = covariance[columns[:, :, None], columns[:, None, :]]
             distance = squared_mahalanobis(linear.tracked.r, H, P)
-            tracked = distance < threshold(np.array([2]), confidence)[0]
+            dof = np.full(len(distance), 2)
+            largest = threshold(dof, confidence)
+            tracked = distance < largest
+            innovations += Innovations.of(distance, dof, largest, tracked)
         if linear.fresh is not None and self.fresh is not None:
             P = predicted.covariance_of([X(i) for i in self.fresh.obs.frames])
             distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
-            fresh = distance < threshold(linear.fresh.dof, confidence)
-        return tracked, fresh
+            largest = threshold(linear.fresh.dof, confidence)
+            fresh = distance < largest
+            innovations += Innovations.of(distance, linear.fresh.dof, largest, fresh)
+        return Gate(tracked, fresh, innovations)
 
 
 def _tracked_columns(obs: Observations, layout: Layout) -> NDArray[np.intp]:

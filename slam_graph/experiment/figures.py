@@ -69,9 +69,20 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         )
         for part in ("orientation", "position")
     ]
+    panels += [
+        Panel(
+            TIME[1],
+            "NEES of the pose",
+            _curves(runs, "nees_time_s", "nees_pose"),
+            mean_bounds(6, max(seeds, 1)),
+            "95 % of χ²",
+        ),
+        Panel(TIME[1], "NIS over what is expected of it", _curves(runs, "nis_time_s", "nis_ratio")),
+    ]
     yield from _drawn(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
         Panel(TIME[1], "ms a frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
         Panel(TIME[1], "steps a frame", _curves(runs, "step_time_s", "steps")),
         Panel(TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
         Panel(TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
