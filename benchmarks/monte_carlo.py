@@ -22,6 +22,7 @@ from benchmarks.metric import Metric, info
 from benchmarks.suite import RECURSIVE, Benchmark, Outcome
 from slam_graph.evaluation.consistency import average_nees, mean_bounds
 from slam_graph.experiment.comparison import WITHOUT_FEJ, Comparison, with_variants
+from slam_graph.experiment.figures import NEES_DOF
 from slam_graph.experiment.results import Series, read_series
 from slam_graph.experiment.sources import find_sources
 
@@ -29,8 +30,6 @@ SEEDS = 20
 DURATION_S = 15.0
 CAMERAS = 2
 FLIGHT = ("rate_hz=10", "tracks.features=40", "flight.hover_s=0")
-
-DOF = {"pose": 6, "orientation": 3, "position": 3}
 
 
 def measure(data: Path) -> Outcome:
@@ -75,7 +74,7 @@ def figures_of(comparison: Comparison, data: str, algorithm: str) -> list[Metric
 def consistency(runs: list[Series]) -> list[Metric]:
     """Mean NEES, and the share of the frames at which the mean over the runs is in its bounds."""
     metrics = []
-    for part, dof in DOF.items():
+    for part, dof in NEES_DOF.items():
         mean = inside = math.nan
         if runs:
             found = average_nees(np.array([series[f"nees_{part}"] for series in runs]), dof)
