@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The real IMU of four EuRoC flights, with a simulated stereo camera flown along their ground truth.
+"""The real IMU of four EuRoC flights, and a simulated stereo camera along their ground truth.
 
 Images cannot be what an estimate fails on here: pixel noise is what is assumed, so that errors come
 from the IMU, its vibration, and the estimator.
