@@ -7,7 +7,16 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 
 from __future__ import annotations
 
-from benchmarks import cost_over_time, mh01, monte_carlo, openvins_sim, real_imu, speed, wheel
+from benchmarks import (
+    cost_over_time,
+    memory,
+    mh01,
+    monte_carlo,
+    openvins_sim,
+    real_imu,
+    speed,
+    wheel,
+)
 from benchmarks.suite import Benchmark
 
 BENCHMARKS: dict[str, Benchmark] = {
@@ -17,5 +26,6 @@ BENCHMARKS: dict[str, Benchmark] = {
     **monte_carlo.BENCHMARKS,
     **real_imu.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
+    **memory.BENCHMARKS,
     **speed.BENCHMARKS,
 }
