@@ -42,7 +42,7 @@ def measure(data: Path) -> Outcome:
         outcome.add(name, figures_of(comparison, source.name, name), judged=name not in GROWING)
     note_failures(outcome, comparison)
     outcome.notes.append(
-        "times are by the wall clock: what other programs take shows in them, but not in the columns"
+        "times are by the wall clock: other programs show in them, but not in the columns"
     )
     outcome.notes += [f"drawn: {figure.file}" for figure in draw(comparison, source.name)]
     return outcome

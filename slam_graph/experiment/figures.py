@@ -135,7 +135,8 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
                 edges,
             )
             filled = np.isfinite(means)
-            curves.append(Curve(name, centres[filled], means[filled]))
+            if filled.any():
+                curves.append(Curve(name, centres[filled], means[filled]))
     return curves
 
 
