@@ -38,6 +38,10 @@ class CostPolicy(Settings):
     """… and the largest angle between its first ray and any other must be this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
+    gate: Literal["prediction", "residual"] = "prediction"
+    """How wrong features outside the state are found. prediction: before the steps, by the χ² test
+    of their whole tracks against the predicted covariance. residual: after the steps, by that of
+    the residual of each observation; one that fails is never used again."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
     keyframe_motion: float = Field(0.05, ge=0)
