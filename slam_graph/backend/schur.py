@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from slam_graph.backend.feature_factors import WhitenedObservations
+from slam_graph.backend.state import POSE_DIM
 from slam_graph.backend.tracks import Observations
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
@@ -67,24 +67,12 @@ def condense_features(obs: Observations, linear: WhitenedObservations) -> Conden
         obs: N observations of J features, each seen at least twice.
         linear: their linearisation.
     """
-    Q, R_f = _orthonormal(obs, linear.by_point)
-    T, r_1 = _along(obs, Q, linear)
-    stacked = np.concatenate([T, r_1[:, :, None]], axis=2).reshape(3 * len(T), -1)
-    information = _pose_information(obs, linear) - stacked.T @ stacked
-    return CondensedFeatures(R_f, T, r_1, information_root(information))
-
-
-def _orthonormal(obs: Observations, by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q (N, 2, 3) with orthonormal columns over all rows of a feature, and R_f (J, 3, 3)."""
-    Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(obs.ids), 3, 3))
-    for _ in range(2):
-        squares = np.einsum("nki,nkj->nij", Q, Q)
-        squares = np.add.reduceat(squares, _first_of_each(obs.feature))
-        trace = np.trace(squares, axis1=1, axis2=2)
-        squares += REGULARISATION * trace[:, None, None] * np.eye(3)
-        R = np.linalg.cholesky(squares).transpose(0, 2, 1)
-        Q, R_f = Q @ np.linalg.inv(R)[obs.feature], R @ R_f
-    return Q, R_f
+    by_point, by_view = _tables(obs, linear)
+    Q, R_f = _orthonormal(by_point)
+    T = _along(Q, by_view)
+    stacked = T.reshape(-1, T.shape[2])
+    information = _view_information(by_view) - stacked.T @ stacked
+    return CondensedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
 
 
 def information_root(information: FloatArray) -> FloatArray:
@@ -106,31 +94,52 @@ def information_root(information: FloatArray) -> FloatArray:
     return rows
 
 
-def _along(
-    obs: Observations, Q: FloatArray, linear: WhitenedObservations
-) -> tuple[FloatArray, FloatArray]:
-    """Qᵀ H_x (J, 3, 6 F) and Qᵀ r (J, 3) of each feature."""
-    J, F = len(obs.ids), len(obs.frames)
-    views = _first_of_each(obs.feature * F + obs.frame)  # a view: all cameras of one frame
-    by_pose = np.add.reduceat(np.einsum("nki,nkj->nij", Q, linear.by_pose), views)
-    T = np.zeros((J, 3, F, 6))
-    T[obs.feature[views], :, obs.frame[views]] = by_pose
-    r_1 = np.add.reduceat(np.einsum("nki,nk->ni", Q, linear.r), _first_of_each(obs.feature))
-    return T.reshape(J, 3, 6 * F), r_1
+def _tables(obs: Observations, linear: WhitenedObservations) -> tuple[FloatArray, FloatArray]:
+    """All rows in their places, zero where a feature was not seen.
 
+    A view is what all C cameras of one frame see of a feature, m = 2 C rows.
 
-def _pose_information(obs: Observations, linear: WhitenedObservations) -> FloatArray:
-    """Σ [H_x r]ᵀ [H_x r], (6 F + 1, 6 F + 1): a block for each pose, and the residuals."""
-    F = len(obs.frames)
+    Returns:
+        by_point: (J, F m, 3).
+        by_view: (J, F, m, 6 + 1) derivatives by the pose of the frame, and residuals.
+    """
+    J, F, C = len(obs.ids), len(obs.frames), int(obs.camera.max()) + 1
+    by_point = np.zeros((J, F, C, 2, 3))
+    by_point[obs.feature, obs.frame, obs.camera] = linear.by_point
+    by_view = np.zeros((J, F, C, 2, POSE_DIM + 1))
     rows = np.concatenate([linear.by_pose, linear.r[:, :, None]], axis=2)
-    information = np.zeros((6 * F + 1, 6 * F + 1))
+    by_view[obs.feature, obs.frame, obs.camera] = rows
+    return by_point.reshape(J, -1, 3), by_view.reshape(J, F, 2 * C, -1)
+
+
+def _orthonormal(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Q (J, F m, 3) with orthonormal columns for each feature, and R_f (J, 3, 3)."""
+    Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(by_point), 3, 3))
+    for _ in range(2):
+        squares = Q.transpose(0, 2, 1) @ Q
+        trace = np.trace(squares, axis1=1, axis2=2)
+        squares += REGULARISATION * trace[:, None, None] * np.eye(3)
+        R = np.linalg.cholesky(squares).transpose(0, 2, 1)
+        Q, R_f = Q @ np.linalg.inv(R), R @ R_f
+    return Q, R_f
+
+
+def _along(Q: FloatArray, by_view: FloatArray) -> FloatArray:
+    """Qᵀ [H_x r] of each feature, (J, 3, 6 F + 1)."""
+    J, F, m, _ = by_view.shape
+    views = Q.reshape(J, F, m, 3).transpose(0, 1, 3, 2) @ by_view
+    poses = views[:, :, :, :POSE_DIM].transpose(0, 2, 1, 3).reshape(J, 3, POSE_DIM * F)
+    return np.concatenate([poses, views[:, :, :, POSE_DIM:].sum(axis=1)], axis=2)
+
+
+def _view_information(by_view: FloatArray) -> FloatArray:
+    """Σ [H_x r]ᵀ [H_x r], (6 F + 1, 6 F + 1): a block for each pose, and the residuals."""
+    _, F, _, width = by_view.shape
+    size = POSE_DIM * F
+    information = np.zeros((size + width - POSE_DIM, size + width - POSE_DIM))
+    rest = np.arange(size, len(information))
     for frame in range(F):
-        seen = rows[obs.frame == frame].reshape(-1, 7)
-        columns = np.append(np.arange(6 * frame, 6 * frame + 6), 6 * F)
+        seen = np.ascontiguousarray(by_view[:, frame]).reshape(-1, width)
+        columns = np.append(np.arange(POSE_DIM * frame, POSE_DIM * (frame + 1)), rest)
         information[np.ix_(columns, columns)] += seen.T @ seen
     return information
-
-
-def _first_of_each(ascending: IntArray) -> IntArray:
-    """Index of the first of each run of equal values."""
-    return np.flatnonzero(np.diff(ascending, prepend=-1))
