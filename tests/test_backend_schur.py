@@ -4,12 +4,12 @@
 
 import numpy as np
 import pytest
+from flight import Flight, rig, room, scene
 
 from slam_graph.backend.config import GatingConfig
 from slam_graph.backend.feature_factors import reduce_features, whiten
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.schur import condense_features, information_root
-from flight import Flight, rig, room, scene
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

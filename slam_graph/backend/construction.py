@@ -46,6 +46,7 @@ class ConstructedCost:
         moving: those of them whose velocity and bias stay.
         features: ids of the features that stay in the state, ascending.
         leaving: (J,) those of the cost's new features that are used for the last time.
+        keep_lost_features: whether features that leave are put aside for when they are seen again.
     """
 
     cost: Cost
@@ -54,6 +55,7 @@ class ConstructedCost:
     moving: list[int]
     features: IntArray
     leaving: BoolArray
+    keep_lost_features: bool
 
     def drop_features(self) -> None:
         """Leave only the prior and the factors."""
@@ -93,6 +95,8 @@ class CostConstruction:
         if still:
             past = window.past[:-1]
             return self._constructed(window, cost, None, past, window.features, nothing)
+        window.recall_features()
+        cost.prior = window.prior
         past = POSE_CHOICES[self.policy.past_poses](window, self.policy)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
         seen = np.intersect1d(window.features, window.tracks.ids_in(window.frame), True)
@@ -122,7 +126,8 @@ class CostConstruction:
         count = self.policy.recent_frames - 1
         recent = set(window.past[-count:]) if count else set()
         moving = [i for i in window.moving if i in recent and i in past]
-        return ConstructedCost(cost, linear, past, moving, features, leaving)
+        keep_lost = self.policy.keep_lost_features and window.archive.open
+        return ConstructedCost(cost, linear, past, moving, features, leaving, keep_lost)
 
     def reject_residuals(self, window: Window, constructed: ConstructedCost) -> None:
         """Forget the observations that do not fit after the steps, where the gate is on residuals.
@@ -204,6 +209,8 @@ class CostConstruction:
             ids = np.unique(cost.tracked.ids[cost.tracked.feature])
         if self.policy.keep_lost_features:
             ids = window.features
+            if window.archive.open:
+                ids = ids[is_in(ids, window.tracks.seen)]
         if cost.fresh is not None:
             ids = np.union1d(ids, cost.fresh.obs.ids[cost.fresh.in_state])
         return ids

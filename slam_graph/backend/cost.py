@@ -244,14 +244,13 @@ class Cost:
         if linear.tracked is not None and self.tracked is not None:
             keys = [X(i) for i in self.tracked.frames]
             keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
-            covariance = predicted.covariance_of(keys)
             columns = _tracked_columns(self.tracked, Layout(dims_of(keys)))
             H = np.concatenate([linear.tracked.by_pose, linear.tracked.by_point], axis=2)
-            P = covariance[columns[:, :, None], columns[:, None, :]]
+            P = predicted.covariance_blocks(keys, columns)
             distance = squared_mahalanobis(linear.tracked.r, H, P)
             tracked = distance < threshold(np.array([2]), confidence)[0]
-        if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
-            fresh = np.ones(len(self.fresh.points), np.bool_)
+        if isinstance(linear.fresh, CondensedFeatures):
+            fresh = np.ones(len(linear.fresh.R_f), np.bool_)
         elif linear.fresh is not None and self.fresh is not None:
             P = predicted.covariance_of([X(i) for i in self.fresh.obs.frames])
             distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
