@@ -104,7 +104,7 @@ class CostConstruction:
         window.tracks.consume(window.features)
         leaving_frames = [i for i in window.past if i not in past]
         cost.fresh = self._new_features(window, leaving_frames, len(seen))
-        linear = cost.linearize(apart=self.policy.gate == "prediction")
+        linear = cost.linearize(summed=self.policy.gate == "residual")
         tracked_ok, fresh_ok = cost.gate(linear, predicted)
         linear = self._leave_out(window, cost, linear, tracked_ok, fresh_ok)
         leaving = self._leaving(window, cost, leaving_frames)

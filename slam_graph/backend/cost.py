@@ -152,11 +152,12 @@ class Cost:
 
     # --- linearisation -------------------------------------------------------------------------
 
-    def linearize(self, apart: bool = False) -> Linearization:
+    def linearize(self, summed: bool = False) -> Linearization:
         """Linearise all observations.
 
         Args:
-            apart: whether the rows of new features are kept apart, as the gate needs them.
+            summed: whether new features are summed up; else their rows stay apart, as the gate
+                needs them.
         """
         self.state.relinearize()
         tracked = fresh = None
@@ -164,7 +165,7 @@ class Cost:
             tracked = self._whitened(self.tracked, None)
         if self.fresh is not None and len(self.fresh.obs):
             whitened = self._whitened(self.fresh.obs, self.fresh.points)
-            reduce = reduce_features if apart else condense_features
+            reduce = condense_features if summed else reduce_features
             fresh = reduce(self.fresh.obs, whitened)
         return Linearization(tracked, fresh)
 

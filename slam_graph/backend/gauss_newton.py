@@ -51,7 +51,7 @@ def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
     layout, costs = cost.layout(), [cost.value()]
     for step in range(policy.max_steps):
         if linear is None or step > 0:
-            linear = cost.linearize()
+            linear = cost.linearize(summed=True)
         posterior = _system(cost, linear, layout)
         delta = posterior.solution()
         cost.apply(delta, linear, layout)
@@ -64,7 +64,7 @@ def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
 
 def linearized(cost: Cost) -> SquareRootInformation:
     """A cost as a Gaussian over an increment of the current estimates."""
-    return _system(cost, cost.linearize(), cost.layout())
+    return _system(cost, cost.linearize(summed=True), cost.layout())
 
 
 def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInformation:
@@ -78,7 +78,7 @@ def _levenberg_marquardt(
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
     layout = cost.layout()
-    linear = linear or cost.linearize()
+    linear = linear or cost.linearize(summed=True)
     system, costs, damping = _system(cost, linear, layout), [cost.value()], 0.0
     for left in reversed(range(policy.max_steps)):
         delta = _damped(system, damping).solution()
@@ -95,7 +95,7 @@ def _levenberg_marquardt(
         costs.append(value)
         if left == 0 or max(gain, 0.0 if damping else _promised(system)) < policy.tolerance * value:
             return Minimum(system.shifted(delta), tuple(costs))
-        linear = cost.linearize()
+        linear = cost.linearize(summed=True)
         system = _system(cost, linear, layout)
         damping = 0.1 * damping if damping > INITIAL_DAMPING else 0.0
     return Minimum(system, tuple(costs))

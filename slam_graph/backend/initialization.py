@@ -242,7 +242,7 @@ class Initializer:
 
 def _normalized_cost(cost: Cost) -> float:
     """Mean squared residual of the features that do not depend on their positions."""
-    fresh = cost.linearize(apart=True).fresh
+    fresh = cost.linearize().fresh
     if not isinstance(fresh, ReducedFeatures):
         return float("inf")
     return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
