@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
@@ -174,6 +174,9 @@ class CostConstruction:
         good = is_in(obs.ids, known_ids)
         points = np.zeros((len(obs.ids), 3))
         points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
+        here = window.state.estimate.atPose3(X(window.frame)).translation()
+        # steps may have sent a feature with little parallax to infinity
+        good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
         if not good.all():
             new = ~good
             poses = stacked_poses(window.state.estimate, obs.frames)
