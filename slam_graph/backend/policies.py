@@ -27,8 +27,8 @@ class CostPolicy(Settings):
     features: Literal["once", "state", "window"] = "once"
     """What becomes of a feature that is not held in the state. once: used when its track ends, with
     all its observations, and marginalised at once. state: never used, only features of the state
-    count. window: in the cost of every step until a keyframe that saw it leaves; then it becomes part
-    of the prior, and starts anew if it is still tracked."""
+    count. window: in the cost of every step until a keyframe that saw it leaves; then it becomes
+    part of the prior, and starts anew if it is still tracked."""
     keep_lost_features: bool = False
     """Whether features of the state that are no longer tracked are kept for when they come back."""
     max_state_features: int | None = Field(40, ge=0)
