@@ -93,6 +93,7 @@ class Estimator:
         with self._timed("gauss_newton"):
             minimum = self._minimize(constructed)
             self.costs = minimum.costs
+            self._construction.reject_residuals(window, constructed)
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
             marginalize_step(window, constructed, minimum.posterior, policy)
