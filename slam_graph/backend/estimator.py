@@ -51,7 +51,7 @@ class Estimator:
         window: variables, prior and tracks; None as long as there is no state.
         timings: seconds that each module took in the last step.
         costs: the cost before the first Gauss-Newton step of the last frame and after each.
-        columns: dimension of the state in the last step.
+        columns: dimension of the state in the last step, with the features that are put aside.
         innovations: how far the last frame was from what was predicted of it.
     """
 
@@ -97,7 +97,9 @@ class Estimator:
             constructed = self._construction.construct(window, still)
         with self._timed("gauss_newton"):
             minimum = self._minimize(constructed)
-            self.costs, self.columns = minimum.costs, minimum.posterior.layout.size
+            self.costs = minimum.costs
+            self.columns = minimum.posterior.layout.size + window.archive.size
+            self._construction.reject_residuals(window, constructed)
             self.innovations = constructed.innovations_under(minimum.posterior)
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization

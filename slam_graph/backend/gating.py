@@ -20,7 +20,8 @@ class Innovations:
     """How far the measurements of one step were from what was predicted of them.
 
     A measurement is a new feature with all of its observations, or one observation of a feature of
-    the state. Distances are squared Mahalanobis distances, which the gate judges.
+    the state; where the gate is on what remains after the steps, each single observation. Distances
+    are squared Mahalanobis distances, which the gate judges.
 
     Attributes:
         tested: number of measurements.
@@ -65,6 +66,12 @@ class Innovations:
             int(np.sum(dof[passed])),
             float(np.sum(means)),
         )
+
+    @staticmethod
+    def untested(dof: NDArray[np.int64]) -> Innovations:
+        """Measurements with degrees of freedom (J,) that enter without a gate."""
+        total = int(np.sum(dof))
+        return Innovations(passed_dof=total, expected=float(total))
 
     def __add__(self, other: Innovations) -> Innovations:
         return Innovations(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
