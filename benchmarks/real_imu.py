@@ -13,8 +13,7 @@ from pathlib import Path
 
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
 from benchmarks.metric import Metric, info
-from benchmarks.running import clipped
-from benchmarks.suite import PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
+from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
 from slam_graph.experiment.comparison import Comparison
 from slam_graph.experiment.sources import find_sources
 
@@ -28,30 +27,25 @@ CAMERA = ("rate_hz=20", "tracks.features=150", "tracks.pixel_sigma=1")
 ATE_BARS_M = {"msckf": 0.10, "okvis": 0.10}
 """An algorithm without a bar is only shown."""
 
-CLIP_S = 15.0
-"""How much of a flight algorithms run on whose cost has no bound."""
-
 
 def measure(data: Path, duration_s: float | None = None) -> Outcome:
     """Errors of every algorithm on every flight.
 
     Args:
         data: folder of recordings.
-        duration_s: how much of each flight to take; all of it, but for the unbounded, if not said.
+        duration_s: how much of each flight to take; all of it if not said.
     """
     outcome = Outcome()
-    flights = [f"sim:{data / flight}" for flight in FLIGHTS]
-    bounded = [name for name in (*RECURSIVE, *PEERS) if name not in UNBOUNDED]
-    for names, length_s in ((bounded, duration_s), (list(UNBOUNDED), duration_s or CLIP_S)):
-        folder = folder_of("real_imu") / ("whole" if length_s is None else f"{length_s:g}s")
-        sources = find_sources(flights, length_s, CAMERA)
-        comparison = compared(folder, sources, configs_of(names, CAMERAS, length_s))
-        for source in sources:
-            for name in names:
-                label = f"{source.name.removeprefix('sim_')}.{clipped(name, length_s)}"
-                judged = name in ATE_BARS_M and length_s is None
-                outcome.add(label, figures_of(comparison, source.name, name), judged)
-        note_failures(outcome, comparison)
+    names = (*RECURSIVE, *PEERS)
+    sources = find_sources([f"sim:{data / flight}" for flight in FLIGHTS], duration_s, CAMERA)
+    folder = folder_of("real_imu") / ("whole" if duration_s is None else f"{duration_s:g}s")
+    comparison = compared(folder, sources, configs_of(names, CAMERAS, duration_s))
+    for source in sources:
+        for name in names:
+            label = f"{source.name.removeprefix('sim_')}.{name}"
+            judged = name in ATE_BARS_M and duration_s is None
+            outcome.add(label, figures_of(comparison, source.name, name), judged)
+    note_failures(outcome, comparison)
     return outcome
 
 
