@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.gating import Innovations
 from slam_graph.backend.gauss_newton import Minimum, minimize
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.initialization import Initializer, start_from
@@ -50,6 +51,8 @@ class Estimator:
         window: variables, prior and tracks; None as long as there is no state.
         timings: seconds that each module took in the last step.
         costs: the cost before the first Gauss-Newton step of the last frame and after each.
+        columns: dimension of the state in the last step, with the features that are put aside.
+        innovations: how far the last frame was from what was predicted of it.
     """
 
     def __init__(
@@ -66,6 +69,8 @@ class Estimator:
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
         self.costs: tuple[float, ...] = ()
+        self.columns = 0
+        self.innovations = Innovations()
         projection = RigProjection(rig)
         self._propagation = Propagation(rig.imu, self.config, self.diagnostics)
         self._construction = CostConstruction(
@@ -93,6 +98,9 @@ class Estimator:
         with self._timed("gauss_newton"):
             minimum = self._minimize(constructed)
             self.costs = minimum.costs
+            self.columns = minimum.posterior.layout.size + window.archive.size
+            self._construction.reject_residuals(window, constructed)
+            self.innovations = constructed.innovations_under(minimum.posterior)
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
             marginalize_step(window, constructed, minimum.posterior, policy)
@@ -156,7 +164,7 @@ class Estimator:
             as there is no state, and for a frame that does not follow those before.
         """
         stamp_ns = frame.stamp_ns + self._time_offset_ns
-        self.timings, self.costs = {}, ()
+        self.timings, self.costs, self.innovations = {}, (), Innovations()
         if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from slam_graph.backend.archive import FeatureArchive
 from slam_graph.backend.construction import ConstructedCost
 from slam_graph.backend.gauss_newton import linearized
 from slam_graph.backend.policies import MarginalizationPolicy
@@ -43,7 +44,8 @@ def marginalize_step(
         posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
         window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
     _keep_landmarks(window, constructed)
-    window.prior = marginalize(posterior, window.state, keep, policy.first_estimates)
+    archive = window.archive if constructed.keep_lost_features else None
+    window.prior = marginalize(posterior, window.state, keep, policy.first_estimates, archive)
     window.past, window.moving = list(constructed.past), list(constructed.moving)
     window.features = constructed.features
     window.tracks.retain([*constructed.past, window.frame])
@@ -66,6 +68,7 @@ def marginalize(
     state: State,
     keep: Sequence[int],
     first_estimates: bool,
+    archive: FeatureArchive | None = None,
 ) -> SquareRootInformation:
     """Eliminate all variables but `keep` and make the rest the prior of the next step.
 
@@ -78,14 +81,19 @@ def marginalize(
         keep: keys that stay, in the order of the new prior's columns; those that the posterior does
             not contain stay free of it.
         first_estimates: whether first-estimates Jacobians are used.
+        archive: gets what the variables that leave are, given those that stay.
 
     Returns:
         The prior as a function of the offsets of the estimates from their linearisation points.
     """
     staying = set(keep)
-    prior = posterior.marginal([key for key in keep if key in posterior.layout])
+    conditional, prior = posterior.divided([key for key in keep if key in posterior.layout])
+    if archive is not None:
+        archive.put(conditional, state)
     state.remove([key for key in state.variables() if key not in staying])
     if not first_estimates:
+        if archive is not None:
+            archive.follow(state)
         state.rebase()
     state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
     return prior.shifted(-state.offset(prior.layout))

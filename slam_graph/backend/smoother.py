@@ -102,7 +102,9 @@ class SmootherEstimator(Estimator):
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)
         assert predicted.covariance is not None
-        return self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        new = self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        self.innovations = self._features.innovations
+        return new
 
     # --- the smoother ----------------------------------------------------------------------------
 
