@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.calibration import camera_entry
 from slam_graph.sensors.kalibr import write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
@@ -40,7 +41,6 @@ TRUTH_COLUMNS = (
     "b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],"
     "b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]"
 )
-DISTORTIONS = {"none": "none", "radtan": "radial-tangential", "equidistant": "equidistant"}
 TRUTH_FOLDER = "state_groundtruth_estimate0"
 
 
@@ -187,14 +187,15 @@ def _truth_rows(truth: Trajectory) -> FloatArray:
 def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
     """What EuRoC's ``sensor.yaml`` holds, and Kalibr's key for the time offset, if there is one."""
     camera = mounted.camera
+    model, intrinsics, distortion, coefficients = camera_entry(camera)
     values: dict[str, object] = {
         "T_BS": _matrix(mounted.body_T_camera),
         "rate_hz": float(rate_hz),
         "resolution": [camera.width, camera.height],
-        "camera_model": "pinhole",
-        "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
-        "distortion_model": DISTORTIONS[camera.distortion],
-        "distortion_coefficients": [float(v) for v in camera.coefficients],
+        "camera_model": model,
+        "intrinsics": intrinsics,
+        "distortion_model": "radial-tangential" if distortion == "radtan" else distortion,
+        "distortion_coefficients": coefficients,
     }
     if mounted.time_offset_s:
         values["timeshift_cam_imu"] = float(mounted.time_offset_s)

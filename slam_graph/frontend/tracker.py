@@ -21,6 +21,7 @@ from slam_graph.frontend.extraction import CornerExtractor, read_mask
 from slam_graph.frontend.outliers import fundamental_inliers
 from slam_graph.frontend.stereo import StereoMatcher
 from slam_graph.frontend.tracks import Image, Mask, Tracks
+from slam_graph.sensors.camera import WIDE
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
 
@@ -211,7 +212,7 @@ class KltTracker:
 
 
 def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
-    """One extractor per camera, with its mask."""
+    """One extractor per camera, with its mask: what is told, and what a wide lens cannot use."""
     if len(config.masks) > len(rig.cameras):
         raise ConfigError(
             f"frontend.masks lists {len(config.masks)} masks, "
@@ -220,8 +221,11 @@ def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
     masks = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
     extractors = []
     for rig_camera, path in zip(rig.cameras, masks, strict=True):
-        width, height = rig_camera.camera.width, rig_camera.camera.height
+        camera, width, height = rig_camera.camera, rig_camera.camera.width, rig_camera.camera.height
         mask = None if path is None else read_mask(path, width, height)
+        if camera.distortion in WIDE:
+            seen = np.where(camera.visible_mask(), np.uint8(255), np.uint8(0))
+            mask = seen if mask is None else np.minimum(mask, seen)
         extractors.append(CornerExtractor(config, width, height, mask))
     return extractors
 

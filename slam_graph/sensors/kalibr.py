@@ -19,7 +19,12 @@ import gtsam
 import yaml
 
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration import has_rolling_shutter, read_camera, read_imu_noise
+from slam_graph.sensors.calibration import (
+    camera_entry,
+    has_rolling_shutter,
+    read_camera,
+    read_imu_noise,
+)
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 from slam_graph.sensors.yaml_source import YamlValue, read_yaml
 
@@ -114,13 +119,14 @@ def write_kalibr(rig: Rig, path: Path) -> None:
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
     camera = mounted.camera
+    model, intrinsics, distortion, coefficients = camera_entry(camera)
     shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
     return shutter | {
         "name": mounted.name,
-        "camera_model": "pinhole",
-        "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
-        "distortion_model": camera.distortion,
-        "distortion_coeffs": [float(value) for value in camera.coefficients],
+        "camera_model": model,
+        "intrinsics": intrinsics,
+        "distortion_model": distortion,
+        "distortion_coeffs": coefficients,
         "resolution": [int(camera.width), int(camera.height)],
         "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist(),
         "timeshift_cam_imu": float(mounted.time_offset_s),
