@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.datasets.images import FileImages
+from slam_graph.datasets.ordering import in_order
 from slam_graph.datasets.rows import read_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -81,20 +83,41 @@ def list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
         if (folder / "data").exists():
             raise DataError(f"{index}: missing, but there are images beside it")
         return FileImages(folder.name, np.zeros(0, np.int64), [])
-    stamps: list[int] = []
-    names: list[str] = []
-    for rows in read_rows(index):
-        for k, line in enumerate(rows.lines):
-            stamp, name = _parse_image_row(line, partial(rows.where, k))
-            if stamps and stamp <= stamps[-1]:
-                diagnostics.warn("camera_out_of_order", f"{rows.where(k)}: image dropped")
-                continue
-            stamps.append(stamp)
-            names.append(name)
-    if not stamps:
+    listed = [
+        _parse_image_row(line, partial(rows.where, k))
+        for rows in read_rows(index)
+        for k, line in enumerate(rows.lines)
+    ]
+    if not listed:
         raise DataError(f"{index}: no images listed in this file")
-    paths = [folder / "data" / name for name in names]
-    return FileImages(folder.name, np.array(stamps, np.int64), paths)
+    stamps = np.array([stamp for stamp, _ in listed], np.int64)
+    paths = [folder / "data" / name for _, name in listed]
+    return ordered_images(folder.name, stamps, paths, index, diagnostics)
+
+
+def ordered_images(
+    name: str,
+    stamps_ns: NDArray[np.int64],
+    paths: Sequence[Path],
+    index: Path,
+    diagnostics: Diagnostics,
+) -> FileImages:
+    """The images of a camera without those that break the order of time.
+
+    Args:
+        name: of the camera.
+        stamps_ns: (N,) in any order.
+        paths: N files.
+        index: file that lists them, for messages.
+        diagnostics: counts `camera_out_of_order`.
+    """
+
+    def dropped(k: int, _: int) -> None:
+        what = f"{index}: {paths[k].name} at {stamps_ns[k]} dropped, not in the order of time"
+        diagnostics.warn("camera_out_of_order", what)
+
+    kept = in_order(stamps_ns, dropped)
+    return FileImages(name, stamps_ns[kept], [paths[k] for k in kept])
 
 
 def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:

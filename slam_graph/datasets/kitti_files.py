@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.ordering import in_order
 from slam_graph.datasets.rows import STAMP_TEXT, parse, read_rows, stamps_from_seconds
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -127,9 +128,10 @@ def read_seconds(path: Path) -> NDArray[np.int64]:
 def increasing(
     stamps_ns: NDArray[np.int64], kind: str, path: Path, diagnostics: Diagnostics
 ) -> NDArray[np.intp]:
-    """Indices of the stamps that are later than all before them; the others are counted."""
-    latest = np.maximum.accumulate(stamps_ns)
-    keep = np.concatenate([np.ones(min(len(stamps_ns), 1), bool), stamps_ns[1:] > latest[:-1]])
-    for k in np.flatnonzero(~keep):
-        diagnostics.warn(kind, f"{path}:{k + 1}: dropped, not later than the one before it")
-    return np.flatnonzero(keep)
+    """Indices of the stamps (N,), one a line, that increase; the others are counted."""
+    return in_order(
+        stamps_ns,
+        lambda k, _: diagnostics.warn(
+            kind, f"{path}:{k + 1}: dropped, not between the ones before and after it"
+        ),
+    )

@@ -24,6 +24,7 @@ from slam_graph.datasets.image_sequence import (
 )
 from slam_graph.datasets.images import Fault, Image, prefetch
 from slam_graph.datasets.imu_stream import ImuCleaner
+from slam_graph.datasets.ordering import in_order
 from slam_graph.datasets.packets import FrameStream
 from slam_graph.datasets.pairing import ABSENT, Groups
 from slam_graph.datasets.recorded import Extent
@@ -47,13 +48,13 @@ class _Index:
 
     Attributes:
         received_ns: for each camera the times at which all its messages were recorded.
-        kept: for each camera which of its messages are used: those later than the one before.
+        kept: for each camera which of its messages are used: those in the order of time.
         groups: frames, with indices into `kept`.
         imu_samples: number of messages of the IMU.
     """
 
     received_ns: list[NDArray[np.int64]]
-    kept: list[NDArray[np.int64]]
+    kept: list[NDArray[np.intp]]
     groups: Groups
     imu_samples: int
 
@@ -230,7 +231,6 @@ class RosBagSequence(GroupedSequence):
     def _index(self) -> _Index:
         """Go through the whole bag for the stamps of its images."""
         received: list[list[int]] = [[] for _ in self._cameras]
-        kept: list[list[int]] = [[] for _ in self._cameras]
         stamps: list[list[int]] = [[] for _ in self._cameras]
         samples = 0
         inertial = [] if self._imu_topic is None else [self._imu_topic]
@@ -240,16 +240,21 @@ class RosBagSequence(GroupedSequence):
                 continue
             camera = self._cameras.index(message.topic)
             received[camera].append(message.received_ns)
-            stamp_ns = self._stamp_ns(message)
-            if stamps[camera] and stamp_ns <= stamps[camera][-1]:
-                what = f"{self._where(message)}: image at {stamp_ns} dropped"
-                self.diagnostics.warn("camera_out_of_order", what)
-                continue
-            kept[camera].append(len(received[camera]) - 1)
-            stamps[camera].append(stamp_ns)
-        groups = self._group([np.array(s, np.int64) for s in stamps], STEREO_TOLERANCE_S)
-        arrays = [[np.array(column, np.int64) for column in table] for table in (received, kept)]
-        return _Index(arrays[0], arrays[1], groups, samples)
+            stamps[camera].append(self._stamp_ns(message))
+        all_stamps = [np.array(column, np.int64) for column in stamps]
+        kept = [self._in_order(*camera) for camera in zip(self._cameras, all_stamps, strict=True)]
+        used = [column[rows] for column, rows in zip(all_stamps, kept, strict=True)]
+        groups = self._group(used, STEREO_TOLERANCE_S)
+        return _Index([np.array(column, np.int64) for column in received], kept, groups, samples)
+
+    def _in_order(self, topic: str, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Which images of a camera do not break the order of time."""
+
+        def dropped(k: int, _: int) -> None:
+            what = f"{topic}: image at {stamps_ns[k]} dropped, not in the order of time"
+            self.diagnostics.warn("camera_out_of_order", f"{self.path}: {what}")
+
+        return in_order(stamps_ns, dropped)
 
     def _until_damage(self, topics: list[str]) -> Generator[Message, None, None]:
         """Messages up to where the bag is damaged, if it is."""

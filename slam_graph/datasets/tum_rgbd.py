@@ -19,6 +19,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from slam_graph.datasets.asl import ordered_images
 from slam_graph.datasets.image_sequence import ImageSequence
 from slam_graph.datasets.images import FileImages
 from slam_graph.datasets.recorded import Extent
@@ -123,12 +124,8 @@ def _list_images(path: Path, diagnostics: Diagnostics) -> FileImages:
             stamp, _, name = line.strip().partition(" ")
             if not name:
                 raise DataError(f"{rows.where(k)}: expected time [s] and file name")
-            stamp_ns = stamp_from_seconds(stamp, rows, k)
-            if stamps and stamp_ns <= stamps[-1]:
-                diagnostics.warn("camera_out_of_order", f"{rows.where(k)}: image dropped")
-                continue
-            stamps.append(stamp_ns)
+            stamps.append(stamp_from_seconds(stamp, rows, k))
             files.append(path / name.strip())
     if not stamps:
         raise DataError(f"{path / 'rgb.txt'}: no images listed in this file")
-    return FileImages("rgb", np.array(stamps, np.int64), files)
+    return ordered_images("rgb", np.array(stamps, np.int64), files, path / "rgb.txt", diagnostics)
