@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import write_euroc, write_openvins
+from recordings_loose import write_flight_video, write_image_folder
 from recordings_public import (
     write_kitti_odometry,
     write_kitti_raw,
@@ -72,6 +73,14 @@ def bag_mcap_file(folder: Path) -> Sequence:
     return open_dataset(write_bag(folder, "mcap_file"))
 
 
+def video(folder: Path) -> Sequence:
+    return open_dataset(write_flight_video(folder))
+
+
+def image_folder(folder: Path) -> Sequence:
+    return open_dataset(write_image_folder(folder / "walk"))
+
+
 def recording(folder: Path) -> Sequence:
     source = openvins(folder)
     with TrackRecorder(folder / "recorded", source.rig) as recorder:
@@ -95,6 +104,8 @@ MADE_UP: list[Callable[[Path], Sequence]] = [
     bag_sqlite,
     bag_mcap,
     bag_mcap_file,
+    video,
+    image_folder,
 ]
 
 ASSUMPTIONS = {"imu_noise_assumed"}

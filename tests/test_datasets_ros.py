@@ -3,7 +3,6 @@
 """ROS bags: every encoding and kind of bag, topics found or named, and bags that are broken."""
 
 import sqlite3
-import sys
 from pathlib import Path
 
 import cv2
@@ -306,13 +305,6 @@ def test_metadata_that_is_missing(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="not a recording of a known format"):
         open_dataset(path)
     assert open_dataset(next(path.glob("*.db3"))).info().frames == 8
-
-
-def test_the_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(DataError, match=r"pip install 'slam-graph\[ros\]'"):
-        open_dataset(path)
 
 
 def test_reading_stops_with_its_reader(tmp_path: Path) -> None:

@@ -42,8 +42,9 @@ Sources = Annotated[
         "--topic",
         "--source",
         metavar="SENSOR=WHERE",
-        help="Topic of a ROS bag or file beside a video where a sensor is: imu=/imu0, cam0=/cam0, "
-        "groundtruth=/pose; imu=imu.csv, stamps=times.csv. Repeatable.",
+        help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
+        "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
+        "rate=30 instead of stamps.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.images import FileImages
+from slam_graph.datasets.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.ordering import in_order
 from slam_graph.datasets.rows import read_rows
 from slam_graph.diagnostics import Diagnostics
@@ -36,9 +37,10 @@ def find_mav0(path: Path) -> Path:
     )
 
 
-def imu_file(mav0: Path) -> Path | None:
+def imu_file(mav0: Path) -> ImuFile | None:
     """The samples of the IMU; None where there is no IMU."""
-    return mav0 / "imu0" / "data.csv" if (mav0 / "imu0").is_dir() else None
+    folder = mav0 / "imu0"
+    return ImuFile(folder / "data.csv", parse_imu_rows) if folder.is_dir() else None
 
 
 def name_of(mav0: Path) -> str:
@@ -66,7 +68,7 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
         beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
         imu = next((file for file in beside if file.is_file()), None)
         noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
-        rig = read_kalibr(calibration, fallback=noise)
+        rig = read_kalibr(calibration, fallback=noise, needs_imu=imu_file(mav0) is not None)
         if len(rig.cameras) > len(folders):
             raise DataError(
                 f"{calibration}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.images import Fault, Image, prefetch
-from slam_graph.datasets.imu_stream import clean_blocks, parse_imu_rows
+from slam_graph.datasets.imu_stream import ImuFile
 from slam_graph.datasets.packets import FrameStream
 from slam_graph.datasets.pairing import ABSENT, Groups, group_by_time
 from slam_graph.datasets.recorded import Extent, RecordedSequence
-from slam_graph.datasets.rows import count_rows, read_rows, require_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
@@ -191,13 +190,13 @@ class ImageSequence(GroupedSequence):
 
 
 class FileImageSequence(ImageSequence):
-    """A recording of images whose IMU, if it has one, is a CSV file in EuRoC's order of columns.
+    """A recording of images whose IMU, if it has one, is a CSV file.
 
     Args:
         name: of the recording.
         rig: its calibration.
         streams: the images of each camera of the rig.
-        imu_file: with stamp [ns], rate [rad/s], specific force [m/s²]; None without an IMU.
+        imu: its file; None without an IMU.
         groundtruth: file or folder with the ground truth, or None.
         diagnostics: where faults are counted.
         stereo_tolerance_s: largest time difference of images that are one frame.
@@ -208,36 +207,31 @@ class FileImageSequence(ImageSequence):
         name: str,
         rig: Rig,
         streams: Sequence[ImageStream],
-        imu_file: Path | None,
+        imu: ImuFile | None,
         groundtruth: Path | None,
         diagnostics: Diagnostics | None,
         stereo_tolerance_s: float = STEREO_TOLERANCE_S,
     ) -> None:
         super().__init__(name, rig, streams, groundtruth, diagnostics, stereo_tolerance_s)
-        self.has_imu = imu_file is not None
-        self._imu_file = imu_file
-        if imu_file is not None:
-            require_rows(imu_file)
+        self.has_imu = imu is not None
+        self._imu = imu
+        if imu is not None:
+            imu.require()
         elif len(self._groups.stamps_ns) == 0:
             raise DataError(f"{name}: neither images nor an IMU in this recording")
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
-        if self._imu_file is None:
-            return iter(())
-        blocks = ((rows, parse_imu_rows(rows)) for rows in read_rows(self._imu_file))
-        return clean_blocks(blocks, self.diagnostics, after_ns)
+        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
 
     def measure(self) -> Extent:
         """Count frames and IMU samples."""
-        samples, first, last = 0, "", ""
-        if self._imu_file is not None:
-            samples, first, last = count_rows(self._imu_file)
+        samples = 0 if self._imu is None else self._imu.count()
         stamps = self._groups.stamps_ns
         if len(stamps):
             return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
-        ends = [int(line.partition(",")[0]) for line in (first, last)]
-        return Extent(0, ends[0], ends[1], samples)
+        assert self._imu is not None
+        return Extent(0, *self._imu.ends_ns(), samples)
 
 
 def check_size(image: Image | Fault, camera: Camera, where: Callable[[], str]) -> Image | Fault:

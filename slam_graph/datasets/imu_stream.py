@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.ordering import in_order
-from slam_graph.datasets.rows import Rows, parse
+from slam_graph.datasets.rows import Rows, count_rows, parse, read_rows, require_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import ImuData
 
@@ -99,6 +100,38 @@ def clean_blocks(
         cleaned = cleaner.clean(data, rows.where)
         if len(cleaned):
             yield cleaned
+
+
+@dataclass(frozen=True)
+class ImuFile:
+    """The samples of an IMU in a CSV file.
+
+    Attributes:
+        path: of the file.
+        parse: turns its rows into samples.
+    """
+
+    path: Path
+    parse: Callable[[Rows], ImuData]
+
+    def require(self) -> None:
+        """Refuse a file that cannot be read or has no samples."""
+        require_rows(self.path)
+
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned samples from `after_ns` on."""
+        blocks = ((rows, self.parse(rows)) for rows in read_rows(self.path))
+        return clean_blocks(blocks, diagnostics, after_ns)
+
+    def count(self) -> int:
+        """How many samples there are, before faulty ones are dropped."""
+        return count_rows(self.path)[0]
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        _, first, last = count_rows(self.path)
+        begin, end = self.parse(Rows(self.path, [first, last], [1, 1])).stamps_ns.tolist()
+        return begin, end
 
 
 def parse_imu_rows(rows: Rows) -> ImuData:

@@ -82,7 +82,10 @@ class KittiOdometrySequence(ImageSequence):
             FileImages(f.name, self._times_ns[kept], [f / f"{k:06d}.png" for k in kept])
             for f in folders
         ]
-        rig = read_kalibr(calibration) if calibration is not None else _read_rig(path, streams)
+        if calibration is not None:
+            rig = read_kalibr(calibration, needs_imu=False)
+        else:
+            rig = _read_rig(path, streams)
         rig = rig if cameras is None else rig.select(cameras)
         if len(rig.cameras) > len(streams):
             raise DataError(f"{calibration}: {len(rig.cameras)} cameras, {path} has {len(streams)}")

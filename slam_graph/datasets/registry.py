@@ -12,6 +12,7 @@ from typing import Protocol
 
 from slam_graph.datasets.eqvio_tracks import EqvioTracks, is_eqvio_file, wheel_tracks
 from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.image_folder import ImageFolderSequence, is_image_folder
 from slam_graph.datasets.kitti_odometry import KittiOdometrySequence, is_kitti_odometry
 from slam_graph.datasets.kitti_raw import KittiRawSequence, is_kitti_raw
 from slam_graph.datasets.openvins_sim import OpenvinsSimulation
@@ -21,6 +22,7 @@ from slam_graph.datasets.ros_bag import is_bag
 from slam_graph.datasets.ros_sequence import RosBagSequence
 from slam_graph.datasets.tum_rgbd import TumRgbdSequence, is_tum_rgbd
 from slam_graph.datasets.tum_vi import TumViSequence, is_tum_vi
+from slam_graph.datasets.video import VideoSequence, is_video
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 
@@ -91,6 +93,18 @@ DATASETS: dict[str, Format] = {
     ),
     "eqvio": Format(
         EqvioTracks, is_eqvio_file, f"a CSV file that begins with 'row_type,' (or '{DEMO}')"
+    ),
+    "video": Format(
+        VideoSequence,
+        is_video,
+        "a video (.mp4, .avi, .mov, .mkv, …)",
+        lambda sources: partial(VideoSequence, sources=sources),
+    ),
+    "images": Format(
+        ImageFolderSequence,
+        is_image_folder,
+        "a folder of images",
+        lambda sources: partial(ImageFolderSequence, sources=sources),
     ),
 }
 """Every format by its name; a path is of the first one that recognises it."""

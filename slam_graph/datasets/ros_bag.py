@@ -27,8 +27,6 @@ METADATA = "metadata.yaml"
 HEADER_BYTES = 12
 """Of a message up to the end of its stamp."""
 
-INSTALL = "pip install 'slam-graph[ros]'"
-
 REINDEX = (
     "if its recording was cut short, rebuild its index first (rosbag reindex, ros2 bag reindex)"
 )
@@ -68,7 +66,7 @@ class Bag:
         topics: type of the messages of each topic, e.g. ``sensor_msgs/msg/Imu``.
 
     Raises:
-        DataError: if `rosbags` is not installed, or the bag cannot be read.
+        DataError: if the bag cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,12 +127,8 @@ class Bag:
 
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:
-        try:
-            from rosbags.highlevel import AnyReader
-        except ImportError:
-            raise DataError(
-                f"{self.path}: reading bags needs the package 'rosbags': {INSTALL}"
-            ) from None
+        from rosbags.highlevel import AnyReader  # not on import: most runs read no bag
+
         with self._translated():
             reader = AnyReader([self.path], default_typestore=_usual_types())
             reader.open()

@@ -105,7 +105,7 @@ class RosBagSequence(GroupedSequence):
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
         unknown = ImuNoise()
         if calibration is not None:
-            rig = read_kalibr(calibration, fallback=unknown)
+            rig = read_kalibr(calibration, fallback=unknown, needs_imu=topics.imu is not None)
         else:
             count = len(topics.cameras) if cameras is None else cameras
             rig = read_bag_rig(self._bag, replace(topics, cameras=topics.cameras[:count]), unknown)

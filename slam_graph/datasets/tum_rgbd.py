@@ -78,7 +78,7 @@ class TumRgbdSequence(ImageSequence):
         diagnostics = diagnostics if diagnostics is not None else Diagnostics()
         images = _list_images(path, diagnostics)
         if calibration is not None:
-            rig = read_kalibr(calibration).select(1)
+            rig = read_kalibr(calibration, needs_imu=False).select(1)
         else:
             rig = _known_rig(self.path, images)
         truth = path / "groundtruth.txt"

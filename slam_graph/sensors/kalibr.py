@@ -31,7 +31,12 @@ from slam_graph.sensors.yaml_source import YamlValue, read_yaml
 IMU_KEY = "imu0"
 
 
-def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | None = None) -> Rig:
+def read_kalibr(
+    path: Path,
+    imu_path: Path | None = None,
+    fallback: ImuNoise | None = None,
+    needs_imu: bool = True,
+) -> Rig:
     """Read a rig from a Kalibr camera chain.
 
     Args:
@@ -39,6 +44,8 @@ def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | N
         imu_path: Kalibr's ``imu.yaml``. Without it the noise is taken from the key ``imu0`` of the
             camera chain, else from a file ``imu.yaml`` beside it, else from `fallback`.
         fallback: noise to take if no file has any; default that of EuRoC's IMU.
+        needs_imu: whether the cameras must be calibrated to the IMU; otherwise a chain that does
+            not say where it is has the body frame of its first camera.
 
     Raises:
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
@@ -55,12 +62,12 @@ def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | N
         )
     cameras: list[RigCamera] = []
     for index in sorted(entries):
-        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None))
+        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None, needs_imu))
     return Rig(tuple(cameras), _read_imu(path, chain, imu_path, fallback))
 
 
-def _read_camera(entry: YamlValue, previous: RigCamera | None) -> RigCamera:
-    body_T_camera = _body_T_camera(entry, previous)
+def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
+    body_T_camera = _body_T_camera(entry, previous, needs_imu)
     shift = entry.get("timeshift_cam_imu")
     name = entry.get("name")
     return RigCamera(
@@ -72,12 +79,14 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None) -> RigCamera:
     )
 
 
-def _body_T_camera(entry: YamlValue, previous: RigCamera | None) -> gtsam.Pose3:
+def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
     direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
     if direct is not None:
         return direct.pose().inverse()
     if link is not None and previous is not None:
         return previous.body_T_camera.compose(link.pose().inverse())
+    if previous is None and not needs_imu:
+        return gtsam.Pose3()
     raise DataError(
         f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
         "from calibrating cameras and IMU together"
