@@ -23,7 +23,6 @@ from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
-from slam_graph.backend.state import stacked_poses
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
@@ -149,8 +148,9 @@ class CostConstruction:
         self, window: Window, obs: Observations, lasting: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (J, 3) of features, those of the last step where there are, and their worth."""
-        poses = stacked_poses(window.state.estimate, obs.frames)
-        result = triangulate(obs, self.rig, *poses, self.config.triangulation)
+        rig = self.rig.at(window.state)
+        poses = rig.poses(window.state.estimate, obs.frames)
+        result = triangulate(rig.renormalized(obs), rig, *poses, self.config.triangulation)
         known_ids, known_points = window.landmarks
         known = is_in(obs.ids, known_ids)
         points = result.points.copy()
