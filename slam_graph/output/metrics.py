@@ -41,6 +41,7 @@ def metrics_table(result: RunResult) -> Table:
             "extent": _extent(result),
             "accuracy": _accuracy(result),
             "nees": _nees(result),
+            "calibration": result.calibration.table(),
             "timing": _timing(result),
             "features_per_frame": _per_frame(result),
             "map_points": len(result.points),
