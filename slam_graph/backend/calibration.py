@@ -29,6 +29,9 @@ FloatArray = NDArray[np.float64]
 MAX_HELD_NS = 50_000_000
 """By how much the time of a frame may be taken too early, where the IMU has no samples yet."""
 
+FAR = 0.3
+"""A step that moves the parameters by more standard deviations (root mean square) is repeated."""
+
 
 class CalibrationVariables:
     """Which parameters of a rig are variables.
@@ -100,6 +103,15 @@ class CalibrationVariables:
             return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
         sigma = config.distortion_sigma if kind == "d" else config.time_offset_sigma_s
         return np.full(dim(key), sigma)
+
+    def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
+        """Whether a step (n,) moved the parameters far, compared to their standard deviations.
+
+        Such a step is not linear: what it says of the parameters depends on where they were.
+        """
+        step = delta[posterior.layout.indices(self.keys)]
+        covariance = posterior.covariance_of(self.keys)
+        return float(step @ np.linalg.solve(covariance, step)) > FAR**2 * len(step)
 
     # --- the estimate ----------------------------------------------------------------------------
 

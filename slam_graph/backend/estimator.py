@@ -109,8 +109,9 @@ class Estimator:
     def _minimize(self, constructed: ConstructedCost) -> Minimum:
         """Take the steps; without the features if these leave something undetermined."""
         policy = self.algorithm.gauss_newton
+        again = self._calibration.moved_far if self._calibration.keys else None
         try:
-            return minimize(constructed.cost, policy, constructed.linear)
+            return minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
             self.diagnostics.warn("features_degenerate", "one frame goes without its features")
             constructed.drop_features()

@@ -10,16 +10,22 @@ back, and takes a step only if it lowers the cost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.backend.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 
+FloatArray = NDArray[np.float64]
+
 INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e6
+MAX_REPEATED_STEPS = 4
+"""How often a step is repeated at most where it is too large to be linear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +41,23 @@ class Minimum:
     costs: tuple[float, ...]
 
 
-def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None = None) -> Minimum:
+Again = Callable[[SquareRootInformation, FloatArray], bool]
+"""Whether a step (n,) under its posterior asks for one more."""
+
+
+def minimize(
+    cost: Cost,
+    policy: GaussNewtonPolicy,
+    linear: Linearization | None = None,
+    again: Again | None = None,
+) -> Minimum:
     """Take steps on a cost.
 
     Args:
         cost: moved in place: its state, and its new features.
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
+        again: asks for more steps than the policy has, up to `MAX_REPEATED_STEPS` in all.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
@@ -49,7 +65,7 @@ def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
     layout, costs = cost.layout(), [cost.value()]
-    for step in range(policy.max_steps):
+    for step in range(max(policy.max_steps, MAX_REPEATED_STEPS)):
         if linear is None or step > 0:
             linear = cost.linearize()
         posterior = _system(cost, linear, layout)
@@ -58,6 +74,8 @@ def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
         posterior = posterior.shifted(delta)
         costs.append(cost.value())
         if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
+            break
+        if step + 1 >= policy.max_steps and not (again is not None and again(posterior, delta)):
             break
     return Minimum(posterior, tuple(costs))
 
