@@ -65,19 +65,40 @@ def minimize(
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
     layout, costs = cost.layout(), [cost.value()]
-    for step in range(max(policy.max_steps, MAX_REPEATED_STEPS)):
+    for step in range(policy.max_steps):
         if linear is None or step > 0:
             linear = cost.linearize()
-        posterior = _system(cost, linear, layout)
-        delta = posterior.solution()
-        cost.apply(delta, linear, layout)
-        posterior = posterior.shifted(delta)
+        posterior, delta = _step(cost, linear, layout)
         costs.append(cost.value())
         if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
             break
-        if step + 1 >= policy.max_steps and not (again is not None and again(posterior, delta)):
+    minimum = Minimum(posterior, tuple(costs))
+    return minimum if again is None else _repeated(cost, layout, minimum, delta, again)
+
+
+def _step(
+    cost: Cost, linear: Linearization, layout: Layout
+) -> tuple[SquareRootInformation, FloatArray]:
+    """Move a cost by one step: the posterior, at the new estimates, and the step (n,)."""
+    posterior = _system(cost, linear, layout)
+    delta = posterior.solution()
+    cost.apply(delta, linear, layout)
+    return posterior.shifted(delta), delta
+
+
+def _repeated(
+    cost: Cost, layout: Layout, minimum: Minimum, delta: FloatArray, again: Again
+) -> Minimum:
+    """Take more steps as long as the last one asks for it and they lower the cost."""
+    while len(minimum.costs) <= MAX_REPEATED_STEPS and again(minimum.posterior, delta):
+        before = cost.snapshot()
+        posterior, delta = _step(cost, cost.linearize(), layout)
+        value = cost.value()
+        if not value < minimum.costs[-1]:
+            cost.restore(before)
             break
-    return Minimum(posterior, tuple(costs))
+        minimum = Minimum(posterior, (*minimum.costs, value))
+    return minimum
 
 
 def linearized(cost: Cost) -> SquareRootInformation:
