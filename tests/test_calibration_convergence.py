@@ -151,7 +151,7 @@ def check_consistent(estimate: CalibrationEstimate, true: Rig) -> None:
 def test_each_kind_is_found_alone(kind: str) -> None:
     true = rig(1)
     nominal = wrong(true, (kind,))
-    estimate, _ = calibrate("msckf", nominal, true, (kind,), 8.0)
+    estimate, _ = calibrate("msckf", nominal, true, (kind,), 12.0)
     remaining = left(estimate, nominal, true)
     assert max(remaining.values()) < 0.35, remaining
     check_consistent(estimate, true)

@@ -102,7 +102,7 @@ class Estimator:
             self.costs = minimum.costs
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
-            marginalize_step(window, constructed, minimum.posterior, policy)
+            marginalize_step(window, constructed, minimum, policy)
         self._posterior = minimum.posterior
         return window.current(minimum.posterior)
 

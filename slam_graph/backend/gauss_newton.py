@@ -35,10 +35,12 @@ class Minimum:
     Attributes:
         posterior: over an increment of the final estimates, linearised where the last step was.
         costs: the cost before the first step and after each step that was taken.
+        repeated: whether there were more steps than the policy has, because one was too large.
     """
 
     posterior: SquareRootInformation
     costs: tuple[float, ...]
+    repeated: bool = False
 
 
 Again = Callable[[SquareRootInformation, FloatArray], bool]
@@ -97,7 +99,7 @@ def _repeated(
         if not value < minimum.costs[-1]:
             cost.restore(before)
             break
-        minimum = Minimum(posterior, (*minimum.costs, value))
+        minimum = Minimum(posterior, (*minimum.costs, value), repeated=True)
     return minimum
 
 

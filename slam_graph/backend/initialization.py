@@ -21,7 +21,7 @@ from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, NewFeatures
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
-from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.marginalization import LinearizationPoints, marginalize
 from slam_graph.backend.motion_start import StartWindow, guess_states
 from slam_graph.backend.policies import AlgorithmConfig, GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
@@ -178,8 +178,10 @@ class Initializer:
         last = len(window.frames) - 1
         keep = [L(j) for j in features.tolist()]
         keep += [*self._calibration.keys, *imu_state_keys(last)]
-        policy = self._algorithm.marginalization
-        prior = marginalize(posterior, cost.state, keep, policy.first_estimates)
+        points: LinearizationPoints = "current"
+        if self._algorithm.marginalization.first_estimates:
+            points = "first"
+        prior = marginalize(posterior, cost.state, keep, points)
         start = Window(
             last,
             window.stamps_ns[-1],
