@@ -129,7 +129,11 @@ def load_config(
     tree = ConfigTree({"algorithm": DEFAULT_ALGORITHM})
     if file is not None:
         tree.merge(read_tree(Path(file)))
-    said = {name: value for name, value in options.items() if value is not None}
+    said = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in options.items()
+        if value is not None
+    }
     tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
     changes = [override(text) for text in overrides]
     for change in changes:  # which algorithm comes first: other overrides may reach into it

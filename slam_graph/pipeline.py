@@ -100,7 +100,8 @@ def run(
             state = estimate(estimator, features)
             clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
             if estimator.costs:
-                result.steps.append(features.stamp_ns, estimator.costs)
+                result.steps.append(features.stamp_ns, estimator.costs, estimator.columns)
+            result.innovations.append(features.stamp_ns, estimator.innovations)
             ids, points = estimator.landmarks()
             if state is not None:
                 check_sane(state, config.limits)

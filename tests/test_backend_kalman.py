@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The modules on linear problems against the textbook Kalman filter."""
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -121,6 +122,46 @@ def test_more_steps_do_not_move_a_linear_solution(
         )
     np.testing.assert_allclose(solutions[1][1], solutions[0][1], atol=1e-8)
     np.testing.assert_allclose(solutions[1][0], solutions[0][0], atol=1e-8)
+
+
+def range_factor(state: State, key: int, z: float, sigma: float) -> gtsam.CustomFactor:
+    """A measurement that is not linear: the length of a velocity."""
+
+    def residual(
+        _: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None
+    ) -> FloatArray:
+        v = values.atVector(key)
+        if H is not None:
+            H[0] = (v / np.linalg.norm(v))[None]
+        return np.array([np.linalg.norm(v) - z])
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), [key], residual)
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 5])
+def test_several_steps_are_the_iterated_kalman_update(iterations: int) -> None:
+    """After a prediction, against x⁻ + K (z - h(xᵢ) - H (x⁻ - xᵢ)) with K and H at each xᵢ."""
+    rng = np.random.default_rng(6)
+    state = State()
+    state.insert_imu_state(0, Flight().nav_state(0.0))
+    state.freeze([V(0)])
+    P, Q, F = covariance(rng, 3), covariance(rng, 3), np.eye(3) + 0.2 * rng.normal(size=(3, 3))
+    old = state.first.atVector(V(0))
+    predicted, P = F @ old, F @ P @ F.T + Q
+    state.insert_imu_state(1, replace(Flight().nav_state(0.0), velocity=predicted))
+    transition = np.hstack([-F, np.eye(3)])
+    dynamics = linear_factor(state, [V(0), V(1)], transition, F @ old - predicted, Q)
+    z, sigma = 1.7 * float(np.linalg.norm(predicted)), 0.05
+    prior = gaussian([V(0)], np.zeros(3), np.linalg.inv(F) @ (P - Q) @ np.linalg.inv(F).T)
+    cost = cost_of(state, prior, [dynamics, range_factor(state, V(1), z, sigma)])
+    minimize(cost, GaussNewtonPolicy(max_steps=iterations, tolerance=0.0))
+
+    x = predicted
+    for _ in range(iterations):
+        H = (x / np.linalg.norm(x))[None]
+        K = P @ H.T / (H @ P @ H.T + sigma**2)
+        x = predicted + K[:, 0] * (z - np.linalg.norm(x) - (H @ (predicted - x))[0])
+    np.testing.assert_allclose(state.estimate.atVector(V(1)), x, atol=1e-9)
 
 
 @pytest.mark.parametrize("max_steps", [1, 3])

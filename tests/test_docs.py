@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from slam_graph.config import algorithm_names, load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.pipeline import run
+
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
@@ -71,3 +75,18 @@ def test_every_kind_of_warning_is_explained() -> None:
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"^\| `([a-z_]+)` \|", page, re.MULTILINE))
     assert not kinds - explained
+
+
+def test_the_algorithm_of_the_documents_runs(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```yaml\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 1
+    path = tmp_path / "own.yaml"
+    path.write_text(blocks[0], encoding="utf-8")
+    config = load_config(algorithm=path, overrides=["duration_s=8"])
+    assert config.algorithm not in [
+        load_config(algorithm=name).algorithm for name in algorithm_names()
+    ]
+    result = run(open_dataset("demo"), config)
+    result.check()
+    assert len(result.history) > 100

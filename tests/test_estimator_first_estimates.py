@@ -37,7 +37,9 @@ def claimed_information(estimator: Estimator) -> FloatArray:
     return rows.T @ rows
 
 
-def claims_over_time(name: str, first_estimates: bool, cameras: int) -> list[float]:
+def claims_over_time(
+    name: str, first_estimates: bool, cameras: int, duration_s: float = 3.0
+) -> list[float]:
     """After each frame, the largest factor by which a claim exceeds that of the start."""
     rng = np.random.default_rng(2)
     algorithm: AlgorithmConfig = load_config(
@@ -49,28 +51,29 @@ def claims_over_time(name: str, first_estimates: bool, cameras: int) -> list[flo
     estimator.start(flight.nav_state(0.0, WEAK))
     start = claimed_information(estimator)
     growth = []
-    for packet in packets(flight, mounted, room(250, rng), 6.0, rng):
+    for packet in packets(flight, mounted, room(250, rng), duration_s, rng):
         assert isinstance(packet.frame, FeatureFrame)
         estimator.add_imu(packet.imu)
         assert estimator.add_frame(packet.frame) is not None
         growth.append(float(eigh(claimed_information(estimator), start, eigvals_only=True)[-1]))
     assert estimator.window is not None
     kinds = {chr(gtsam.Symbol(key).chr()) for key in estimator.window.prior.layout.dims}
-    assert kinds == {"x", "v", "b", "l"}
-    assert estimator.window.prior.layout.size > 100
+    assert kinds >= {"x", "v", "b"}
+    assert estimator.window.prior.layout.size > 40
     return growth
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("name", ["msckf", "swf"])
+@pytest.mark.parametrize("name", ["ekf", "iekf", "msckf", "swf", "okvis"])
 def test_with_first_estimates_nothing_unseen_is_claimed(name: str, cameras: int) -> None:
     assert max(claims_over_time(name, True, cameras)) < 1.0 + 1e-6
 
 
 def test_without_first_estimates_the_claims_grow() -> None:
-    growth = claims_over_time("msckf", False, 1)
+    growth = claims_over_time("msckf", False, 1, 6.0)
     assert growth[0] < 1.0 + 1e-6
     assert growth[-1] > 10.0
+    assert claims_over_time("ekf", False, 2)[-1] > 2.0
 
 
 def test_the_dynamics_do_not_see_these_directions() -> None:

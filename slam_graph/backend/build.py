@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.gating import Innovations
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.smoother import SmootherEstimator
 from slam_graph.diagnostics import Diagnostics
@@ -31,6 +32,16 @@ class EstimatorLike(Protocol):
     @property
     def costs(self) -> tuple[float, ...]:
         """The cost before the first step of the last frame and after each; empty if not known."""
+        ...
+
+    @property
+    def columns(self) -> int:
+        """Dimension of the state in the last step that has costs."""
+        ...
+
+    @property
+    def innovations(self) -> Innovations:
+        """How far the last frame was from what was predicted of it."""
         ...
 
     @property

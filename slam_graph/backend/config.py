@@ -15,6 +15,21 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
+class AdaptiveNoiseConfig(Settings):
+    """White noise of the IMU that follows what the images say of it."""
+
+    enabled: bool = True
+    """Whether densities are raised while the images correct the IMU more than they should."""
+    whiteness_s: float = Field(0.5, gt=0)
+    """Time over which corrections are averaged to see whether they keep their direction."""
+    size_s: float = Field(2.0, gt=0)
+    """Time over which their squares are averaged."""
+    response_s: float = Field(1.0, gt=0)
+    """Time in which a variance grows e-fold if squares are twice what they should be."""
+    max_factor: float = Field(30.0, ge=1)
+    """Largest factor on a density."""
+
+
 class NoiseConfig(Settings):
     """Noise of the sensors, where the calibration does not say it."""
 
@@ -22,6 +37,8 @@ class NoiseConfig(Settings):
     """Standard deviation of a feature observation, in pixels."""
     imu_scale: float = Field(1.0, gt=0)
     """Factor on all IMU noise densities of the calibration."""
+    adaptive: AdaptiveNoiseConfig = AdaptiveNoiseConfig()
+    """Noise of the IMU that follows what the images say of it."""
     gravity: float = Field(9.81, gt=0)
     """Magnitude of gravity in m/s²."""
     max_imu_gap_s: float = Field(0.03, gt=0)

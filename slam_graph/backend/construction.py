@@ -11,18 +11,20 @@ first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
+from slam_graph.backend.gating import Gate, Innovations, threshold
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
+from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
@@ -44,6 +46,9 @@ class ConstructedCost:
         moving: those of them whose velocity and bias stay.
         features: ids of the features that stay in the state, ascending.
         leaving: (J,) those of the cost's new features that are used for the last time.
+        keep_lost_features: whether features that leave are put aside for when they are seen again.
+        predicted: what was known of the variables before the images; None if these are left out.
+        innovations: distances of the images from that.
     """
 
     cost: Cost
@@ -52,6 +57,23 @@ class ConstructedCost:
     moving: list[int]
     features: IntArray
     leaving: BoolArray
+    keep_lost_features: bool
+    predicted: SquareRootInformation | None = None
+    innovations: Innovations = field(default_factory=Innovations)
+
+    def innovations_under(self, posterior: SquareRootInformation) -> Innovations:
+        """The innovations with the joint distance of all measurements that entered.
+
+        What they add to the least of the cost is rᵀ (H P Hᵀ + I)⁻¹ r of all of them stacked, with
+        the correlations that they have by their common poses.
+        """
+        if self.predicted is None:
+            return Innovations()
+        joint = posterior.residual - self.predicted.residual
+        known = replace(self.innovations, passed_distance=joint)
+        if known.dof:
+            return known
+        return replace(known, distance=joint, dof=known.passed_dof)  # nothing was gated before
 
     def drop_features(self) -> None:
         """Leave only the prior and the factors."""
@@ -59,7 +81,7 @@ class ConstructedCost:
             new = self.cost.fresh.obs.ids[self.cost.fresh.in_state]
             self.cost.state.remove(L(int(j)) for j in new)
             self.features = self.features[~is_in(self.features, new)]
-        self.cost.tracked = self.cost.fresh = self.linear = None
+        self.cost.tracked = self.cost.fresh = self.linear = self.predicted = None
         self.leaving = np.zeros(0, np.bool_)
 
 
@@ -91,6 +113,8 @@ class CostConstruction:
         if still:
             past = window.past[:-1]
             return self._constructed(window, cost, None, past, window.features, nothing)
+        window.recall_features()
+        cost.prior = window.prior
         past = POSE_CHOICES[self.policy.past_poses](window, self.policy)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
         seen = np.intersect1d(window.features, window.tracks.ids_in(window.frame), True)
@@ -98,15 +122,18 @@ class CostConstruction:
         window.tracks.consume(window.features)
         leaving_frames = [i for i in window.past if i not in past]
         cost.fresh = self._new_features(window, leaving_frames, len(seen))
-        linear = cost.linearize()
-        tracked_ok, fresh_ok = cost.gate(linear, predicted)
-        linear = self._leave_out(window, cost, linear, tracked_ok, fresh_ok)
+        linear = cost.linearize(summed=self.policy.gate == "residual")
+        gate = cost.gate(linear, predicted)
+        linear = self._leave_out(window, cost, linear, gate)
         leaving = self._leaving(window, cost, leaving_frames)
         if self.policy.features != "window":
             # a pose that no unused observation refers to has nothing more to give
             useful = window.tracks.frames()
             past = [i for i in past if i in useful]
-        return self._constructed(window, cost, linear, past, self._in_state(window, cost), leaving)
+        features = self._in_state(window, cost)
+        constructed = self._constructed(window, cost, linear, past, features, leaving)
+        constructed.predicted, constructed.innovations = predicted, gate.innovations
+        return constructed
 
     def _constructed(
         self,
@@ -120,7 +147,27 @@ class CostConstruction:
         count = self.policy.recent_frames - 1
         recent = set(window.past[-count:]) if count else set()
         moving = [i for i in window.moving if i in recent and i in past]
-        return ConstructedCost(cost, linear, past, moving, features, leaving)
+        keep_lost = self.policy.keep_lost_features and window.archive.open
+        return ConstructedCost(cost, linear, past, moving, features, leaving, keep_lost)
+
+    def reject_residuals(self, window: Window, constructed: ConstructedCost) -> None:
+        """Forget the observations that do not fit after the steps, where the gate is on residuals.
+
+        Features that too few others see are left out of what becomes part of the prior.
+        """
+        cost = constructed.cost
+        if self.policy.gate != "residual" or cost.fresh is None:
+            return
+        obs = cost.fresh.obs
+        limit = threshold(np.array([2]), self.config.gating.confidence)[0]
+        fits = cost.squared_errors(obs, cost.fresh.points) < limit
+        window.tracks.forget(obs.rows(~fits))
+        rejected = int(np.sum(~fits))
+        self.diagnostics.counts["observation_rejected_by_gate"] += rejected
+        constructed.innovations = replace(
+            constructed.innovations, tested=len(fits), rejected=rejected
+        )
+        cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
 
     # --- features --------------------------------------------------------------------------------
 
@@ -148,35 +195,35 @@ class CostConstruction:
         self, window: Window, obs: Observations, lasting: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (J, 3) of features, those of the last step where there are, and their worth."""
-        rig = self.rig.at(window.state)
-        poses = rig.poses(window.state.estimate, obs.frames)
-        result = triangulate(rig.renormalized(obs), rig, *poses, self.config.triangulation)
         known_ids, known_points = window.landmarks
-        known = is_in(obs.ids, known_ids)
-        points = result.points.copy()
-        points[known] = known_points[np.searchsorted(known_ids, obs.ids[known])]
-        wide = result.parallax_rad > self.policy.state_feature_parallax_rad
-        return points, result.good & (wide | ~lasting)
+        good = is_in(obs.ids, known_ids)
+        points = np.zeros((len(obs.ids), 3))
+        points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
+        here = window.state.estimate.atPose3(X(window.frame)).translation()
+        # steps may have sent a feature with little parallax to infinity
+        good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
+        if not good.all():
+            new, rig = ~good, self.rig.at(window.state)
+            poses = rig.poses(window.state.estimate, obs.frames)
+            observed = rig.renormalized(obs.subset(new))
+            result = triangulate(observed, rig, *poses, self.config.triangulation)
+            wide = result.parallax_rad > self.policy.state_feature_parallax_rad
+            points[new], good[new] = result.points, result.good & (wide | ~lasting[new])
+        return points, good
 
     def _leave_out(
-        self,
-        window: Window,
-        cost: Cost,
-        linear: Linearization,
-        tracked_ok: BoolArray,
-        fresh_ok: BoolArray,
+        self, window: Window, cost: Cost, linear: Linearization, gate: Gate
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
-        rejected = int(np.sum(~tracked_ok) + np.sum(~fresh_ok))
-        self.diagnostics.counts["feature_rejected_by_gate"] += rejected
+        self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
         if linear.tracked is not None and cost.tracked is not None:
-            cost.tracked = cost.tracked.rows(tracked_ok)
+            cost.tracked = cost.tracked.rows(gate.tracked)
         if linear.fresh is not None and cost.fresh is not None:
-            window.tracks.consume(cost.fresh.obs.ids[~fresh_ok])
-            cost.fresh = cost.fresh.subset(fresh_ok)
+            window.tracks.consume(cost.fresh.obs.ids[~gate.fresh])
+            cost.fresh = cost.fresh.subset(gate.fresh)
             for row in np.flatnonzero(cost.fresh.in_state):
                 cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])
-        return linear.subset(tracked_ok, fresh_ok)
+        return linear.subset(gate.tracked, gate.fresh)
 
     def _in_state(self, window: Window, cost: Cost) -> IntArray:
         """The features that stay in the state: those that are tracked, old and new, or all."""
@@ -185,22 +232,20 @@ class CostConstruction:
             ids = np.unique(cost.tracked.ids[cost.tracked.feature])
         if self.policy.keep_lost_features:
             ids = window.features
+            if window.archive.open:
+                ids = ids[is_in(ids, window.tracks.seen)]
         if cost.fresh is not None:
             ids = np.union1d(ids, cost.fresh.obs.ids[cost.fresh.in_state])
         return ids
 
     def _leaving(self, window: Window, cost: Cost, leaving_frames: Sequence[int]) -> BoolArray:
-        """Which new features (J,) are used for the last time.
-
-        All of them, or those of a keyframe that leaves which are no longer tracked.
-        """
+        """Which new features (J,) become part of the prior: all, or those of a leaving keyframe."""
         if cost.fresh is None:
             return np.zeros(0, np.bool_)
-        ids = cost.fresh.obs.ids
         if self.policy.features != "window":
-            return np.ones(len(ids), np.bool_)
+            return np.ones(len(cost.fresh.points), np.bool_)
+        obs = cost.fresh.obs
         going = [i for i in leaving_frames if i in window.keyframes_before]
-        seen_by_going = np.zeros(len(ids), np.bool_)
-        frames = np.array(cost.fresh.obs.frames)[cost.fresh.obs.frame]
-        seen_by_going[cost.fresh.obs.feature[np.isin(frames, going)]] = True
-        return (seen_by_going & ~is_in(ids, window.tracks.seen)) | cost.fresh.in_state
+        leaving = cost.fresh.in_state.copy()
+        leaving[obs.feature[np.isin(np.array(obs.frames)[obs.frame], going)]] = True
+        return leaving

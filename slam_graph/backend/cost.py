@@ -26,8 +26,9 @@ from slam_graph.backend.feature_factors import (
     robust_loss,
     whiten,
 )
-from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.schur import CondensedFeatures, condense_features
 from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.state import POINT_DIM, State, dims_of, stacked_points
 from slam_graph.backend.tracks import Observations
@@ -61,17 +62,17 @@ class Linearization:
 
     Attributes:
         tracked: observations of the features of the state.
-        fresh: new features, reduced.
+        fresh: new features: their rows apart, as the gate needs them, or summed up.
     """
 
     tracked: WhitenedObservations | None
-    fresh: ReducedFeatures | None
+    fresh: ReducedFeatures | CondensedFeatures | None
 
     def subset(self, tracked: BoolArray, fresh: BoolArray) -> Linearization:
-        """The tracked observations (N,) and new features (J,) that are kept."""
+        """The tracked observations (N,), and of new features (J,) that are apart those, kept."""
         return Linearization(
             self.tracked.subset(tracked) if self.tracked is not None else None,
-            self.fresh.subset(fresh) if self.fresh is not None else None,
+            self.fresh.subset(fresh) if isinstance(self.fresh, ReducedFeatures) else self.fresh,
         )
 
 
@@ -116,8 +117,9 @@ class Cost:
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
         """The prior with only some of the factors and of the new features (J,)."""
-        features = self.fresh.subset(fresh) if self.fresh is not None else None
-        if features is not None:
+        features = None
+        if self.fresh is not None:
+            features = self.fresh.subset(fresh & (self.fresh.obs.counts > 1))
             features = replace(features, obs=features.obs.without_idle_frames())
         return Cost(self.state, self.rig, self.config, self.prior, factors, None, features)
 
@@ -125,7 +127,7 @@ class Cost:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""
         offset = self.state.offset(self.prior.layout)
         total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
-        total += 0.5 * float(self.prior.Rd[-1, -1] ** 2)
+        total += 0.5 * self.prior.residual
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
         if self.tracked is not None and len(self.tracked):
             total += self._loss(self.tracked, None)
@@ -134,22 +136,38 @@ class Cost:
         return total
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
+        errors = np.sqrt(self.squared_errors(obs, points))
+        return float(np.sum(robust_loss(errors, self.config.gating)))
+
+    def squared_errors(self, obs: Observations, points: FloatArray | None) -> FloatArray:
+        """Squared residuals (N,) of observations at the current estimates, in units of σ².
+
+        Args:
+            obs: of features at `points` (J, 3), or of features of the state where these are None.
+            points: in the world.
+        """
         rig = self.rig.at(self.state)
         residuals, _ = rig.residuals(obs, self._geometry(rig, self.state.estimate, obs, points))
-        errors = np.linalg.norm(residuals, axis=1) / self.config.noise.pixel_sigma
-        return float(np.sum(robust_loss(errors, self.config.gating)))
+        squares = np.einsum("ni,ni->n", residuals, residuals)
+        return np.asarray(squares / self.config.noise.pixel_sigma**2, dtype=np.float64)
 
     # --- linearisation -------------------------------------------------------------------------
 
-    def linearize(self) -> Linearization:
-        """Linearise all observations."""
+    def linearize(self, summed: bool = False) -> Linearization:
+        """Linearise all observations.
+
+        Args:
+            summed: whether new features are summed up; else their rows stay apart, as the gate
+                needs them.
+        """
         self.state.relinearize()
         tracked = fresh = None
         if self.tracked is not None and len(self.tracked):
             tracked = self._whitened(self.tracked, None)
         if self.fresh is not None and len(self.fresh.obs):
             whitened = self._whitened(self.fresh.obs, self.fresh.points)
-            fresh = reduce_features(self.fresh.obs, whitened)
+            reduce = condense_features if summed else reduce_features
+            fresh = reduce(self.fresh.obs, whitened)
         return Linearization(tracked, fresh)
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
@@ -218,10 +236,10 @@ class Cost:
 
     # --- gating --------------------------------------------------------------------------------
 
-    def gate(
-        self, linear: Linearization, predicted: SquareRootInformation
-    ) -> tuple[BoolArray, BoolArray]:
-        """Which tracked observations (N,) and new features (J,) pass the χ² test.
+    def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
+        """Which tracked observations and new features pass the χ² test.
+
+        New features that are summed up all pass: they are not told apart before the steps.
 
         Args:
             linear: of this cost.
@@ -229,20 +247,27 @@ class Cost:
         """
         tracked = np.zeros(0, np.bool_)
         fresh = np.zeros(0, np.bool_)
-        confidence = self.config.gating.confidence
+        innovations, confidence = Innovations(), self.config.gating.confidence
         if linear.tracked is not None and self.tracked is not None:
             keys = self.rig.keys_of(self.tracked)
             keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
-            covariance = predicted.covariance_of(keys)
             columns = self._tracked_columns(self.tracked, Layout(dims_of(keys)))
-            P = covariance[columns[:, :, None], columns[:, None, :]]
+            P = predicted.covariance_blocks(keys, columns)
             distance = squared_mahalanobis(linear.tracked.r, linear.tracked.H, P)
-            tracked = distance < threshold(np.array([2]), confidence)[0]
-        if linear.fresh is not None and self.fresh is not None:
+            dof = np.full(len(distance), 2)
+            largest = threshold(dof, confidence)
+            tracked = distance < largest
+            innovations += Innovations.of(distance, dof, largest, tracked)
+        if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
+            fresh = np.ones(len(self.fresh.points), np.bool_)
+            innovations += Innovations.untested(2 * self.fresh.obs.counts - POINT_DIM)
+        elif isinstance(linear.fresh, ReducedFeatures) and self.fresh is not None:
             P = predicted.covariance_of(self.rig.keys_of(self.fresh.obs))
             distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
-            fresh = distance < threshold(linear.fresh.dof, confidence)
-        return tracked, fresh
+            largest = threshold(linear.fresh.dof, confidence)
+            fresh = distance < largest
+            innovations += Innovations.of(distance, linear.fresh.dof, largest, fresh)
+        return Gate(tracked, fresh, innovations)
 
     def _tracked_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
@@ -271,7 +296,7 @@ def _tracked_rows(
 
 
 def _null_space_rows(
-    linear: ReducedFeatures, columns: NDArray[np.intp], layout: Layout
+    linear: ReducedFeatures | CondensedFeatures, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
     """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
     compact = linear.null_space_rows()
@@ -284,7 +309,10 @@ def _null_space_rows(
 
 
 def _new_variable_rows(
-    fresh: NewFeatures, linear: ReducedFeatures, columns: NDArray[np.intp], layout: Layout
+    fresh: NewFeatures,
+    linear: ReducedFeatures | CondensedFeatures,
+    columns: NDArray[np.intp],
+    layout: Layout,
 ) -> FloatArray:
     """The three rows that determine each feature that stays in the state."""
     features = np.flatnonzero(fresh.in_state)

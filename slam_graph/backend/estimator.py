@@ -19,6 +19,7 @@ from slam_graph.backend.calibrated_projection import CalibratedProjection
 from slam_graph.backend.calibration import CalibrationVariables
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.gating import Innovations
 from slam_graph.backend.gauss_newton import Minimum, minimize
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.initialization import Initializer, start_from
@@ -54,6 +55,8 @@ class Estimator:
         window: variables, prior and tracks; None as long as there is no state.
         timings: seconds that each module took in the last step.
         costs: the cost before the first Gauss-Newton step of the last frame and after each.
+        columns: dimension of the state in the last step, with the features that are put aside.
+        innovations: how far the last frame was from what was predicted of it.
     """
 
     def __init__(
@@ -70,6 +73,8 @@ class Estimator:
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
         self.costs: tuple[float, ...] = ()
+        self.columns = 0
+        self.innovations = Innovations()
         self._calibration = CalibrationVariables(rig, self.config.calibration)
         projection = RigProjection(rig)
         if self._calibration.keys:
@@ -79,7 +84,7 @@ class Estimator:
             algorithm.cost, projection, self.config, self.diagnostics
         )
         self._initializer = Initializer(
-            projection, self._propagation.params, algorithm, self.config, self._calibration
+            projection, self._propagation.noise.params(), algorithm, self.config, self._calibration
         )
         self._standstill = StandstillDetector(self.config.zero_velocity)
         self._imu = ImuBuffer()
@@ -100,11 +105,16 @@ class Estimator:
         with self._timed("gauss_newton"):
             minimum = self._minimize(constructed)
             self.costs = minimum.costs
+            self.columns = minimum.posterior.layout.size + window.archive.size
+            self._construction.reject_residuals(window, constructed)
+            self.innovations = constructed.innovations_under(minimum.posterior)
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
             marginalize_step(window, constructed, minimum, policy)
         self._posterior = minimum.posterior
-        return window.current(minimum.posterior)
+        state = window.current(minimum.posterior)
+        self._propagation.learn(state)
+        return state
 
     def _minimize(self, constructed: ConstructedCost) -> Minimum:
         """Take the steps; without the features if these leave something undetermined."""
@@ -164,7 +174,7 @@ class Estimator:
         """
         state = self.window.state if self.window is not None else None
         stamp_ns = self._calibration.stamp(frame.stamp_ns, state, self._imu)
-        self.timings, self.costs = {}, ()
+        self.timings, self.costs, self.innovations = {}, (), Innovations()
         if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)

@@ -69,7 +69,7 @@ def minimize(
     layout, costs = cost.layout(), [cost.value()]
     for step in range(policy.max_steps):
         if linear is None or step > 0:
-            linear = cost.linearize()
+            linear = cost.linearize(summed=True)
         posterior, delta = _step(cost, linear, layout)
         costs.append(cost.value())
         if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
@@ -94,7 +94,7 @@ def _repeated(
     """Take more steps as long as the last one asks for it and they lower the cost."""
     while len(minimum.costs) <= MAX_REPEATED_STEPS and again(minimum.posterior, delta):
         before = cost.snapshot()
-        posterior, delta = _step(cost, cost.linearize(), layout)
+        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
         value = cost.value()
         if not value < minimum.costs[-1]:
             cost.restore(before)
@@ -105,7 +105,7 @@ def _repeated(
 
 def linearized(cost: Cost) -> SquareRootInformation:
     """A cost as a Gaussian over an increment of the current estimates."""
-    return _system(cost, cost.linearize(), cost.layout())
+    return _system(cost, cost.linearize(summed=True), cost.layout())
 
 
 def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInformation:
@@ -117,32 +117,40 @@ def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInfo
 def _levenberg_marquardt(
     cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
 ) -> Minimum:
+    """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
     layout = cost.layout()
-    linear = linear or cost.linearize()
-    system, costs, damping = _system(cost, linear, layout), [cost.value()], INITIAL_DAMPING
-    for _ in range(policy.max_steps):
+    linear = linear or cost.linearize(summed=True)
+    system, costs, damping = _system(cost, linear, layout), [cost.value()], 0.0
+    for left in reversed(range(policy.max_steps)):
         delta = _damped(system, damping).solution()
         before = cost.snapshot()
         cost.apply(delta, linear, layout)
         value = cost.value()
         if not value < costs[-1]:
             cost.restore(before)
-            damping *= 10.0
-            if damping > MAX_DAMPING:
+            if _promised(system) < policy.tolerance * costs[-1] or damping > MAX_DAMPING:
                 break
+            damping = max(10.0 * damping, INITIAL_DAMPING)
             continue
         gain = costs[-1] - value
         costs.append(value)
-        linear = cost.linearize()
+        if left == 0 or max(gain, 0.0 if damping else _promised(system)) < policy.tolerance * value:
+            return Minimum(system.shifted(delta), tuple(costs))
+        linear = cost.linearize(summed=True)
         system = _system(cost, linear, layout)
-        damping = max(0.1 * damping, 1e-9)
-        if gain < policy.tolerance * value:
-            break
+        damping = 0.1 * damping if damping > INITIAL_DAMPING else 0.0
     return Minimum(system, tuple(costs))
+
+
+def _promised(system: SquareRootInformation) -> float:
+    """By how much the linearised cost falls from no step to the best one."""
+    return 0.5 * float(system.d @ system.d)
 
 
 def _damped(system: SquareRootInformation, damping: float) -> SquareRootInformation:
     """The system with rows that pull every increment to zero, in proportion to its curvature."""
+    if damping == 0.0:
+        return system
     n = system.layout.size
     rows = np.zeros((n, n + 1))
     np.fill_diagonal(rows, np.sqrt(damping) * np.linalg.norm(system.R, axis=0))

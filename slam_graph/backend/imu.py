@@ -27,7 +27,11 @@ INTEGRATION_SIGMA = 1e-5
 
 
 def preintegration_params(
-    noise: ImuNoise, gravity: float, scale: float = 1.0
+    noise: ImuNoise,
+    gravity: float,
+    scale: float = 1.0,
+    gyro_scale: float = 1.0,
+    accel_scale: float = 1.0,
 ) -> gtsam.PreintegrationCombinedParams:
     """GTSAM's parameters for an IMU.
 
@@ -35,11 +39,13 @@ def preintegration_params(
         noise: continuous-time densities.
         gravity: magnitude in m/s²; the world's z axis points up.
         scale: factor on all densities.
+        gyro_scale: factor on the white noise of the gyroscope.
+        accel_scale: factor on that of the accelerometer.
     """
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     eye = np.eye(3)
-    params.setGyroscopeCovariance(eye * (scale * noise.gyro_noise_density) ** 2)
-    params.setAccelerometerCovariance(eye * (scale * noise.accel_noise_density) ** 2)
+    params.setGyroscopeCovariance(eye * (scale * gyro_scale * noise.gyro_noise_density) ** 2)
+    params.setAccelerometerCovariance(eye * (scale * accel_scale * noise.accel_noise_density) ** 2)
     params.setBiasOmegaCovariance(eye * (scale * noise.gyro_random_walk) ** 2)
     params.setBiasAccCovariance(eye * (scale * noise.accel_random_walk) ** 2)
     params.setIntegrationCovariance(eye * INTEGRATION_SIGMA**2)

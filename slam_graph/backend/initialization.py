@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from slam_graph.backend.calibration import CalibrationVariables
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, NewFeatures
+from slam_graph.backend.feature_factors import ReducedFeatures
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
 from slam_graph.backend.marginalization import LinearizationPoints, marginalize
@@ -268,6 +269,6 @@ class Initializer:
 def _normalized_cost(cost: Cost) -> float:
     """Mean squared residual of the features that do not depend on their positions."""
     fresh = cost.linearize().fresh
-    if fresh is None:
+    if not isinstance(fresh, ReducedFeatures):
         return float("inf")
     return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)

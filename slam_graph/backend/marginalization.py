@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from slam_graph.backend.archive import FeatureArchive
 from slam_graph.backend.construction import ConstructedCost
 from slam_graph.backend.gauss_newton import Minimum, linearized
 from slam_graph.backend.policies import MarginalizationPolicy
@@ -49,10 +50,11 @@ def marginalize_step(
         posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
         window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
     _keep_landmarks(window, constructed)
+    archive = window.archive if constructed.keep_lost_features else None
     points: LinearizationPoints = "first" if policy.first_estimates else "current"
     if policy.first_estimates and minimum.repeated:
         points = "corrected"
-    window.prior = marginalize(posterior, window.state, keep, points)
+    window.prior = marginalize(posterior, window.state, keep, points, archive)
     window.past, window.moving = list(constructed.past), list(constructed.moving)
     window.features = constructed.features
     window.tracks.retain([*constructed.past, window.frame])
@@ -75,6 +77,7 @@ def marginalize(
     state: State,
     keep: Sequence[int],
     points: LinearizationPoints,
+    archive: FeatureArchive | None = None,
 ) -> SquareRootInformation:
     """Eliminate all variables but `keep` and make the rest the prior of the next step.
 
@@ -87,13 +90,18 @@ def marginalize(
         points: where the variables that stay are linearised from now on: where the prior was made
             (first-estimates Jacobians), at their estimates, or there without the prior gaining
             information about what no measurement sees.
+        archive: gets what the variables that leave are, given those that stay.
 
     Returns:
         The prior as a function of the offsets of the estimates from their linearisation points.
     """
     staying = set(keep)
-    prior = posterior.marginal([key for key in keep if key in posterior.layout])
+    conditional, prior = posterior.divided([key for key in keep if key in posterior.layout])
+    if archive is not None:
+        archive.put(conditional, state)
     state.remove([key for key in state.variables() if key not in staying])
+    if points != "first" and archive is not None:
+        archive.follow(state)
     if points == "current":
         state.rebase()
     elif points == "corrected":

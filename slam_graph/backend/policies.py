@@ -27,9 +27,10 @@ class CostPolicy(Settings):
     features: Literal["once", "state", "window"] = "once"
     """What becomes of a feature that is not held in the state. once: used when its track ends, with
     all its observations, and marginalised at once. state: never used, only features of the state
-    count. window: in the cost of every step as long as poses that saw it are."""
+    count. window: in the cost of every step until a keyframe that saw it leaves; then it becomes
+    part of the prior, and starts anew if it is still tracked."""
     keep_lost_features: bool = False
-    """Whether features of the state stay in it when they are no longer tracked."""
+    """Whether features of the state that are no longer tracked are kept for when they come back."""
     max_state_features: int | None = Field(40, ge=0)
     """How many features are held in the state while they are tracked; null for no bound."""
     state_feature_frames: int = Field(10, ge=2)
@@ -38,6 +39,10 @@ class CostPolicy(Settings):
     """… and the largest angle between its first ray and any other must be this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
+    gate: Literal["prediction", "residual"] = "prediction"
+    """How wrong features outside the state are found. prediction: before the steps, by the χ² test
+    of their whole tracks against the predicted covariance. residual: after the steps, by that of
+    the residual of each observation; one that fails is never used again."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
     keyframe_motion: float = Field(0.05, ge=0)

@@ -4,20 +4,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 from gtsam.symbol_shorthand import B
 
+from slam_graph.backend.adaptive_noise import DynamicsNoise, predicted_covariance
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.imu import (
     ImuBuffer,
     imu_factor,
     predict,
     preintegrate,
-    preintegration_params,
 )
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import zero_velocity_factors
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.rig import ImuNoise
 
 
@@ -25,17 +28,15 @@ class Propagation:
     """Appends a new frame to a window by the dynamics model.
 
     Attributes:
-        params: of the preintegration.
+        noise: of the IMU, which is learned on the way.
     """
 
     def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
         self.config = config
         self.diagnostics = diagnostics
-        noise = config.noise
-        self.params = preintegration_params(imu, noise.gravity, noise.imu_scale)
-        self._gap_params = preintegration_params(
-            imu, noise.gravity, noise.imu_scale * noise.imu_gap_scale
-        )
+        self.noise = DynamicsNoise(imu, config.noise)
+        self._last: NavState | None = None
+        self._predicted: NavState | None = None
 
     def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
         """Make a new frame the current one.
@@ -52,13 +53,33 @@ class Propagation:
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.estimate.atConstantBias(B(i))
         pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
-        window.state.insert_imu_state(j, predict(previous, pim, stamp_ns))
+        predicted = predict(previous, pim, stamp_ns)
+        window.state.insert_imu_state(j, predicted)
         window.past.append(i)
         window.moving.append(i)
         window.frame, window.stamp_ns = j, stamp_ns
-        window.factors.append(imu_factor(i, j, pim))
+        factor = imu_factor(i, j, pim)
+        window.factors.append(factor)
+        self._predicted = None if still else self._with_covariance(predicted, factor, window)
         if still:
             window.factors += zero_velocity_factors(i, j, self.config.zero_velocity)
+
+    def _with_covariance(
+        self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window
+    ) -> NavState | None:
+        """A prediction from the last state, with its covariance where that is known."""
+        last = self._last
+        if last is None or last.covariance is None:
+            return None
+        covariance = predicted_covariance(factor, window.state.estimate, last.covariance)
+        return replace(predicted, covariance=covariance)
+
+    def learn(self, state: NavState) -> None:
+        """Learn the noise of the IMU from what a step made of the last prediction."""
+        if self._last is not None and self._predicted is not None:
+            dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
+            self.noise.learn(self._predicted, state, dt_s)
+        self._last = state
 
     def _params(
         self, imu: ImuBuffer, start_ns: int, end_ns: int
@@ -66,6 +87,6 @@ class Propagation:
         """Noise of the IMU, much larger where samples are missing."""
         gap_s = imu.largest_gap_s(start_ns, end_ns)
         if gap_s <= self.config.noise.max_imu_gap_s:
-            return self.params
+            return self.noise.params()
         self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
-        return self._gap_params
+        return self.noise.params(self.config.noise.imu_gap_scale)

@@ -124,12 +124,14 @@ class RigProjection:
         """
         in_body = self.in_body(obs, at)
         by_camera_point = self.by_camera_point(obs, self.in_camera(obs, in_body))
-        by_body_point = by_camera_point @ self.body_R_camera[obs.camera].transpose(0, 2, 1)
+        camera_R_body = np.ascontiguousarray(self.body_R_camera.transpose(0, 2, 1))
+        by_body_point = by_camera_point @ camera_R_body[obs.camera]
         by_pose = np.empty((len(obs), 2, 6))
         # rotating the body by θ moves the point by p × θ in the body frame
         by_pose[:, :, :3] = np.cross(by_body_point, in_body[:, None, :])
         by_pose[:, :, 3:] = -by_body_point
-        by_point = by_body_point @ at.rotations[obs.frame].transpose(0, 2, 1)
+        body_R_world = np.ascontiguousarray(at.rotations.transpose(0, 2, 1))
+        by_point = by_body_point @ body_R_world[obs.frame]
         return by_pose, by_point
 
     def by_camera_point(self, obs: Observations, in_camera: FloatArray) -> FloatArray:

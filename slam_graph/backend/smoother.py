@@ -80,7 +80,9 @@ class SmootherEstimator(Estimator):
         with self._timed("smoother"):
             self._solve(window, ahead, new)
         with self._timed("covariance"):
-            return self._advance(window, ahead, predicted)
+            state = self._advance(window, ahead, predicted)
+        self._propagation.learn(state)
+        return state
 
     def _predicted(self, ahead: Window) -> NavState:
         """The new state and its covariance before any image is used."""
@@ -106,7 +108,9 @@ class SmootherEstimator(Estimator):
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)
         assert predicted.covariance is not None
-        return self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        new = self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        self.innovations = self._features.innovations
+        return new
 
     # --- the smoother ----------------------------------------------------------------------------
 

@@ -56,6 +56,51 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Conditional:
+    """What some variables are given others: the cost ‖R δ_gone + S δ_given - d‖².
+
+    Attributes:
+        gone: columns of the variables that it determines, `w` in all.
+        given: columns of the others.
+        rows: (w, w + n + 1) [R S d], R upper triangular.
+    """
+
+    gone: Layout
+    given: Layout
+    rows: FloatArray
+
+    @staticmethod
+    def nothing() -> Conditional:
+        """Of no variables."""
+        return Conditional(Layout({}), Layout({}), np.zeros((0, 1)))
+
+    @property
+    def layouts(self) -> tuple[Layout, Layout]:
+        """`gone` and `given`."""
+        return self.gone, self.given
+
+    @property
+    def keys(self) -> list[int]:
+        """Keys of all variables, in the order of the columns."""
+        return [*self.gone.dims, *self.given.dims]
+
+    def solution(self, given: FloatArray) -> FloatArray:
+        """The δ_gone (w,) of least cost where the others are at `given` (n,).
+
+        Raises:
+            numpy.linalg.LinAlgError: if some direction is not determined.
+        """
+        w = self.gone.size
+        return _solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
+
+    def shifted(self, delta: FloatArray) -> Conditional:
+        """The same as a function of δ - delta, delta (w + n,) over `gone` and `given`."""
+        rows = self.rows.copy()
+        rows[:, -1] -= self.rows[:, :-1] @ delta
+        return Conditional(self.gone, self.given, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SquareRootInformation:
     """The Gaussian ‖R δ - d‖² over the variables of a layout.
 
@@ -82,6 +127,11 @@ class SquareRootInformation:
     def d(self) -> FloatArray:
         """(n,) right-hand side."""
         return self.Rd[:-1, -1]
+
+    @property
+    def residual(self) -> float:
+        """The part of the cost that no δ can remove."""
+        return float(self.Rd[-1, -1] ** 2)
 
     def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
         """The same Gaussian with further variables of which nothing is known."""
@@ -128,10 +178,7 @@ class SquareRootInformation:
         Raises:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
-        x, info = lapack.dtrtrs(self.R, self.d)
-        if info != 0 or not np.all(np.isfinite(x)):
-            raise np.linalg.LinAlgError("the cost does not determine all of its variables")
-        return np.asarray(x, dtype=np.float64)
+        return _solved(self.R, self.d)
 
     def covariance(self) -> FloatArray:
         """The (n, n) covariance R⁻¹ R⁻ᵀ."""
@@ -140,6 +187,24 @@ class SquareRootInformation:
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The covariance of some variables only, in the order given."""
+        root = self._root_covariance_of(keys)
+        return np.asarray(root.T @ root, dtype=np.float64)
+
+    def covariance_blocks(self, keys: Sequence[int], columns: NDArray[np.intp]) -> FloatArray:
+        """Small blocks of the covariance of some variables, without forming the whole.
+
+        Args:
+            keys: the variables.
+            columns: (N, k) places in their stacked tangent.
+
+        Returns:
+            (N, k, k) the covariance of each row of `columns`.
+        """
+        root = np.ascontiguousarray(self._root_covariance_of(keys).T)[columns]
+        return np.asarray(root @ root.transpose(0, 2, 1), dtype=np.float64)
+
+    def _root_covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """Rows (m, k) of R⁻ᵀ, the columns of the variables; zero rows are left out."""
         columns = self.layout.indices(keys)
         first = int(columns.min(initial=self.layout.size))
         right = np.zeros((self.layout.size - first, len(columns)), order="F")
@@ -147,7 +212,7 @@ class SquareRootInformation:
         root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
-        return np.asarray(root.T @ root, dtype=np.float64)
+        return np.asarray(root, dtype=np.float64)
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
@@ -158,68 +223,87 @@ class SquareRootInformation:
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
+        return self.divided(keep)[1]
+
+    def divided(self, keep: Sequence[int]) -> tuple[Conditional, SquareRootInformation]:
+        """The conditional of all variables but `keep` given these, and the marginal over `keep`.
+
+        What changes its order goes through one QR. The rows of variables that stand before it are
+        worked on in blocks, with the rows that determine the eliminated variables carried upwards.
+        That costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
+        """
         staying = set(keep)
-        gone = [k for k in self.layout.dims if k not in staying]
-        layout = Layout({k: self.layout.dims[k] for k in keep})
-        width = self.layout.size - layout.size
-        first = self._unmoved(keep)
-        order = self.layout.indices([*gone, *keep])
-        order = np.append(np.concatenate([order[:width], order[width + first :]]), -1)
-        tail = triangularize(self.Rd[first:, order])
-        Rd = np.zeros((layout.size + 1, layout.size + 1), order="F")
-        Rd[first:, first:] = tail[width:, width:]
-        _eliminate_behind(Rd, self.Rd[:first], order[:width], order[width:], tail[:width])
-        return SquareRootInformation(layout, Rd)
+        gone = Layout({k: d for k, d in self.layout.dims.items() if k not in staying})
+        kept = Layout({k: self.layout.dims[k] for k in keep})
+        Rd = np.zeros((kept.size + 1, kept.size + 1), order="F")
+        order = np.append(self.layout.indices([*gone.dims, *keep]), self.layout.size)
+        lead, w = self._unmoved(keep), gone.size
+        lead_gone = int(np.searchsorted(order[:w], lead))
+        top = lead - lead_gone  # the rows of the marginal that come from the leading ones
+        tail = np.r_[lead_gone:w, w + top : len(order)]
+        triangle = triangularize(self.Rd[lead:, order[tail]])
+        Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
+        carried = np.zeros((w - lead_gone, len(order)))
+        carried[:, tail] = triangle[: w - lead_gone]
+        if w == 0:
+            Rd[:lead] = self.Rd[:lead, order]
+        else:
+            carried = _eliminate_behind(Rd, self.Rd[:lead, order], order[:w], carried)
+        return Conditional(gone, kept, carried), SquareRootInformation(kept, Rd)
 
     def _unmoved(self, keep: Sequence[int]) -> int:
-        """How many leading columns stay where they are."""
-        columns = 0
-        for mine, kept in zip(self.layout.dims, keep, strict=False):
-            if mine != kept:
-                break
-            columns += self.layout.dims[mine]
+        """How many leading columns are of variables that leave, or stay in their order."""
+        staying, place, columns = set(keep), 0, 0
+        for mine, dim in self.layout.dims.items():
+            if mine in staying:
+                if keep[place] != mine:
+                    break
+                place += 1
+            columns += dim
         return columns
 
 
 def _eliminate_behind(
-    Rd: FloatArray,
-    rows: FloatArray,
-    gone: NDArray[np.intp],
-    others: NDArray[np.intp],
-    conditional: FloatArray,
-) -> None:
-    """Eliminate variables from the rows of others that stand before them.
+    Rd: FloatArray, rows: FloatArray, gone: NDArray[np.intp], carried: FloatArray
+) -> FloatArray:
+    """Eliminate variables from rows of a triangle, block by block from the bottom up.
 
-    The rows that determine the eliminated variables are carried upwards, block by block: a rotation
-    with each block takes the eliminated columns out of it, another restores its triangle. That
-    costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
+    A rotation with each block takes the eliminated columns out of it, another restores its
+    triangle.
 
     Args:
-        Rd: gets the result in its first rows.
-        rows: (n, …) the rows [R d] of the variables that stand before.
-        gone: columns of the eliminated variables in `rows`.
-        others: columns behind that stay, the right-hand side included.
-        conditional: (w, w + …) triangular rows over the eliminated columns and the others.
+        Rd: gets the rows without the eliminated variables as its first ones.
+        rows: (n, w + …) the leading rows of the triangle, with the w eliminated columns first.
+        gone: (w,) where these columns stood in the triangle, ascending.
+        carried: (w', w + …) rows that determine those of them that stood behind the leading rows.
+
+    Returns:
+        (w, w + …) rows that determine all of them.
     """
-    n, w = len(rows), len(gone)
-    if n == 0:
-        return
-    carried = np.hstack([conditional[:, :w], np.zeros((w, n)), conditional[:, w:]])
-    for start in range((n - 1) // ROWS_AT_ONCE * ROWS_AT_ONCE, -1, -ROWS_AT_ONCE):
-        stop = min(start + ROWS_AT_ONCE, n)
-        block = rows[start:stop]
-        stacked = np.vstack(
-            [
-                np.hstack([carried[:, :w], carried[:, w + start :]]),
-                np.hstack([block[:, gone], block[:, start:n], block[:, others]]),
-            ]
-        )
-        Q, R = np.linalg.qr(stacked[:, :w], mode="complete")
-        stacked = Q.T @ stacked[:, w:]
-        carried = np.hstack([R[:w], np.zeros((w, start)), stacked[:w]])
-        Q, _ = np.linalg.qr(stacked[w:, : stop - start])
-        Rd[start:stop, start:] = Q.T @ stacked[w:]
-        Rd[start:stop, start:stop] = np.triu(Rd[start:stop, start:stop])
+    w, width = len(gone), rows.shape[1]
+    for stop in range(len(rows), 0, -ROWS_AT_ONCE):
+        start = max(stop - ROWS_AT_ONCE, 0)
+        before, upto = np.searchsorted(gone, [start, stop])
+        first, last = start - before, stop - upto  # rows of the result
+        stacked = np.vstack([carried, rows[start:stop]])
+        Q, R = np.linalg.qr(stacked[:, before:w], mode="complete")
+        others = Q.T @ stacked[:, w + first :]
+        carried = np.zeros((w - before, width))
+        carried[:, before:w], carried[:, w + first :] = R[: w - before], others[: w - before]
+        Q, _ = np.linalg.qr(others[w - before :, : last - first], mode="complete")
+        Rd[first:last, first:] = Q.T @ others[w - before :]
+        Rd[first:last, first:last] = np.triu(Rd[first:last, first:last])
+    return carried
+
+
+def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
+    """The solution of R x = d for an upper triangular R."""
+    if len(d) == 0:
+        return np.zeros(0)
+    x, info = lapack.dtrtrs(R, d)
+    if info != 0 or not np.all(np.isfinite(x)):
+        raise np.linalg.LinAlgError("the cost does not determine all of its variables")
+    return np.asarray(x, dtype=np.float64)
 
 
 def triangularize(Ab: FloatArray) -> FloatArray:

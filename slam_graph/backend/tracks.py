@@ -132,6 +132,20 @@ class TrackWindow:
         if len(ids):
             self._select(~is_in(self._ids, ids))
 
+    def forget(self, obs: Observations) -> None:
+        """Forget single observations."""
+        if len(obs):
+            frames = np.array(obs.frames)[obs.frame]
+            key = self._key(obs.ids[obs.feature], frames, obs.camera)
+            self._select(~np.isin(self._key(self._ids, self._frames, self._cameras), key))
+
+    def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
+        """A number (N,) for each observation that no other one has."""
+        first = self._frames.min(initial=0)
+        span = self._frames.max(initial=0) - first + 1
+        count = self._cameras.max(initial=0) + 1
+        return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
+
     def _select(self, rows: NDArray[np.bool_]) -> None:
         if rows.all():
             return

@@ -12,6 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
+from slam_graph.backend.archive import FeatureArchive
 from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.tracks import TrackWindow, is_in
@@ -45,6 +46,7 @@ class Window:
         keyframes_before: the same before this step's choice of poses.
         factors: GTSAM's factors that are not part of the prior yet.
         features: ids (N,) of the features in the state, ascending.
+        archive: the features that were in the state and are known although they are not seen.
         landmarks: ids (N,) and world positions (N, 3) of the features that are in the cost without
             being in the state.
         used: the same of all features that the last step estimated outside the state.
@@ -62,6 +64,7 @@ class Window:
     keyframes_before: set[int] = field(default_factory=set)
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
     features: IntArray = field(default_factory=_no_ids)
+    archive: FeatureArchive = field(default_factory=FeatureArchive)
     landmarks: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
     used: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
     calibration: tuple[int, ...] = ()
@@ -69,13 +72,15 @@ class Window:
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
         """Keys of some features, the calibration, past poses and past and current IMU states.
 
-        They are in this order, and features that are no longer tracked come first, as they were:
-        what no new measurement touches stands to the left, where an update need not go.
+        They are in this order, and features that are no longer tracked come first, the others after
+        them as they were: what no new measurement touches stands to the left, where an update need
+        not go, and what does not change its place is cheap to keep.
         """
         tracked = is_in(features, self.tracks.seen)
-        lost = {L(int(j)) for j in features[~tracked]}
+        lost, live = ({L(int(j)) for j in features[rows]} for rows in (~tracked, tracked))
         keys = [key for key in self.prior.layout.dims if key in lost]
-        keys += [L(int(j)) for j in features[tracked]]
+        keys += [key for key in self.prior.layout.dims if key in live]
+        keys += sorted(live.difference(self.prior.layout.dims))
         keys += self.calibration
         keys += [X(i) for i in past if i not in moving]
         for i in (*moving, self.frame):
@@ -96,3 +101,10 @@ class Window:
             np.concatenate([self.features, ids[other]]),
             np.concatenate([in_state, points[other]]),
         )
+
+    def recall_features(self) -> None:
+        """Make variables again of the features that the current frame sees and the archive has."""
+        again = self.archive.due(self.tracks.seen)
+        if len(again):
+            self.prior = self.archive.recall(again, self.prior, self.state)
+            self.features = np.union1d(self.features, again)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,6 +96,7 @@ def state_lines(history: StateHistory) -> Iterator[str]:
     trajectory = history.trajectory()
     parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
     rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
-    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
-        cells = ("" if np.isnan(value) else f"{value:.9g}" for value in row)
+    # row by row: lists of all of them would take several times the memory of the arrays
+    for stamp_ns, row in zip(trajectory.stamps_ns, rows, strict=True):
+        cells = ("" if math.isnan(value) else f"{value:.9g}" for value in row.tolist())
         yield ",".join([str(stamp_ns), *cells]) + "\n"

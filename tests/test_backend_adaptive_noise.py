@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive noise: found where the IMU is worse than its calibration, left alone elsewhere."""
+
+import numpy as np
+import pytest
+
+from slam_graph.backend.adaptive_noise import DensityScale
+from slam_graph.backend.config import AdaptiveNoiseConfig
+from slam_graph.config import load_config
+from slam_graph.evaluation.consistency import nees
+from slam_graph.pipeline import run
+from slam_graph.simulation.config import SimulationConfig
+from slam_graph.simulation.simulator import simulate
+
+DT_S = 0.05
+COVARIANCE = np.array([[2.0, 0.4, 0.0], [0.4, 1.0, -0.3], [0.0, -0.3, 0.5]])
+
+
+def factors(corrections: np.ndarray) -> np.ndarray:
+    """The factor after each of some corrections (N, 3), whose covariance is said to be as above."""
+    scale = DensityScale(AdaptiveNoiseConfig())
+    history = []
+    for correction in corrections:
+        scale.observe(correction, COVARIANCE, DT_S)
+        history.append(scale.factor)
+    return np.array(history)
+
+
+def corrections(persistence: float, size: float) -> np.ndarray:
+    """A first-order Markov sequence (4000, 3) with the covariance above times `size` squared."""
+    rng = np.random.default_rng(5)
+    white = rng.normal(size=(4000, 3)) @ np.linalg.cholesky(COVARIANCE).T * size
+    values = np.zeros_like(white)
+    for k in range(1, len(white)):
+        values[k] = persistence * values[k - 1] + np.sqrt(1.0 - persistence**2) * white[k]
+    return values
+
+
+def test_white_corrections_of_the_right_size_leave_the_densities_alone() -> None:
+    history = factors(corrections(0.0, 1.0))
+    assert history.mean() < 1.03
+    assert history.max() < 1.5
+
+
+def test_corrections_that_are_only_persistent_or_only_large_leave_them_alone() -> None:
+    assert factors(corrections(0.95, 0.6)).mean() < 1.1  # images whose errors last
+    assert factors(np.tile([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], (500, 1))).mean() < 1.1
+
+
+def test_large_and_persistent_corrections_raise_them_and_they_fall_back() -> None:
+    history = factors(np.concatenate([corrections(0.9, 2.0)[:200], corrections(0.0, 1.0)]))
+    assert history[200] > 3.0
+    assert history[1000:].mean() < 1.03
+
+
+def mean_nees(noise_scale: float, adaptive: bool) -> float:
+    """Of the poses (6 is ideal) of a simulated flight with noisier samples than calibrated."""
+    flight = {"duration_s": 15.0, "seed": 3, "imu": {"noise_scale": noise_scale}}
+    overrides = [
+        f"backend.noise.adaptive.enabled={adaptive}",
+        "backend.initialization.mode=given",
+        "cameras=2",
+    ]
+    sequence = simulate(SimulationConfig(**flight, tracks={"features": 40}))
+    result = run(sequence, load_config(algorithm="msckf", overrides=overrides))
+    truth = sequence.groundtruth()
+    assert truth is not None
+    history = result.history
+    values = nees(history.trajectory(), history.pose_covariances(), truth)
+    return float(values.pose.mean())
+
+
+def test_an_imu_much_noisier_than_its_calibration_is_found_out() -> None:
+    believing = mean_nees(12.0, adaptive=False)
+    learning = mean_nees(12.0, adaptive=True)
+    assert learning < 0.35 * believing
+
+
+def test_nothing_changes_where_the_calibration_is_right() -> None:
+    believing = mean_nees(1.0, adaptive=False)
+    learning = mean_nees(1.0, adaptive=True)
+    assert learning == pytest.approx(believing, rel=0.1)

@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features that are put aside and recalled are what they would be had they always stayed."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, V, X
+
+from slam_graph.backend.archive import FeatureArchive
+from slam_graph.backend.marginalization import LinearizationPoints, marginalize
+from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.state import State, dims_of, imu_state_keys
+from slam_graph.geometry.trajectory import NavState
+
+FEATURES = 6
+STEPS = 9
+
+
+class Filter:
+    """A filter on random rows, with features that leave put aside or held on to."""
+
+    def __init__(self, archive: bool, points: LinearizationPoints) -> None:
+        self.state = State()
+        self.archive = FeatureArchive()
+        self.put_aside, self.points = archive, points
+        self.prior = SquareRootInformation.empty()
+        self.tracked: set[int] = set()
+        self.kept: list[int] = []
+
+    def step(self, frame: int, tracked: set[int], rng: np.random.Generator) -> None:
+        """A new frame and new features, random measurements of them, and all else leaves."""
+        self.state.insert_imu_state(frame, NavState(frame, gtsam.Pose3(), *np.zeros((3, 3)), None))
+        again = self.archive.due(np.array(sorted(tracked)))
+        if len(again):
+            self.prior = self.archive.recall(again, self.prior, self.state)
+        keys = [*imu_state_keys(frame), *(L(j) for j in sorted(tracked))]
+        for j in sorted(tracked):
+            if L(j) not in self.state.offsets:
+                self.state.insert_point(j, np.zeros(3))
+        old = [X(frame - 1), V(frame - 1), B(frame - 1)] if frame else []
+        measured = dims_of([*old, *keys])
+        rows = rng.normal(size=(40, sum(measured.values()) + 1)) * 0.1
+        estimate = self.prior.shifted(self.state.offset(self.prior.layout))
+        joint = estimate.extended({k: d for k, d in measured.items() if k not in estimate.layout})
+        Ab = np.zeros((len(rows), joint.layout.size + 1))
+        Ab[:, np.append(joint.layout.indices(measured), joint.layout.size)] = rows
+        posterior = joint.updated(Ab)
+        delta = posterior.solution()
+        self.state.update(posterior.layout, delta)
+        features = [k for k in posterior.layout.dims if gtsam.Symbol(k).chr() == ord("l")]
+        if self.put_aside:
+            features = [k for k in features if gtsam.Symbol(k).index() in tracked]
+        self.prior = marginalize(
+            posterior.shifted(delta),
+            self.state,
+            [*features, *imu_state_keys(frame)],
+            self.points,
+            self.archive if self.put_aside else None,
+        )
+
+
+@pytest.mark.parametrize("points", ["first", "current"])
+@pytest.mark.parametrize("seed", range(4))
+def test_put_aside_and_recalled_is_held_on_to(seed: int, points: LinearizationPoints) -> None:
+    rng = np.random.default_rng(seed)
+    archive, joint = (Filter(aside, points) for aside in (True, False))
+    for frame in range(STEPS):
+        tracked = set(rng.choice(FEATURES, rng.integers(1, 4), replace=False).tolist())
+        for one in (archive, joint):
+            one.step(frame, tracked, np.random.default_rng([seed, frame]))
+        keys = list(archive.prior.layout.dims)
+        np.testing.assert_allclose(
+            archive.prior.covariance_of(keys), joint.prior.covariance_of(keys), rtol=1e-7, atol=1e-9
+        )
+        for j in tracked:
+            np.testing.assert_allclose(
+                archive.state.estimate.atPoint3(L(j)),
+                joint.state.estimate.atPoint3(L(j)),
+                atol=1e-7,
+            )
+    seen = {gtsam.Symbol(k).index() for k in joint.prior.layout.dims if k != X(STEPS - 1)}
+    assert len(archive.archive) > 0
+    assert len(seen) > len(tracked)
