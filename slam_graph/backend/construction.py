@@ -207,8 +207,9 @@ class CostConstruction:
             poses = rig.poses(window.state.estimate, obs.frames)
             observed = rig.renormalized(obs.subset(new))
             result = triangulate(observed, rig, *poses, self.config.triangulation)
-            wide = result.parallax_rad > self.policy.state_feature_parallax_rad
-            points[new], good[new] = result.points, result.good & (wide | ~lasting[new])
+            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
+            known = noise * result.depth_error < self.policy.state_feature_depth_error
+            points[new], good[new] = result.points, result.good & (known | ~lasting[new])
         return points, good
 
     def _leave_out(
