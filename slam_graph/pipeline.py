@@ -107,6 +107,8 @@ def run(
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
+            if state is not None and estimator.calibration is not None:
+                result.calibration.append(estimator.calibration)
             result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
             recorder.write(packet.imu, features)
             progress.advance(features.stamp_ns, estimator.initialized)

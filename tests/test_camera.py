@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the camera models: inverses, derivatives, agreement with GTSAM's calibrations."""
 
+from dataclasses import replace
+
 import cv2
 import gtsam
 import numpy as np
@@ -79,6 +81,22 @@ def test_jacobian_matches_numerical_derivative(camera: Camera) -> None:
         axis=2,
     )
     np.testing.assert_allclose(jacobian, numerical, rtol=1e-6, atol=1e-4)
+
+
+@each_camera
+def test_derivatives_by_the_parameters_match_numerical_ones(camera: Camera) -> None:
+    m = np.concatenate([camera.undistort(pixel_grid(camera)), np.zeros((1, 2))])
+    values = np.array([*camera.intrinsics, *camera.coefficients])
+    analytical = np.concatenate([camera.by_intrinsics(m), camera.by_coefficients(m)], axis=2)
+    assert analytical.shape == (len(m), 2, len(values))
+    for k, h in enumerate([1e-3] * 4 + [1e-6] * len(camera.coefficients)):
+        ends = []
+        for sign in (1.0, -1.0):
+            fx, fy, cx, cy, *coefficients = values + sign * h * np.eye(len(values))[k]
+            changed = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(coefficients))
+            ends.append(changed.distort(m)[0])
+        numerical = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(analytical[:, :, k], numerical, rtol=1e-5, atol=1e-4)
 
 
 @each_camera

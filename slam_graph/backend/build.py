@@ -16,6 +16,7 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.smoother import SmootherEstimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -63,6 +64,11 @@ class EstimatorLike(Protocol):
 
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
         """Take the features of one time and estimate the state then."""
+        ...
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
         ...
 
     def landmarks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

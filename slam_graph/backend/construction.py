@@ -25,7 +25,6 @@ from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
 from slam_graph.backend.square_root import SquareRootInformation
-from slam_graph.backend.state import stacked_poses
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
@@ -204,11 +203,13 @@ class CostConstruction:
         # steps may have sent a feature with little parallax to infinity
         good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
         if not good.all():
-            new = ~good
-            poses = stacked_poses(window.state.estimate, obs.frames)
-            result = triangulate(obs.subset(new), self.rig, *poses, self.config.triangulation)
-            wide = result.parallax_rad > self.policy.state_feature_parallax_rad
-            points[new], good[new] = result.points, result.good & (wide | ~lasting[new])
+            new, rig = ~good, self.rig.at(window.state)
+            poses = rig.poses(window.state.estimate, obs.frames)
+            observed = rig.renormalized(obs.subset(new))
+            result = triangulate(observed, rig, *poses, self.config.triangulation)
+            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
+            known = noise * result.depth_error < self.policy.state_feature_depth_error
+            points[new], good[new] = result.points, result.good & (known | ~lasting[new])
         return points, good
 
     def _leave_out(

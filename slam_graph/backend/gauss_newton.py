@@ -10,16 +10,22 @@ back, and takes a step only if it lowers the cost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.backend.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 
+FloatArray = NDArray[np.float64]
+
 INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e6
+MAX_REPEATED_STEPS = 4
+"""How often a step is repeated at most where it is too large to be linear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,19 +35,31 @@ class Minimum:
     Attributes:
         posterior: over an increment of the final estimates, linearised where the last step was.
         costs: the cost before the first step and after each step that was taken.
+        repeated: whether there were more steps than the policy has, because one was too large.
     """
 
     posterior: SquareRootInformation
     costs: tuple[float, ...]
+    repeated: bool = False
 
 
-def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None = None) -> Minimum:
+Again = Callable[[SquareRootInformation, FloatArray], bool]
+"""Whether a step (n,) under its posterior asks for one more."""
+
+
+def minimize(
+    cost: Cost,
+    policy: GaussNewtonPolicy,
+    linear: Linearization | None = None,
+    again: Again | None = None,
+) -> Minimum:
     """Take steps on a cost.
 
     Args:
         cost: moved in place: its state, and its new features.
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
+        again: asks for more steps than the policy has, up to `MAX_REPEATED_STEPS` in all.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
@@ -52,14 +70,37 @@ def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
     for step in range(policy.max_steps):
         if linear is None or step > 0:
             linear = cost.linearize(summed=True)
-        posterior = _system(cost, linear, layout)
-        delta = posterior.solution()
-        cost.apply(delta, linear, layout)
-        posterior = posterior.shifted(delta)
+        posterior, delta = _step(cost, linear, layout)
         costs.append(cost.value())
         if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
             break
-    return Minimum(posterior, tuple(costs))
+    minimum = Minimum(posterior, tuple(costs))
+    return minimum if again is None else _repeated(cost, layout, minimum, delta, again)
+
+
+def _step(
+    cost: Cost, linear: Linearization, layout: Layout
+) -> tuple[SquareRootInformation, FloatArray]:
+    """Move a cost by one step: the posterior, at the new estimates, and the step (n,)."""
+    posterior = _system(cost, linear, layout)
+    delta = posterior.solution()
+    cost.apply(delta, linear, layout)
+    return posterior.shifted(delta), delta
+
+
+def _repeated(
+    cost: Cost, layout: Layout, minimum: Minimum, delta: FloatArray, again: Again
+) -> Minimum:
+    """Take more steps as long as the last one asks for it and they lower the cost."""
+    while len(minimum.costs) <= MAX_REPEATED_STEPS and again(minimum.posterior, delta):
+        before = cost.snapshot()
+        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
+        value = cost.value()
+        if not value < minimum.costs[-1]:
+            cost.restore(before)
+            break
+        minimum = Minimum(posterior, (*minimum.costs, value), repeated=True)
+    return minimum
 
 
 def linearized(cost: Cost) -> SquareRootInformation:

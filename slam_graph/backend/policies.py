@@ -35,8 +35,8 @@ class CostPolicy(Settings):
     """How many features are held in the state while they are tracked; null for no bound."""
     state_feature_frames: int = Field(10, ge=2)
     """How many frames must have seen a feature before it may be held in the state."""
-    state_feature_parallax_rad: float = Field(0.01, ge=0)
-    """… and the largest angle between its first ray and any other must be this."""
+    state_feature_depth_error: float = Field(0.1, gt=0)
+    """… and the standard deviation of its depth, relative to it, must be less than this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
     gate: Literal["prediction", "residual"] = "prediction"

@@ -31,6 +31,9 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["nis"]:
         typer.echo("")
         echo_table(_innovations(metrics["nis"]))
+    if metrics["calibration"]:
+        typer.echo("")
+        echo_table(_calibration(metrics["calibration"]))
     typer.echo("")
     typer.echo(f"{folder}/")
     typer.echo("  " + " ".join(path.name for path in files))
@@ -93,3 +96,11 @@ def _innovations(nis: Table) -> Iterator[tuple[str, ...]]:
     yield "NIS / dof", "mean", "expected", "inside 95% bounds", "rejected"
     shares = (f"{nis['inside_bounds']:.0%}", f"{nis['rejected']:.1%}")
     yield "images", number(nis["mean"], 2), number(nis["expected_mean"], 2), *shares
+
+
+def _calibration(parameters: Table) -> Iterator[tuple[str, ...]]:
+    """Estimated parameters of the rig beside what they were at first."""
+    yield "calibration", "start", "estimate", "1 sigma"
+    for name, row in parameters.items():
+        values = (f"{row[column]:.6g}" for column in ("start", "value"))
+        yield name, *values, f"{row['sigma']:.2g}"

@@ -42,6 +42,7 @@ def metrics_table(result: RunResult) -> Table:
             "accuracy": _accuracy(result),
             "nees": _nees(result),
             "nis": innovation_report(result.innovations.columns()),
+            "calibration": result.calibration.table(),
             "timing": _timing(result),
             "features_per_frame": _per_frame(result),
             "map_points": len(result.points),

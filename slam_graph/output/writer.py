@@ -61,6 +61,10 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
     metrics = folder / "metrics.json"
     write_text(metrics, [json.dumps(result.metrics, indent=2, allow_nan=False), "\n"])
     files += [map_file, timing, config, calibration, metrics]
+    if result.calibration.latest is not None:
+        files += [folder / "calibration_estimated.yaml", folder / "calibration.csv"]
+        write_kalibr(result.calibration.latest.rig, files[-2])
+        write_text(files[-1], result.calibration.csv_lines())
     if truth is not None and write_picture(result, truth, folder / "trajectory.png"):
         files.append(folder / "trajectory.png")
     return files

@@ -87,6 +87,8 @@ def read_camera(entry: YamlValue) -> Camera:
         size = (int(width), int(height))
         if shape.name is None:
             return Camera(fx, fy, cx, cy, distortion, tuple(coefficients), *size)
+        if shape.name == "double_sphere" and not 0.0 <= extra[1] <= 1.0:
+            raise DataError(f"alpha of a double sphere is in [0, 1], got {extra[1]}")
         bend = coefficients or [0.0] * (COEFFICIENTS[shape.name] - len(extra))
         return Camera(fx, fy, cx, cy, shape.name, (*extra, *bend), *size)
     except DataError as error:

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.omnidirectional import (
     double_sphere,
+    double_sphere_by_parameters,
     double_sphere_inverse,
     unified,
+    unified_by_parameters,
     unified_inverse,
 )
 
@@ -87,13 +89,16 @@ class Camera:
             )
         if not (self.fx > 0 and self.fy > 0):
             raise DataError(f"focal lengths must be positive, got ({self.fx}, {self.fy})")
-        if self.distortion == "double_sphere" and not 0.0 <= self.coefficients[1] <= 1.0:
-            raise DataError(f"alpha of a double sphere is in [0, 1], got {self.coefficients[1]}")
 
     @property
     def K(self) -> FloatArray:
         """The (3, 3) calibration matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(fx, fy, cx, cy) in pixels."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def distort(self, normalized: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels of normalised points, and the derivative.
@@ -124,10 +129,41 @@ class Camera:
         """Pixels (N, 2) of points (N, 3) in the camera frame; the points must have z > 0."""
         return self.distort(points[:, :2] / points[:, 2:3])[0]
 
-    def undistort(self, pixels: FloatArray) -> FloatArray:
+    def by_intrinsics(self, normalized: FloatArray) -> FloatArray:
+        """Derivatives (N, 2, 4) of the pixels of normalised points by (fx, fy, cx, cy)."""
+        bent = (self.distort(normalized)[0] - (self.cx, self.cy)) / (self.fx, self.fy)
+        derivative = np.zeros((len(normalized), 2, 4))
+        derivative[:, 0, 0], derivative[:, 1, 1] = bent[:, 0], bent[:, 1]
+        derivative[:, 0, 2] = derivative[:, 1, 3] = 1.0
+        return derivative
+
+    def by_coefficients(self, normalized: FloatArray) -> FloatArray:
+        """Derivatives (N, 2, n) of the pixels of normalised points by the distortion's."""
+        if self.distortion == "radtan":
+            bent = _radtan_by_coefficients(normalized)
+        elif self.distortion == "equidistant":
+            r = np.hypot(normalized[:, 0], normalized[:, 1])
+            powers = np.arctan(r)[:, None] ** np.array([3, 5, 7, 9]) / np.maximum(r, 1e-9)[:, None]
+            bent = normalized[:, :, None] * powers[:, None, :]
+        elif self.distortion == "mei":
+            on_plane, _ = unified(normalized, self.coefficients[0])
+            bend = _radtan(on_plane, *self.coefficients[1:])[1]
+            first = bend @ unified_by_parameters(normalized, self.coefficients[0])
+            bent = np.concatenate([first, _radtan_by_coefficients(on_plane)], axis=2)
+        elif self.distortion == "double_sphere":
+            bent = double_sphere_by_parameters(normalized, *self.coefficients)
+        else:
+            bent = np.zeros((len(normalized), 2, 0))
+        return np.asarray(bent * np.array([[self.fx], [self.fy]]), dtype=np.float64)
+
+    def undistort(self, pixels: FloatArray, near: FloatArray | None = None) -> FloatArray:
         """Normalised coordinates (N, 2) of pixels (N, 2): the inverse of `distort`.
 
         Pixels that see nothing in front of the camera get NaN or any other point; see `visible`.
+
+        Args:
+            pixels: (N, 2).
+            near: (N, 2) a guess of the result, where there is one; it saves time.
         """
         if len(pixels) == 0:
             return np.zeros((0, 2))
@@ -139,7 +175,7 @@ class Camera:
             return unified_inverse(bend.undistort(plain), self.coefficients[0])
         if self.distortion == "double_sphere":
             return double_sphere_inverse(plain, *self.coefficients)
-        return self._invert_distortion(plain)
+        return self._newton(plain, self._fixed_point(plain) if near is None else near)
 
     def visible(self, pixels: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Normalised coordinates of pixels (N, 2), and which of them have any.
@@ -161,8 +197,8 @@ class Camera:
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
         return self.visible(pixels)[1].reshape(self.height, self.width)
 
-    def _invert_distortion(self, bent: FloatArray) -> FloatArray:
-        """Newton's method on `distort`, started from OpenCV's fixed-point solution."""
+    def _fixed_point(self, bent: FloatArray) -> FloatArray:
+        """OpenCV's solution, from which Newton's method converges."""
         source = np.ascontiguousarray(bent[:, None, :])
         coefficients = np.array(self.coefficients)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-9)
@@ -171,7 +207,11 @@ class Camera:
             start = cv2.undistortPointsIter(source, eye, coefficients, eye, eye, criteria)
         else:
             start = cv2.fisheye.undistortPoints(source, np.eye(3), coefficients, criteria=criteria)
-        m = np.asarray(start, dtype=np.float64)[:, 0, :]
+        return np.asarray(start, dtype=np.float64)[:, 0, :]
+
+    def _newton(self, bent: FloatArray, m: FloatArray) -> FloatArray:
+        """Newton's method on `distort` from a start m (N, 2)."""
+        coefficients = np.array(self.coefficients)
         forward = _radtan if self.distortion == "radtan" else None
         for _ in range(3):
             if forward is not None:
@@ -210,6 +250,15 @@ def _radtan(
     jacobian[:, 1, 0] = jacobian[:, 0, 1]
     jacobian[:, 1, 1] = radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x
     return bent, jacobian
+
+
+def _radtan_by_coefficients(m: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, 4) of Brown's model by k1, k2, p1, p2."""
+    x, y = m[:, 0], m[:, 1]
+    r2, xy = x * x + y * y, 2.0 * x * y
+    columns_x = [x * r2, x * r2 * r2, xy, r2 + 2.0 * x * x]
+    columns_y = [y * r2, y * r2 * r2, r2 + 2.0 * y * y, xy]
+    return np.stack([np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)], axis=1)
 
 
 def _equidistant(m: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -27,6 +27,13 @@ def unified(m: FloatArray, xi: float) -> tuple[FloatArray, FloatArray]:
     return _divide(m, depth, xi / rho)
 
 
+def unified_by_parameters(m: FloatArray, xi: float) -> FloatArray:
+    """Derivatives (N, 2, 1) of the points of the unified model by ξ."""
+    rho = np.sqrt(1.0 + np.sum(m * m, axis=1))
+    by_xi: FloatArray = -(rho / (1.0 + xi * rho) ** 2)[:, None] * m
+    return by_xi[:, :, None]
+
+
 def unified_inverse(q: FloatArray, xi: float) -> FloatArray:
     """Points m (N, 2) of the plane z = 1 that the unified model takes to q (N, 2)."""
     s = np.sum(q * q, axis=1)
@@ -41,13 +48,20 @@ def double_sphere(m: FloatArray, xi: float, alpha: float) -> tuple[FloatArray, F
     Usenko, Demmel and Cremers, "The Double Sphere Camera Model", 3DV 2018, eq. (40) to (42), with
     z = 1.
     """
-    r2 = np.sum(m * m, axis=1)
-    rho = np.sqrt(1.0 + r2)
-    shifted = 1.0 + xi * rho
-    second = np.sqrt(r2 + shifted * shifted)
+    rho, shifted, second = _distances(m, xi)
     depth = alpha * second + (1.0 - alpha) * shifted
     slope = alpha * (1.0 + shifted * xi / rho) / second + (1.0 - alpha) * xi / rho
     return _divide(m, depth, slope)
+
+
+def double_sphere_by_parameters(m: FloatArray, xi: float, alpha: float) -> FloatArray:
+    """Derivatives (N, 2, 2) of the points of the double sphere model by ξ and α."""
+    rho, shifted, second = _distances(m, xi)
+    depth = alpha * second + (1.0 - alpha) * shifted
+    by_xi = alpha * shifted * rho / second + (1.0 - alpha) * rho
+    depth_by_parameters = np.stack([by_xi, second - shifted], axis=1)
+    scale = depth_by_parameters / (depth * depth)[:, None]
+    return np.asarray(-m[:, :, None] * scale[:, None, :], dtype=np.float64)
 
 
 def double_sphere_inverse(q: FloatArray, xi: float, alpha: float) -> FloatArray:
@@ -60,6 +74,14 @@ def double_sphere_inverse(q: FloatArray, xi: float, alpha: float) -> FloatArray:
     z = (1.0 - alpha * alpha * s) / (alpha * root + 1.0 - alpha)
     scale = (z * xi + _root(z * z + (1.0 - xi * xi) * s)) / (z * z + s)
     return _to_plane(q * scale[:, None], scale * z - xi)
+
+
+def _distances(m: FloatArray, xi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distances (N,) of points (m, 1) from the first centre, their z and distances from the other."""
+    r2 = np.sum(m * m, axis=1)
+    rho = np.sqrt(1.0 + r2)
+    shifted = 1.0 + xi * rho
+    return rho, shifted, np.sqrt(r2 + shifted * shifted)
 
 
 def _divide(m: FloatArray, depth: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
