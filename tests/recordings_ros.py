@@ -15,7 +15,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from slam_graph.datasets.recorded import RecordedSequence
 from slam_graph.datasets.ros_messages import TRANSFORMS
+from slam_graph.sensors.measurements import CameraFrame
 
 LAG_NS = 7_000_000
 """How much later than its stamp a message is recorded."""
@@ -148,6 +150,23 @@ def write_bag(
                 pose = bag.transform(told_ns, "world", "body", [k, 2, 3], [0.5, 0.5, -0.5, 0.5])
                 bag.write("/truth", pose, stamp_ns + LAG_NS)
     return next(path.glob("*.mcap")) if kind == "mcap_file" else path
+
+
+def write_bag_of(sequence: RecordedSequence, path: Path, kind: str, end_ns: int) -> Path:
+    """Images and IMU of a recording as a bag, without calibration."""
+    with bag_writer(path, kind) as bag:
+        for packet in sequence.packets(end_ns=end_ns):
+            assert isinstance(packet.frame, CameraFrame)
+            samples = zip(
+                packet.imu.stamps_ns.tolist(), packet.imu.gyro, packet.imu.accel, strict=True
+            )
+            for stamp_ns, gyro, accel in samples:
+                bag.write("/imu0", bag.imu(stamp_ns, gyro, accel), stamp_ns)
+            for c, image in enumerate(packet.frame.images):
+                if image is not None:
+                    message = bag.image(packet.frame.stamp_ns, image, "mono8", f"cam{c}")
+                    bag.write(f"/cam{c}/image_raw", message, packet.frame.stamp_ns + LAG_NS)
+    return path
 
 
 def write_calibration(bag: BagWriter) -> None:

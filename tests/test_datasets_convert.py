@@ -11,14 +11,16 @@ import pytest
 from recordings import FRAME_PERIOD_NS, START_NS, edit_text, write_euroc, write_openvins
 from recordings_loose import write_flight_video, write_image_folder
 from recordings_public import write_kitti_odometry, write_kitti_raw, write_tum_rgbd, write_tum_vi
-from recordings_ros import write_bag
+from recordings_ros import write_bag, write_bag_of
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
+from slam_graph.config import load_config
 from slam_graph.datasets.convert import convert_to_euroc
 from slam_graph.datasets.recorded import RecordedSequence
 from slam_graph.datasets.registry import open_dataset
 from slam_graph.errors import DataError
+from slam_graph.pipeline import run
 from slam_graph.sensors.kalibr import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig
@@ -147,3 +149,24 @@ def test_tracks_are_not_images(tmp_path: Path) -> None:
 def test_sources_need_a_name_and_a_place(tmp_path: Path) -> None:
     status, _ = convert(write_bag(tmp_path), tmp_path / "new", "--topic", "/imu0")
     assert status == 2
+
+
+@pytest.mark.data
+def test_a_real_bag_and_its_conversion_give_the_same_trajectory(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    source = open_dataset(data_dir / "euroc" / "MH_01_easy_17s", cameras=1)
+    end_ns = source.info().start_ns + 2_500_000_000
+    bag = write_bag_of(source, tmp_path / "flight.bag", "ros1", end_ns)
+    write_kalibr(source.rig, tmp_path / "chain.yaml")
+    status, said = convert(bag, tmp_path / "flight", "--calibration", tmp_path / "chain.yaml")
+    assert status == 0, said
+    config = load_config(algorithm="msckf")
+    recorded = open_dataset(bag, calibration=tmp_path / "chain.yaml")
+    before, after = (
+        run(s, config).trajectory for s in (recorded, open_dataset(tmp_path / "flight"))
+    )
+    assert len(before) > 15
+    assert np.array_equal(before.stamps_ns, after.stamps_ns)
+    np.testing.assert_allclose(after.positions, before.positions, atol=1e-6)
+    np.testing.assert_allclose(after.quaternions, before.quaternions, atol=1e-6)

@@ -77,7 +77,7 @@ def double_sphere_inverse(q: FloatArray, xi: float, alpha: float) -> FloatArray:
 
 
 def _distances(m: FloatArray, xi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (N,) of points (m, 1) from the first centre, their z and distances from the other."""
+    """Distances of points (m, 1) from the first centre; z and distances from the second one."""
     r2 = np.sum(m * m, axis=1)
     rho = np.sqrt(1.0 + r2)
     shifted = 1.0 + xi * rho
