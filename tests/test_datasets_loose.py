@@ -19,10 +19,16 @@ from recordings_loose import (
     write_times,
     write_video,
 )
+from typer.testing import CliRunner
 
+from slam_graph.cli.main import app
+from slam_graph.datasets.checks import check_sequence
 from slam_graph.datasets.recorded import RecordedSequence
 from slam_graph.datasets.registry import open_dataset
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.registry import build_frontend
 from slam_graph.pipeline import run
 from slam_graph.sensors.measurements import CameraFrame
 
@@ -278,8 +284,28 @@ def test_without_imu_it_can_be_looked_at_but_not_run_on(tmp_path: Path, kind: st
     assert sequence.info().frames == 8
     assert sequence.rig.cameras[0].camera.width == SIZE[0]
     assert [len(packet.imu) for packet in sequence.packets()] == [0] * 8
+    tracker = build_frontend(sequence.rig, FrontendConfig(), 0, Diagnostics(), "images")
+    features = [tracker.track(packet.frame).cameras[0] for packet in sequence.packets()]
+    assert all(len(seen) > 0 for seen in features)
     with pytest.raises(DataError, match="no IMU"):
         run(sequence)
+
+
+def test_a_check_tells_what_was_noticed_on_opening(tmp_path: Path) -> None:
+    path = write_video(tmp_path)
+    edit_text(path.with_suffix(".yaml"), "camera_model", "readout_time: 0.02\n  camera_model")
+    findings = [found.what for found in check_sequence(open_dataset(path))]
+    for kind in ("stamps_assumed", "rolling_shutter"):
+        assert any(what.startswith(f"{kind}: 1 times") for what in findings)
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path: Path) -> None:
+    path = write_image_folder(tmp_path / "walk", inertial=False)
+    arguments = ["run", str(path), "--no-progress", "--output", str(tmp_path / "results")]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 1
+    assert "no IMU" in str(done.exception)
+    assert not list((tmp_path / "results").iterdir())
 
 
 def test_with_an_imu_the_calibration_must_say_where_it_is(tmp_path: Path) -> None:

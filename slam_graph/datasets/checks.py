@@ -70,6 +70,7 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
     """
     if isinstance(sequence, GroupedSequence) and not read_images:
         sequence = sequence.without_images()
+    opened = dict(sequence.diagnostics.counts)
     with _collecting(sequence) as faults:
         survey, stamps = _go_through(sequence)
         truth = sequence.groundtruth()
@@ -77,6 +78,10 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
     findings = [
         Finding("warning", f"{kind}: {count} times, first: {faults.messages[kind]}", name)
         for kind, count in faults.counts.items()
+    ]
+    findings += [
+        Finding("warning", f"{kind}: {count} times, counted before the check", name)
+        for kind, count in opened.items()
     ]
     findings += [Finding(*found, "imu") for found in survey.findings(sequence.rig.imu)]
     findings += _check_frames(stamps, name)
