@@ -224,8 +224,10 @@ def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
         camera, width, height = rig_camera.camera, rig_camera.camera.width, rig_camera.camera.height
         mask = None if path is None else read_mask(path, width, height)
         if camera.distortion in WIDE:
-            seen = np.where(camera.visible_mask(), np.uint8(255), np.uint8(0))
-            mask = seen if mask is None else np.minimum(mask, seen)
+            # Windows stay inside too: where nothing is shown beyond, its rim moves with the camera
+            window = np.ones((config.window_px, config.window_px), np.uint8)
+            seen = cv2.erode(np.where(camera.visible_mask(), np.uint8(255), np.uint8(0)), window)
+            mask = np.asarray(seen if mask is None else np.minimum(mask, seen), np.uint8)
         extractors.append(CornerExtractor(config, width, height, mask))
     return extractors
 
