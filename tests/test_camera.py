@@ -172,7 +172,7 @@ def test_a_front_end_leaves_out_what_a_fisheye_sees_sideways() -> None:
     features = tracker.track(CameraFrame(0, (np.asarray(image, np.uint8),))).cameras[0]
     length = np.linalg.norm(features.normalized, axis=1)
     assert len(features) > 100
-    assert 3.0 < np.max(length) < 6.0
+    assert 2.0 < np.max(length) < np.tan(np.deg2rad(70.1))
 
 
 def test_calibration_matrix_projects_undistorted_points() -> None:

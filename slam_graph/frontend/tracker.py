@@ -28,6 +28,10 @@ from slam_graph.sensors.rig import Rig
 FEW_FEATURES = 15
 """Fewer features than this left of a frame with more are worth a warning."""
 
+REACH = 2.75
+"""Features of wide lenses lie less than 70° off the axis. On the plane z = 1, where matches are
+tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, by 33 at 80°."""
+
 
 class KltTracker:
     """Follows corners of the first camera (the reference) and finds them in the other cameras.
@@ -226,8 +230,9 @@ def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
         if camera.distortion in WIDE:
             # Windows stay inside too: where nothing is shown beyond, its rim moves with the camera
             window = np.ones((config.window_px, config.window_px), np.uint8)
-            seen = cv2.erode(np.where(camera.visible_mask(), np.uint8(255), np.uint8(0)), window)
-            mask = np.asarray(seen if mask is None else np.minimum(mask, seen), np.uint8)
+            seen = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
+            seen = np.asarray(cv2.erode(seen, window), np.uint8)
+            mask = seen if mask is None else np.minimum(mask, seen)
         extractors.append(CornerExtractor(config, width, height, mask))
     return extractors
 

@@ -177,25 +177,31 @@ class Camera:
             return double_sphere_inverse(plain, *self.coefficients)
         return self._newton(plain, self._fixed_point(plain) if near is None else near)
 
-    def visible(self, pixels: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def visible(
+        self, pixels: FloatArray, reach: float = WIDEST
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Normalised coordinates of pixels (N, 2), and which of them have any.
+
+        Args:
+            pixels: (N, 2).
+            reach: longest normalised point that counts, the tangent of the angle to the axis.
 
         Returns:
             normalized: (N, 2); zero where there is none.
-            usable: (N,) whether the pixel sees points less than 80° off the axis.
+            usable: (N,) whether the pixel sees points so near to the axis.
         """
         with np.errstate(all="ignore"):
             plane = self.undistort(pixels)
-            usable = np.linalg.norm(plane, axis=1) < WIDEST
+            usable = np.linalg.norm(plane, axis=1) < reach
             plane = np.where(usable[:, None], plane, 0.0)
             error_px = np.linalg.norm(self.distort(plane)[0] - pixels, axis=1)
         return plane, usable & (error_px < SEEN_TOLERANCE_PX)
 
-    def visible_mask(self) -> NDArray[np.bool_]:
-        """Which pixels (height, width) see points less than 80° off the axis."""
+    def visible_mask(self, reach: float = WIDEST) -> NDArray[np.bool_]:
+        """Which pixels (height, width) see points with normalised coordinates up to `reach`."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-        return self.visible(pixels)[1].reshape(self.height, self.width)
+        return self.visible(pixels, reach)[1].reshape(self.height, self.width)
 
     def _fixed_point(self, bent: FloatArray) -> FloatArray:
         """OpenCV's solution, from which Newton's method converges."""
