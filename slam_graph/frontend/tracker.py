@@ -30,7 +30,7 @@ FEW_FEATURES = 15
 
 REACH = 2.75
 """Features of wide lenses lie less than 70° off the axis. On the plane z = 1, where matches are
-tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, by 33 at 80°."""
+tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, 33 at 80°."""
 
 
 class KltTracker:
