@@ -17,20 +17,15 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.association import LucasKanade
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.extraction import CornerExtractor, read_mask
+from slam_graph.frontend.extraction import CornerExtractor, camera_mask
 from slam_graph.frontend.outliers import fundamental_inliers
 from slam_graph.frontend.stereo import StereoMatcher
 from slam_graph.frontend.tracks import Image, Mask, Tracks
-from slam_graph.sensors.camera import WIDE
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
 
 FEW_FEATURES = 15
 """Fewer features than this left of a frame with more are worth a warning."""
-
-REACH = 2.75
-"""Features of wide lenses lie less than 70° off the axis. On the plane z = 1, where matches are
-tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, 33 at 80°."""
 
 
 class KltTracker:
@@ -225,14 +220,8 @@ def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
     masks = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
     extractors = []
     for rig_camera, path in zip(rig.cameras, masks, strict=True):
-        camera, width, height = rig_camera.camera, rig_camera.camera.width, rig_camera.camera.height
-        mask = None if path is None else read_mask(path, width, height)
-        if camera.distortion in WIDE:
-            # Windows stay inside too: where nothing is shown beyond, its rim moves with the camera
-            window = np.ones((config.window_px, config.window_px), np.uint8)
-            seen = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
-            seen = np.asarray(cv2.erode(seen, window), np.uint8)
-            mask = seen if mask is None else np.minimum(mask, seen)
+        width, height = rig_camera.camera.width, rig_camera.camera.height
+        mask = camera_mask(rig_camera.camera, path, config.window_px)
         extractors.append(CornerExtractor(config, width, height, mask))
     return extractors
 
