@@ -30,7 +30,7 @@ from slam_graph.experiment.tasks import RecordTask, RunTask
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")
 SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tracks.features=50")]
-TIMEOUT_S = 100
+TIMEOUT_S = 600
 
 
 def compare(*arguments: str | Path) -> subprocess.CompletedProcess:

@@ -115,7 +115,7 @@ class CostConstruction:
             return self._constructed(window, cost, None, past, window.features, nothing)
         window.recall_features()
         cost.prior = window.prior
-        past = POSE_CHOICES[self.policy.past_poses](window, self.policy)
+        past = POSE_CHOICES[self.policy.past_poses](window, self.policy, self.rig)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
         seen = np.intersect1d(window.features, window.tracks.ids_in(window.frame), True)
         cost.tracked = window.tracks.observations(seen, [window.frame])

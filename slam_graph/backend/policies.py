@@ -45,8 +45,8 @@ class CostPolicy(Settings):
     the residual of each observation; one that fails is never used again."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
-    keyframe_motion: float = Field(0.05, ge=0)
-    """… or when these have moved by more than this in the image (median, focal lengths)."""
+    keyframe_parallax_rad: float = Field(0.05, ge=0)
+    """… or when it sees these from elsewhere: under a median angle of more than this."""
 
 
 class GaussNewtonPolicy(Settings):
