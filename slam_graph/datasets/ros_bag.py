@@ -71,6 +71,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._kept: AnyReader | None = None
         with self._open() as reader:
             self.topics = {
                 connection.topic: connection.msgtype
@@ -104,6 +105,16 @@ class Bag:
                 decode = self._decoder(reader.typestore, raw, connection.msgtype)
                 yield Message(connection.topic, received_ns, raw, decode)
 
+    @contextmanager
+    def kept_open(self) -> Iterator[None]:
+        """Open the bag once for several streams of messages, of which each ends before the next."""
+        with self._open() as reader:
+            self._kept = reader
+            try:
+                yield
+            finally:
+                self._kept = None
+
     def header_stamp_ns(self, message: Message) -> int:
         """The stamp in the header of a message, which must begin with one; 0 if it is not set."""
         if len(message.raw) < HEADER_BYTES:
@@ -127,6 +138,9 @@ class Bag:
 
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:
+        if self._kept is not None:
+            yield self._kept
+            return
         from rosbags.highlevel import AnyReader  # not on import: most runs read no bag
 
         with self._translated():

@@ -108,7 +108,9 @@ class RosBagSequence(GroupedSequence):
             rig = read_kalibr(calibration, fallback=unknown, needs_imu=topics.imu is not None)
         else:
             count = len(topics.cameras) if cameras is None else cameras
-            rig = read_bag_rig(self._bag, replace(topics, cameras=topics.cameras[:count]), unknown)
+            used = replace(topics, cameras=topics.cameras[:count])
+            with self._bag.kept_open():
+                rig = read_bag_rig(self._bag, used, unknown)
         if topics.imu is not None and rig.imu is unknown:
             what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
             diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
@@ -125,8 +127,9 @@ class RosBagSequence(GroupedSequence):
         self.has_imu = topics.imu is not None
         if groundtruth is None and topics.groundtruth is not None:
             self.own_groundtruth = self._read_poses
-        for k, topic in enumerate(self._cameras):
-            self._check_first_images(topic, k)
+        with self._bag.kept_open():
+            for k, topic in enumerate(self._cameras):
+                self._check_first_images(topic, k)
 
     @property
     def groups(self) -> Groups:
