@@ -256,7 +256,9 @@ class Cost:
             distance = squared_mahalanobis(linear.tracked.r, linear.tracked.H, P)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
-            tracked = distance < largest
+            # nearer or behind, the slope of the projection is so large that any residual would pass
+            near = linear.tracked.depths < self.config.triangulation.min_depth_m
+            tracked = (distance < largest) & ~near
             innovations += Innovations.of(distance, dof, largest, tracked)
         if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
             fresh = np.ones(len(self.fresh.points), np.bool_)

@@ -35,12 +35,14 @@ class WhitenedObservations:
         by_pose: (N, 2, 6) derivatives of the projection.
         by_point: (N, 2, 3).
         by_calibration: (N, 2, C), by the parameters of the rig that are estimated.
+        depths: (N,) in metres.
     """
 
     r: FloatArray
     by_pose: FloatArray
     by_point: FloatArray
     by_calibration: FloatArray
+    depths: FloatArray
 
     @property
     def H(self) -> FloatArray:
@@ -50,7 +52,11 @@ class WhitenedObservations:
     def subset(self, keep: NDArray[np.bool_]) -> WhitenedObservations:
         """The observations where `keep` (N,) holds."""
         return WhitenedObservations(
-            self.r[keep], self.by_pose[keep], self.by_point[keep], self.by_calibration[keep]
+            self.r[keep],
+            self.by_pose[keep],
+            self.by_point[keep],
+            self.by_calibration[keep],
+            self.depths[keep],
         )
 
 
@@ -108,7 +114,7 @@ def whiten(
     gating: GatingConfig,
 ) -> WhitenedObservations:
     """Linearise observations: Jacobians at the first estimates, residuals at the current ones."""
-    residuals, _ = rig.residuals(obs, estimate)
+    residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     r = residuals / sigma_px
     weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=1), gating)) / sigma_px
@@ -117,6 +123,7 @@ def whiten(
         by_pose * weight[:, None, None],
         by_point * weight[:, None, None],
         by_calibration * weight[:, None, None],
+        depths,
     )
 
 

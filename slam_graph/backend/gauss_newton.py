@@ -4,8 +4,9 @@
 
 Each step linearises every residual, stacks the rows under the prior's triangular factor, restores
 the triangle by QR, and moves the estimates by the solution. The triangle of the last step is the
-posterior Gaussian that marginalization works on. Levenberg-Marquardt adds rows that hold the step
-back, and takes a step only if it lowers the cost.
+posterior Gaussian that marginalization works on. After the first step, which makes a filter, steps
+are only taken as long as they lower the cost; Levenberg-Marquardt adds rows that hold a step back
+that would not.
 """
 
 from __future__ import annotations
@@ -66,16 +67,29 @@ def minimize(
     """
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
-    layout, costs = cost.layout(), [cost.value()]
-    for step in range(policy.max_steps):
-        if linear is None or step > 0:
-            linear = cost.linearize(summed=True)
-        posterior, delta = _step(cost, linear, layout)
-        costs.append(cost.value())
-        if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
+    layout, before = cost.layout(), cost.value()
+    posterior, delta = _step(cost, linear or cost.linearize(summed=True), layout)
+    minimum = Minimum(posterior, (before, cost.value()))
+    while _another(policy, minimum, delta, again):
+        undo = cost.snapshot()
+        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
+        value = cost.value()
+        if not value < minimum.costs[-1]:
+            cost.restore(undo)
             break
-    minimum = Minimum(posterior, tuple(costs))
-    return minimum if again is None else _repeated(cost, layout, minimum, delta, again)
+        steps = len(minimum.costs)
+        minimum = Minimum(posterior, (*minimum.costs, value), repeated=steps > policy.max_steps)
+    return minimum
+
+
+def _another(
+    policy: GaussNewtonPolicy, minimum: Minimum, delta: FloatArray, again: Again | None
+) -> bool:
+    """Whether the last step asks for one more."""
+    steps = len(minimum.costs) - 1
+    if steps < policy.max_steps:
+        return bool(np.max(np.abs(delta), initial=0.0) >= policy.tolerance)
+    return again is not None and steps < MAX_REPEATED_STEPS and again(minimum.posterior, delta)
 
 
 def _step(
@@ -86,21 +100,6 @@ def _step(
     delta = posterior.solution()
     cost.apply(delta, linear, layout)
     return posterior.shifted(delta), delta
-
-
-def _repeated(
-    cost: Cost, layout: Layout, minimum: Minimum, delta: FloatArray, again: Again
-) -> Minimum:
-    """Take more steps as long as the last one asks for it and they lower the cost."""
-    while len(minimum.costs) <= MAX_REPEATED_STEPS and again(minimum.posterior, delta):
-        before = cost.snapshot()
-        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
-        value = cost.value()
-        if not value < minimum.costs[-1]:
-            cost.restore(before)
-            break
-        minimum = Minimum(posterior, (*minimum.costs, value), repeated=True)
-    return minimum
 
 
 def linearized(cost: Cost) -> SquareRootInformation:

@@ -147,11 +147,22 @@ def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Pat
     """Print the table, and where the files are."""
     from slam_graph.experiment.report import COLUMNS, cells
 
-    echo_table([("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)])
+    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)]
+    echo_table(_telling(table))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
     typer.echo("  " + " ".join(file.name for file in files))
+
+
+def _telling(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A table without the columns in which nothing is known, and with one data set without it."""
+    columns = [
+        values
+        for values in zip(*table, strict=True)
+        if set(values[1:]) != {"-"} and (values[0] != "data" or len(set(values[1:])) > 1)
+    ]
+    return list(zip(*columns, strict=True))
 
 
 def _leave(comparison: Comparison) -> None:
