@@ -1,0 +1,42 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the bundle adjustment over a whole recording."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from slam_graph.backend.config import Settings
+
+
+class FinalBaConfig(Settings):
+    """The bundle adjustment over the whole recording that ends a run."""
+
+    enabled: bool = True
+    """Whether a run ends with it."""
+    keyframe_spacing_s: float = Field(0.2, gt=0)
+    """Longest time between two keyframes where there are frames."""
+    min_common_features: float = Field(0.5, ge=0, le=1)
+    """A keyframe is taken earlier if fewer than this part of the last one's features are left."""
+    features: int = Field(150, ge=10)
+    """How many features each keyframe is given at least, if it has as many: the longest tracks."""
+    robust_loss: Literal["none", "huber", "cauchy"] = "huber"
+    """Loss that weighs down large reprojection residuals."""
+    robust_width: float = Field(2.45, gt=0)
+    """Width of the loss on the length of a whitened residual (2.45: the 95 % circle)."""
+    outlier_width: float = Field(3.7, gt=0)
+    """Longer whitened residuals are left out after the first minimum (3.7: the 99.9 % circle)."""
+    max_iterations: int = Field(20, ge=1)
+    """Levenberg-Marquardt steps before outliers are left out, and again after that."""
+    tolerance: float = Field(1e-4, gt=0)
+    """Steps end when the cost falls by less than this part of it."""
+    gyro_bias_sigma: float = Field(0.05, gt=0)
+    """How well the causal estimate knows the first gyroscope bias, rad/s."""
+    accel_bias_sigma: float = Field(0.3, gt=0)
+    """How well the causal estimate knows the first accelerometer bias, m/s²."""
+    max_keyframes: int = Field(600, ge=20)
+    """Recordings with more keyframes are solved in pieces of this many, for a bound on memory."""
+    overlap_keyframes: int = Field(50, ge=2)
+    """How many keyframes two pieces share."""

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a run keeps for the bundle adjustment over the whole recording: keyframes, on disk.
+
+In memory stay the times of all frames and keyframes and the noise of the IMU, some 30 bytes a
+frame. Observations of the keyframes and all IMU samples go into a track recording in a temporary
+folder, from which any part is read back.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.tracks import sorted_unique
+from slam_graph.datasets.recorder import TrackRecorder
+from slam_graph.datasets.recording import TrackRecordingSequence
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
+from slam_graph.sensors.rig import Rig
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+MAX_AHEAD_NS = 10_000_000_000
+"""A frame that is later than the last IMU sample by more than this has a wrong stamp."""
+
+
+class _Silent(Diagnostics):
+    """Faults of the data have been counted when they were read for the first time."""
+
+    def warn(self, kind: str, message: str) -> None:
+        """Say nothing."""
+
+
+class KeyframeLog:
+    """Chooses keyframes while a run goes on, and keeps what they saw.
+
+    A frame is a keyframe if it is the first or last one, if the last keyframe is as long ago as
+    the spacing says, or if few of its features are left.
+    """
+
+    def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
+        self._rig = rig
+        self._config = config
+        self._path = folder / "keyframes"
+        self._recorder = TrackRecorder(self._path, rig)
+        self._frames = array("q")
+        self._keyframes = array("q")
+        self._noise = array("d")
+        self._imu: list[ImuData] = []
+        self._newest_imu_ns: int | None = None
+        self._pending: tuple[FeatureFrame, tuple[float, float]] | None = None
+        self._last_ids = np.zeros(0, np.int64)
+
+    @classmethod
+    @contextmanager
+    def open(cls, rig: Rig, config: FinalBaConfig) -> Iterator[KeyframeLog]:
+        """A log that lives as long as the block."""
+        with TemporaryDirectory(prefix="slam_graph_") as folder:
+            yield cls(rig, config, Path(folder))
+
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """Frames can be added inside the block, and read after it."""
+        with self._recorder:
+            yield
+            if self._pending is not None:
+                self._write(*self._pending)
+
+    def add(self, imu: ImuData, frame: FeatureFrame, noise: tuple[float, float]) -> None:
+        """Take a frame; one that does not follow those before is left out.
+
+        Args:
+            imu: the samples since the frame before.
+            frame: what all cameras saw.
+            noise: factors on the white noise of gyroscope and accelerometer around this time.
+        """
+        if len(imu):
+            self._imu.append(imu)
+            self._newest_imu_ns = int(imu.stamps_ns[-1])
+        follows = not self._frames or frame.stamp_ns > self._frames[-1]
+        newest_ns = self._newest_imu_ns
+        if not follows or newest_ns is None or frame.stamp_ns > newest_ns + MAX_AHEAD_NS:
+            return
+        self._frames.append(frame.stamp_ns)
+        if self._is_keyframe(frame):
+            self._write(frame, noise)
+            self._pending = None
+        else:
+            self._pending = (frame, noise)
+
+    @property
+    def frames_ns(self) -> IntArray:
+        """(N,) times of all frames on the clock of the cameras."""
+        return np.array(self._frames, dtype=np.int64)
+
+    @property
+    def keyframes_ns(self) -> IntArray:
+        """(K,) times of the keyframes on the clock of the cameras."""
+        return np.array(self._keyframes, dtype=np.int64)
+
+    @property
+    def noise(self) -> FloatArray:
+        """(K, 2) factors on the noise of gyroscope and accelerometer at the keyframes."""
+        return np.array(self._noise, dtype=np.float64).reshape(-1, 2)
+
+    def packets(self, first: int, stop: int) -> Iterator[Packet]:
+        """Keyframes `first` to `stop - 1`, each with the samples since the one before."""
+        sequence = TrackRecordingSequence(self._path, diagnostics=_Silent())
+        yield from sequence.packets(self._keyframes[first], self._keyframes[stop - 1])
+
+    def _is_keyframe(self, frame: FeatureFrame) -> bool:
+        if not self._keyframes:
+            return True
+        since_s = (frame.stamp_ns - self._keyframes[-1]) * 1e-9
+        if since_s >= 0.95 * self._config.keyframe_spacing_s:  # stamps jitter
+            return True
+        common = np.isin(self._last_ids, frame.cameras[0].ids)
+        return len(common) > 0 and common.mean() < self._config.min_common_features
+
+    def _write(self, frame: FeatureFrame, noise: tuple[float, float]) -> None:
+        missing = len(self._rig.cameras) - len(frame.cameras)
+        cameras = frame.cameras + (FeatureObservations.empty(),) * missing
+        usable = tuple(_finite(seen) for seen in cameras)
+        self._recorder.write(
+            ImuData.concatenate(self._imu), FeatureFrame(frame.stamp_ns, usable)
+        )
+        self._imu = []
+        self._keyframes.append(frame.stamp_ns)
+        self._noise.extend(noise)
+        self._last_ids = sorted_unique(np.sort(usable[0].ids))
+
+
+def _finite(seen: FeatureObservations) -> FeatureObservations:
+    """The observations that are finite."""
+    rows = np.isfinite(np.hstack([seen.pixels, seen.normalized])).all(axis=1)
+    return FeatureObservations(seen.ids[rows], seen.pixels[rows], seen.normalized[rows])

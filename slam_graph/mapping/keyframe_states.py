@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""States between, before and after those that are known, by the IMU."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.imu import ImuBuffer, predict, preintegrate
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import NavState, Trajectory
+
+IntArray = NDArray[np.int64]
+
+MAX_HOLE_S = 1.0
+"""Between two causal states that are farther apart the IMU leads on."""
+
+
+def state_at(trajectory: Trajectory, row: int) -> NavState:
+    """One row of a trajectory with velocities and biases."""
+    assert trajectory.velocities is not None
+    assert trajectory.gyro_biases is not None
+    assert trajectory.accel_biases is not None
+    return NavState(
+        int(trajectory.stamps_ns[row]),
+        trajectory.pose(row),
+        trajectory.velocities[row],
+        trajectory.gyro_biases[row],
+        trajectory.accel_biases[row],
+    )
+
+
+def states_at(
+    known: Trajectory,
+    stamps_ns: IntArray,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> list[NavState]:
+    """States at some times: known ones interpolated, others from the nearest by the IMU.
+
+    Args:
+        known: causal estimate.
+        stamps_ns: (K,) ascending, at least one of them inside of `known`.
+        imu: samples over all of them.
+        params: gravity.
+    """
+    inside, valid = interpolate(known, stamps_ns, MAX_HOLE_S)
+    rows = np.cumsum(valid) - 1
+    states: dict[int, NavState] = {
+        k: state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
+    }
+    count, first = len(stamps_ns), int(np.argmax(valid))
+    for k in range(first - 1, -1, -1):
+        states[k] = predict_back(states[k + 1], int(stamps_ns[k]), imu, params)
+    for k in range(first + 1, count):
+        if k not in states:
+            states[k] = predict_on(states[k - 1], int(stamps_ns[k]), imu, params)
+    return [states[k] for k in range(count)]
+
+
+def predict_on(
+    state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
+) -> NavState:
+    """The state at a later time."""
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    pim = preintegrate(imu.between(state.stamp_ns, stamp_ns), bias, params)
+    return predict(state, pim, stamp_ns)
+
+
+def predict_back(
+    state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
+) -> NavState:
+    """The state at an earlier time: the dynamics solved for their beginning.
+
+    With ΔR, Δv and Δp preintegrated over T from there to here (Forster et al. 2017, eq. 33),
+    R = R' ΔRᵀ, v = v' - g T - R Δv, p = p' - v T - ½ g T² - R Δp.
+    """
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    pim = preintegrate(imu.between(stamp_ns, state.stamp_ns), bias, params)
+    seconds, gravity = pim.deltaTij(), params.n_gravity
+    rotation = state.world_T_body.rotation().compose(pim.deltaRij().inverse())
+    velocity = state.velocity - gravity * seconds - rotation.rotate(pim.deltaVij())
+    position = (
+        state.world_T_body.translation()
+        - velocity * seconds
+        - 0.5 * gravity * seconds**2
+        - rotation.rotate(pim.deltaPij())
+    )
+    pose = gtsam.Pose3(rotation, position)
+    return NavState(stamp_ns, pose, velocity, state.gyro_bias, state.accel_bias)
