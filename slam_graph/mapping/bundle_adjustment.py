@@ -10,8 +10,10 @@ without outliers, on features triangulated and IMU samples preintegrated anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -28,11 +30,14 @@ from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.zero_velocity import zero_velocity_factors
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.mapping.averaged_observations import averaged, nearest_keyframe
 from slam_graph.mapping.final_ba_config import FinalBaConfig
-from slam_graph.mapping.keyframes import Keyframes, longest_tracks
+from slam_graph.mapping.keyframe_states import fill_in
+from slam_graph.mapping.keyframes import Piece, longest_tracks, views
 from slam_graph.sensors.rig import Rig
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 ANCHOR_SIGMA = 1e-3
@@ -55,34 +60,34 @@ class Adjustment:
     """The minimum and what it took.
 
     Attributes:
-        states: of every keyframe.
+        states: of every frame.
+        keyframes: number of keyframes.
         features: number of features in the cost.
-        observations: number of observations that were used to the end.
-        outliers: number of observations that were left out.
+        observations: number of observations in the cost.
         iterations: Levenberg-Marquardt steps.
-        cost_before: where the last cost began.
-        cost_after: at its minimum.
-        imu_error: sum of the squared whitened residuals of the IMU.
-        pixel_error: of the observations.
+        cost_before: of all observations, where it began.
+        cost_after: without outliers, at the minimum.
+        imu_residual: root mean square of the whitened residuals of the IMU.
+        pixel_residual: of the observations.
     """
 
     states: list[NavState]
+    keyframes: int
     features: int
     observations: int
-    outliers: int
     iterations: int
     cost_before: float
     cost_after: float
-    imu_error: float = 0.0
-    pixel_error: float = 0.0
+    imu_residual: float
+    pixel_residual: float
 
 
 class BundleAdjustment:
-    """The problem of some keyframes.
+    """The problem of a piece of a recording.
 
     Args:
-        keyframes: times, observations, IMU samples.
-        states: where to begin.
+        piece: times, observations, IMU samples.
+        states: of the keyframes, where to begin.
         anchor: number of the keyframe that keeps its position and yaw.
         rig: calibrated sensors.
         backend: noise and triangulation.
@@ -92,7 +97,7 @@ class BundleAdjustment:
 
     def __init__(
         self,
-        keyframes: Keyframes,
+        piece: Piece,
         states: list[NavState],
         anchor: int,
         rig: Rig,
@@ -100,22 +105,24 @@ class BundleAdjustment:
         config: FinalBaConfig,
         report: Report,
     ) -> None:
-        self._keyframes = keyframes
+        self._piece = piece
         self._anchor = anchor
         self._rig = rig
         self._projection = RigProjection(rig)
         self._backend = backend
         self._config = config
         self._report = report
-        chosen = longest_tracks(keyframes.seen, config.features, MIN_KEYFRAMES)
-        self._candidates = keyframes.seen.subset(chosen)
+        seen = piece.seen_by_keyframes()
+        chosen = longest_tracks(seen, config.features, MIN_KEYFRAMES)
+        self._candidates = seen.subset(chosen)
+        self._everything = piece.seen.subset(chosen)
         self._iterations = 0
-        self.values = gtsam.Values()
+        self._values = gtsam.Values()
         for k, state in enumerate(states):
-            self.values.insert(X(k), state.world_T_body)
-            self.values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
+            self._values.insert(X(k), state.world_T_body)
+            self._values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-            self.values.insert(B(k), bias)
+            self._values.insert(B(k), bias)
 
     def solve(self) -> Adjustment:
         """Minimise, leave out outliers, and minimise again.
@@ -123,33 +130,32 @@ class BundleAdjustment:
         Raises:
             EstimationError: if there is no minimum.
         """
-        candidates = self._candidates
-        points, good = self._triangulated(candidates)
-        before, _ = self._minimize(candidates.subset(good), points[good])
-        points, good = self._triangulated(candidates)
-        points, good = self._known(candidates, points, good)
-        used = candidates.rows(self._inliers(candidates, points) & good[candidates.feature])
-        seen = _keyframes_of_each(used) >= MIN_KEYFRAMES
-        used = used.subset(seen)
-        _, after = self._minimize(used, points[seen])
+        points, good = self._triangulated(self._candidates)
+        obs = self._candidates.subset(good)
+        before, *_ = self._minimize(obs, points[good], np.ones(len(obs), np.int64))
+        points, good = self._triangulated(self._candidates)
+        points, good = self._known(self._candidates, points, good)
+        obs, points, counts = self._without_outliers(good, points[good])
+        _, cost, imu_cost = self._minimize(obs, points, counts)
+        dynamics = 15 * max(len(self._piece.keyframes) - 1, 1)
         return Adjustment(
-            [self._state(k) for k in range(len(self._keyframes))],
-            len(used.ids),
-            len(used),
-            int(np.sum(good[candidates.feature])) - len(used),
+            self._states(),
+            len(self._piece.keyframes),
+            len(obs.ids),
+            len(obs),
             self._iterations,
             before,
-            after,
-            self._imu_cost,
-            self._pixel_cost,
+            cost,
+            float(np.sqrt(2.0 * imu_cost / dynamics)),
+            float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
         )
+
+    # --- features --------------------------------------------------------------------------------
 
     def _triangulated(self, obs: Observations) -> tuple[FloatArray, BoolArray]:
         """Points (J, 3) from the poses as they are, and which of them (J,) are usable."""
-        rotations, positions = stacked_poses(self.values, obs.frames)
-        found = triangulate(
-            obs, self._projection, rotations, positions, self._backend.triangulation
-        )
+        poses = stacked_poses(self._values, obs.frames)
+        found = triangulate(obs, self._projection, *poses, self._backend.triangulation)
         limit_px = MAX_START_ERROR_PX * self._backend.noise.pixel_sigma
         return found.points, found.good & (found.reprojection_px < limit_px)
 
@@ -157,23 +163,41 @@ class BundleAdjustment:
         self, obs: Observations, points: FloatArray, good: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """The same, with the estimates of the features that have one."""
-        known = np.array([self.values.exists(L(j)) for j in obs.ids.tolist()], np.bool_)
-        points[known] = stacked_points(self.values, obs.ids[known].tolist())
+        known = np.array([self._values.exists(L(j)) for j in obs.ids.tolist()], np.bool_)
+        points[known] = stacked_points(self._values, obs.ids[known].tolist())
         return points, good | known
 
-    def _inliers(self, obs: Observations, points: FloatArray) -> BoolArray:
-        """Which observations (N,) fit."""
-        at = Geometry(*stacked_poses(self.values, obs.frames), points)
-        residuals, depths = self._projection.residuals(obs, at)
+    def _without_outliers(
+        self, good: BoolArray, points: FloatArray
+    ) -> tuple[Observations, FloatArray, IntArray]:
+        """Observations that fit, their features, and how many frames each stands for.
+
+        Args:
+            good: (J,) candidates that have a position.
+            points: of these.
+        """
+        obs, seen = self._candidates.subset(good), self._everything.subset(good)
+        if not self._config.average_frames:
+            seen = obs
+        own = Geometry(*stacked_poses(self._values, obs.frames), points)
         limit_px = self._config.outlier_width * self._backend.noise.pixel_sigma
-        near = depths > self._backend.triangulation.min_depth_m
-        return near & (np.linalg.norm(residuals, axis=1) < limit_px)
+        if self._config.average_frames:
+            matrices = np.array([s.world_T_body.matrix() for s in self._states()])
+            theirs = Geometry(matrices[:, :3, :3], matrices[:, :3, 3], points)
+            nearest = nearest_keyframe(self._piece.stamps_ns, self._piece.keyframes)
+        else:
+            theirs, nearest = own, np.arange(len(self._piece.keyframes))
+        obs, counts = averaged(obs, own, seen, theirs, nearest, self._projection, limit_px)
+        used = counts > 0
+        obs, counts = obs.rows(used), counts[used]
+        enough = np.bincount(views(obs)[0], minlength=len(obs.ids)) >= MIN_KEYFRAMES
+        return obs.subset(enough), points[enough], counts[enough[obs.feature]]
 
     # --- the cost --------------------------------------------------------------------------------
 
     def _prior(self) -> list[gtsam.NonlinearFactor]:
         """Position and yaw of the anchor, and the first bias, loosely."""
-        pose, bias = self.values.atPose3(X(self._anchor)), self.values.atConstantBias(B(0))
+        pose, bias = self._values.atPose3(X(self._anchor)), self._values.atConstantBias(B(0))
         sigmas = np.diag([UNKNOWN_TILT_RAD, UNKNOWN_TILT_RAD, ANCHOR_SIGMA])
         root = pose.rotation().matrix().T @ sigmas
         covariance = np.zeros((6, 6))
@@ -191,90 +215,93 @@ class BundleAdjustment:
     def _dynamics(self) -> list[gtsam.NonlinearFactor]:
         """IMU between each keyframe and the next, and zero velocities."""
         factors: list[gtsam.NonlinearFactor] = []
-        frames, noise = self._keyframes, self._backend.noise
-        for k in range(len(frames) - 1):
-            start_ns, end_ns = int(frames.stamps_ns[k]), int(frames.stamps_ns[k + 1])
-            gap = frames.imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
+        imu, noise = self._piece.imu, self._backend.noise
+        stamps_ns = self._piece.keyframe_stamps_ns.tolist()
+        for k, (i, j) in enumerate(pairwise(self._piece.keyframes.tolist())):
+            start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
+            gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
             scale = noise.imu_scale * (noise.imu_gap_scale if gap else 1.0)
-            gyro, accel = 0.5 * (frames.noise[k] + frames.noise[k + 1])
+            # of noise that is not stationary, variances add up
+            gyro, accel = np.sqrt(np.mean(self._piece.noise[i + 1 : j + 1] ** 2, axis=0))
             params = preintegration_params(self._rig.imu, noise.gravity, scale, gyro, accel)
-            bias = self.values.atConstantBias(B(k))
-            pim = preintegrate(frames.imu.between(start_ns, end_ns), bias, params)
+            bias = self._values.atConstantBias(B(k))
+            pim = preintegrate(imu.between(start_ns, end_ns), bias, params)
             factors.append(imu_factor(k, k + 1, pim))
-            if frames.still[k + 1]:
+            if self._piece.still[i + 1 : j + 1].all():
                 factors += zero_velocity_factors(k, k + 1, self._backend.zero_velocity)
+        return factors
+
+    def _projections(self, obs: Observations, counts: IntArray) -> list[gtsam.NonlinearFactor]:
+        """A factor for each observation, which stands for some frames."""
+        robust = {
+            "robust_loss": self._config.robust_loss,
+            "robust_width": self._config.robust_width,
+        }
+        gating = self._backend.gating.model_copy(update=robust)
+        factors: list[gtsam.NonlinearFactor] = []
+        for count in np.unique(counts).tolist():
+            noise = pixel_noise(self._backend.noise.pixel_sigma / math.sqrt(count), gating)
+            factors += ProjectionFactors(self._rig, noise).of(obs.rows(counts == count))
         return factors
 
     # --- Levenberg-Marquardt ---------------------------------------------------------------------
 
-    def _minimize(self, obs: Observations, points: FloatArray) -> tuple[float, float]:
-        """Move the values to the minimum, and return the cost before and there."""
-        count = len(self._keyframes)
-        states = gtsam.Values()
-        for k in range(count):
-            states.insert(X(k), self.values.atPose3(X(k)))
-            states.insert(V(k), self.values.atVector(V(k)))
-            states.insert(B(k), self.values.atConstantBias(B(k)))
+    def _minimize(
+        self, obs: Observations, points: FloatArray, counts: IntArray
+    ) -> tuple[float, float, float]:
+        """Move the values to the minimum.
+
+        Returns:
+            The cost before, the cost there, and the part of the IMU and the prior in it.
+        """
+        start = gtsam.Values()
+        for k in range(len(self._piece.keyframes)):
+            start.insert(X(k), self._values.atPose3(X(k)))
+            start.insert(V(k), self._values.atVector(V(k)))
+            start.insert(B(k), self._values.atConstantBias(B(k)))
         for j, point in zip(obs.ids.tolist(), points, strict=True):
-            states.insert(L(j), point)
-        gating = self._backend.gating.model_copy(
-            update={
-                "robust_loss": self._config.robust_loss,
-                "robust_width": self._config.robust_width,
-            }
-        )
-        noise = pixel_noise(self._backend.noise.pixel_sigma, gating)
-        dynamics = gtsam.NonlinearFactorGraph()
-        for factor in self._prior() + self._dynamics():
-            dynamics.push_back(factor)
-        graph = gtsam.NonlinearFactorGraph(dynamics)
-        projections = ProjectionFactors(self._rig, noise).of(obs)
-        for factor in projections:
-            graph.push_back(factor)
-        ordering = gtsam.Ordering()
-        for j in obs.ids.tolist():
-            ordering.push_back(L(j))
-        for k in range(count):
-            for key in (X(k), V(k), B(k)):
-                ordering.push_back(key)
-        import os
-        if os.environ.get("COLAMD"):
-            ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+            start.insert(L(j), point)
+        inertial = _graph(self._prior() + self._dynamics())
+        graph = gtsam.NonlinearFactorGraph(inertial)
+        graph.push_back(_graph(self._projections(obs, counts)))
         params = gtsam.LevenbergMarquardtParams()
-        params.setOrdering(ordering)
-        import time
-        t=time.time()
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, states, params)
+        params.setOrdering(gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
         before = cost = optimizer.error()
         for _ in range(self._config.max_iterations):
             optimizer.iterate()
             self._iterations += 1
-            fallen = (cost - optimizer.error()) / max(cost, 1e-300)
+            fallen = cost - optimizer.error()
             cost = optimizer.error()
-            self._report(fallen)
-            if fallen < self._config.tolerance or optimizer.lambda_() > MAX_LAMBDA:
+            self._report(fallen / max(cost, 1e-300))
+            if fallen <= self._config.tolerance * cost or optimizer.lambda_() > MAX_LAMBDA:
                 break
-        if not np.isfinite(cost):
+        if not math.isfinite(cost):
             raise EstimationError("the cost of the bundle adjustment is not finite")
-        self.values = optimizer.values()
-        self._imu_cost = dynamics.error(self.values)
-        self._pixel_cost = cost - self._imu_cost
-        print("LM", before, cost, self._iterations, len(obs), len(obs.ids), time.time()-t)
-        return before, cost
+        self._values = optimizer.values()
+        return before, cost, inertial.error(self._values)
 
-    def _state(self, k: int) -> NavState:
-        bias = self.values.atConstantBias(B(k))
-        return NavState(
-            int(self._keyframes.stamps_ns[k]),
-            self.values.atPose3(X(k)),
-            np.asarray(self.values.atVector(V(k))),
-            np.asarray(bias.gyroscope()),
-            np.asarray(bias.accelerometer()),
-        )
+    def _states(self) -> list[NavState]:
+        """The estimate at all frames."""
+        keyframes = []
+        for k, stamp_ns in enumerate(self._piece.keyframe_stamps_ns.tolist()):
+            bias = self._values.atConstantBias(B(k))
+            keyframes.append(
+                NavState(
+                    stamp_ns,
+                    self._values.atPose3(X(k)),
+                    np.asarray(self._values.atVector(V(k))),
+                    np.asarray(bias.gyroscope()),
+                    np.asarray(bias.accelerometer()),
+                )
+            )
+        params = preintegration_params(self._rig.imu, self._backend.noise.gravity)
+        return fill_in(keyframes, self._piece.stamps_ns, self._piece.imu, params)
 
 
-def _keyframes_of_each(obs: Observations) -> NDArray[np.int64]:
-    """Number (J,) of keyframes that see each feature."""
-    new = np.ones(len(obs), np.bool_)
-    new[1:] = (np.diff(obs.feature) != 0) | (np.diff(obs.frame) != 0)
-    return np.bincount(obs.feature[new], minlength=len(obs.ids))
+def _graph(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """The factors as a graph."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph

@@ -22,6 +22,8 @@ class FinalBaConfig(Settings):
     """A keyframe is taken earlier if fewer than this part of the last one's features are left."""
     features: int = Field(150, ge=10)
     """How many features each keyframe is given at least, if it has as many: the longest tracks."""
+    average_frames: bool = True
+    """Whether the frames between keyframes add what they saw to the observations of these."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
     """Loss that weighs down large reprojection residuals."""
     robust_width: float = Field(2.45, gt=0)

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -90,3 +93,40 @@ def predict_back(
     )
     pose = gtsam.Pose3(rotation, position)
     return NavState(stamp_ns, pose, velocity, state.gyro_bias, state.accel_bias)
+
+
+def fill_in(
+    keyframes: list[NavState],
+    stamps_ns: IntArray,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> list[NavState]:
+    """States at all frames, from those of the keyframes.
+
+    From each keyframe the IMU leads on to the next one. What is missing there is laid on the way
+    in proportion to the time, so that both ends are met.
+
+    Args:
+        keyframes: at least one state.
+        stamps_ns: (N,) ascending times, those of the keyframes among them.
+        imu: samples over all of them.
+        params: gravity.
+    """
+    states: list[NavState] = []
+    at = np.searchsorted(stamps_ns, [state.stamp_ns for state in keyframes])
+    for k, (start, end) in enumerate(pairwise(keyframes)):
+        states.append(start)
+        inside = stamps_ns[at[k] + 1 : at[k + 1]].tolist()
+        if not inside:
+            continue
+        way = [start]
+        for stamp_ns in [*inside, end.stamp_ns]:
+            way.append(predict_on(way[-1], stamp_ns, imu, params))
+        missing = gtsam.Pose3.Logmap(way[-1].world_T_body.between(end.world_T_body))
+        faster = end.velocity - way[-1].velocity
+        for state in way[1:-1]:
+            part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
+            pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * missing))
+            velocity = state.velocity + part * faster
+            states.append(replace(state, world_T_body=pose, velocity=velocity))
+    return [*states, keyframes[-1]]

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The keyframes of a piece of a recording: their times, observations and IMU samples."""
+"""A piece of a recording: its frames and keyframes, their observations, its IMU samples."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.backend.config import ZeroVelocityConfig
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.tracks import Observations
 from slam_graph.backend.zero_velocity import StandstillDetector
-from slam_graph.mapping.keyframe_log import KeyframeLog
+from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.sensors.rig import Rig
 
 IntArray = NDArray[np.int64]
@@ -21,41 +22,53 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Keyframes:
-    """Consecutive keyframes, numbered from 0.
+class Piece:
+    """Consecutive frames, numbered from 0; the first and the last are keyframes.
 
     Attributes:
-        stamps_ns: (K,) on the clock of the IMU.
-        noise: (K, 2) factors on the white noise of gyroscope and accelerometer.
-        still: (K,) whether nothing has moved since the keyframe before.
+        stamps_ns: (N,) of all frames, on the clock of the IMU.
+        keyframes: (K,) numbers of the frames that are keyframes.
+        noise: (N, 2) factors on the white noise of gyroscope and accelerometer.
+        still: (N,) whether the platform stands still.
         imu: all samples.
-        seen: all observations; frame f is keyframe f.
+        seen: all observations of all frames; frame f of it is frame f.
     """
 
     stamps_ns: IntArray
+    keyframes: IntArray
     noise: FloatArray
     still: BoolArray
     imu: ImuBuffer
     seen: Observations
 
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
+    @property
+    def keyframe_stamps_ns(self) -> IntArray:
+        """(K,) on the clock of the IMU."""
+        return self.stamps_ns[self.keyframes]
+
+    def seen_by_keyframes(self) -> Observations:
+        """The observations of the keyframes; frame k of it is keyframe k."""
+        number = np.full(len(self.stamps_ns), -1)
+        number[self.keyframes] = np.arange(len(self.keyframes))
+        frame = number[self.seen.frame]
+        seen = replace(self.seen, frames=tuple(range(len(self.keyframes))), frame=frame)
+        return seen.rows(frame >= 0)
 
 
-def read_keyframes(
-    log: KeyframeLog, first: int, stop: int, rig: Rig, standstill: StandstillDetector
-) -> Keyframes:
-    """Read keyframes `first` to `stop - 1`.
+def read_piece(
+    log: FrameLog, keyframes: IntArray, rig: Rig, standstill: ZeroVelocityConfig
+) -> Piece:
+    """Read the frames from the first of some keyframes to the last.
 
     Args:
         log: of a run.
-        first: number of the first one.
-        stop: number behind the last one.
+        keyframes: (K,) consecutive ones of its keyframes.
         rig: may be calibrated better than it was during the run.
-        standstill: tells whether the platform stands still.
+        standstill: when the platform stands still.
     """
+    first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
     offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
-    imu = ImuBuffer()
+    detector, imu = StandstillDetector(standstill), ImuBuffer()
     stamps, still = [], []
     columns: list[tuple[IntArray, ...]] = []
     pixels: list[FloatArray] = []
@@ -63,14 +76,14 @@ def read_keyframes(
         frame = packet.frame
         imu.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
-        still.append(standstill.is_still(imu, stamps[-1], frame))
+        still.append(detector.is_still(imu, stamps[-1], frame))
         for c, seen in enumerate(frame.cameras):
-            count = len(seen)
-            columns.append((seen.ids, np.full(count, number), np.full(count, c)))
+            columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
             pixels.append(seen.pixels)
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
-    return Keyframes(
+    return Piece(
         np.array(stamps),
+        keyframes - first,
         log.noise[first:stop],
         np.array(still),
         imu,
@@ -81,17 +94,30 @@ def read_keyframes(
 def _table(
     ids: IntArray, frames: IntArray, cameras: IntArray, pixels: FloatArray, rig: Rig, count: int
 ) -> Observations:
-    """Observations sorted by feature, then frame, then camera."""
-    order = np.lexsort((cameras, frames, ids))
-    ids, frames, cameras, pixels = ids[order], frames[order], cameras[order], pixels[order]
+    """The observations that are finite, sorted by feature, then frame, then camera."""
     normalized = np.empty_like(pixels)
     for c, mounted in enumerate(rig.cameras):
         rows = cameras == c
         normalized[rows] = mounted.camera.undistort(pixels[rows])
-    features, feature = np.unique(ids, return_inverse=True)
+    order = np.lexsort((cameras, frames, ids))
+    order = order[np.isfinite(np.hstack([pixels, normalized])).all(axis=1)[order]]
+    features, feature = np.unique(ids[order], return_inverse=True)
     return Observations(
-        features, tuple(range(count)), feature, frames, cameras, pixels, normalized
+        features,
+        tuple(range(count)),
+        feature,
+        frames[order],
+        cameras[order],
+        pixels[order],
+        normalized[order],
     )
+
+
+def views(seen: Observations) -> tuple[IntArray, IntArray]:
+    """Which feature (V,) was seen in which frame (V,) by any camera, sorted by feature."""
+    new = np.ones(len(seen), np.bool_)
+    new[1:] = (np.diff(seen.feature) != 0) | (np.diff(seen.frame) != 0)
+    return seen.feature[new], seen.frame[new]
 
 
 def longest_tracks(seen: Observations, per_keyframe: int, least: int) -> BoolArray:
@@ -102,9 +128,7 @@ def longest_tracks(seen: Observations, per_keyframe: int, least: int) -> BoolArr
         per_keyframe: how many features each keyframe is given, if it has as many.
         least: how many keyframes a feature must be seen in.
     """
-    new_frame = np.ones(len(seen), np.bool_)
-    new_frame[1:] = (np.diff(seen.feature) != 0) | (np.diff(seen.frame) != 0)
-    feature, frame = seen.feature[new_frame], seen.frame[new_frame]
+    feature, frame = views(seen)
     lengths = np.bincount(feature, minlength=len(seen.ids))
     starts = np.cumsum(lengths) - lengths
     given = np.zeros(len(seen.frames), np.int64)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a run keeps for the bundle adjustment over the whole recording: keyframes, on disk.
+"""What a run keeps for the bundle adjustment over the whole recording: all its frames, on disk.
 
-In memory stay the times of all frames and keyframes and the noise of the IMU, some 30 bytes a
-frame. Observations of the keyframes and all IMU samples go into a track recording in a temporary
-folder, from which any part is read back.
+In memory stay the times of the frames, the noise of the IMU, and which frames are keyframes: some
+30 bytes a frame. Observations and IMU samples go into a track recording in a temporary folder, from
+which any part is read back.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.backend.tracks import sorted_unique
 from slam_graph.datasets.recorder import TrackRecorder
 from slam_graph.datasets.recording import TrackRecordingSequence
 from slam_graph.diagnostics import Diagnostics
@@ -31,6 +30,8 @@ FloatArray = NDArray[np.float64]
 
 MAX_AHEAD_NS = 10_000_000_000
 """A frame that is later than the last IMU sample by more than this has a wrong stamp."""
+JITTER = 0.95
+"""A keyframe may come this much earlier than the spacing says: stamps jitter."""
 
 
 class _Silent(Diagnostics):
@@ -40,8 +41,8 @@ class _Silent(Diagnostics):
         """Say nothing."""
 
 
-class KeyframeLog:
-    """Chooses keyframes while a run goes on, and keeps what they saw.
+class FrameLog:
+    """Keeps the frames of a run, and chooses keyframes while it goes on.
 
     A frame is a keyframe if it is the first or last one, if the last keyframe is as long ago as
     the spacing says, or if few of its features are left.
@@ -50,30 +51,28 @@ class KeyframeLog:
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
         self._rig = rig
         self._config = config
-        self._path = folder / "keyframes"
+        self._path = folder / "frames"
         self._recorder = TrackRecorder(self._path, rig)
         self._frames = array("q")
-        self._keyframes = array("q")
+        self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
         self._imu: list[ImuData] = []
         self._newest_imu_ns: int | None = None
-        self._pending: tuple[FeatureFrame, tuple[float, float]] | None = None
         self._last_ids = np.zeros(0, np.int64)
 
     @classmethod
     @contextmanager
-    def open(cls, rig: Rig, config: FinalBaConfig) -> Iterator[KeyframeLog]:
-        """A log that lives as long as the block."""
-        with TemporaryDirectory(prefix="slam_graph_") as folder:
-            yield cls(rig, config, Path(folder))
+    def recording(cls, rig: Rig, config: FinalBaConfig, folder: Path) -> Iterator[FrameLog]:
+        """A log to which frames can be added inside of the block, and which can be read behind it.
 
-    @contextmanager
-    def recording(self) -> Iterator[None]:
-        """Frames can be added inside the block, and read after it."""
-        with self._recorder:
-            yield
-            if self._pending is not None:
-                self._write(*self._pending)
+        Args:
+            rig: the cameras that frames have observations of.
+            config: which frames are keyframes.
+            folder: for the files.
+        """
+        log = cls(rig, config, folder)
+        with log._recorder:
+            yield log
 
     def add(self, imu: ImuData, frame: FeatureFrame, noise: tuple[float, float]) -> None:
         """Take a frame; one that does not follow those before is left out.
@@ -90,12 +89,16 @@ class KeyframeLog:
         newest_ns = self._newest_imu_ns
         if not follows or newest_ns is None or frame.stamp_ns > newest_ns + MAX_AHEAD_NS:
             return
-        self._frames.append(frame.stamp_ns)
+        missing = len(self._rig.cameras) - len(frame.cameras)
+        cameras = frame.cameras + (FeatureObservations.empty(),) * missing
+        frame = FeatureFrame(frame.stamp_ns, cameras)
+        self._recorder.write(ImuData.concatenate(self._imu), frame)
+        self._imu = []
         if self._is_keyframe(frame):
-            self._write(frame, noise)
-            self._pending = None
-        else:
-            self._pending = (frame, noise)
+            self._keyframes.append(len(self._frames))
+            self._last_ids = cameras[0].ids
+        self._frames.append(frame.stamp_ns)
+        self._noise.extend(noise)
 
     @property
     def frames_ns(self) -> IntArray:
@@ -103,43 +106,26 @@ class KeyframeLog:
         return np.array(self._frames, dtype=np.int64)
 
     @property
-    def keyframes_ns(self) -> IntArray:
-        """(K,) times of the keyframes on the clock of the cameras."""
-        return np.array(self._keyframes, dtype=np.int64)
+    def keyframes(self) -> IntArray:
+        """(K,) numbers of the frames that are keyframes, the first and the last among them."""
+        numbers = np.array(self._keyframes, dtype=np.int64)
+        return np.union1d(numbers, [len(self._frames) - 1]) if self._frames else numbers
 
     @property
     def noise(self) -> FloatArray:
-        """(K, 2) factors on the noise of gyroscope and accelerometer at the keyframes."""
+        """(N, 2) factors on the noise of gyroscope and accelerometer at the frames."""
         return np.array(self._noise, dtype=np.float64).reshape(-1, 2)
 
     def packets(self, first: int, stop: int) -> Iterator[Packet]:
-        """Keyframes `first` to `stop - 1`, each with the samples since the one before."""
+        """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = TrackRecordingSequence(self._path, diagnostics=_Silent())
-        yield from sequence.packets(self._keyframes[first], self._keyframes[stop - 1])
+        yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _is_keyframe(self, frame: FeatureFrame) -> bool:
         if not self._keyframes:
             return True
-        since_s = (frame.stamp_ns - self._keyframes[-1]) * 1e-9
-        if since_s >= 0.95 * self._config.keyframe_spacing_s:  # stamps jitter
+        since_s = (frame.stamp_ns - self._frames[self._keyframes[-1]]) * 1e-9
+        if since_s >= JITTER * self._config.keyframe_spacing_s:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
-        return len(common) > 0 and common.mean() < self._config.min_common_features
-
-    def _write(self, frame: FeatureFrame, noise: tuple[float, float]) -> None:
-        missing = len(self._rig.cameras) - len(frame.cameras)
-        cameras = frame.cameras + (FeatureObservations.empty(),) * missing
-        usable = tuple(_finite(seen) for seen in cameras)
-        self._recorder.write(
-            ImuData.concatenate(self._imu), FeatureFrame(frame.stamp_ns, usable)
-        )
-        self._imu = []
-        self._keyframes.append(frame.stamp_ns)
-        self._noise.extend(noise)
-        self._last_ids = sorted_unique(np.sort(usable[0].ids))
-
-
-def _finite(seen: FeatureObservations) -> FeatureObservations:
-    """The observations that are finite."""
-    rows = np.isfinite(np.hstack([seen.pixels, seen.normalized])).all(axis=1)
-    return FeatureObservations(seen.ids[rows], seen.pixels[rows], seen.normalized[rows])
+        return len(common) > 0 and bool(common.mean() < self._config.min_common_features)

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the frames between keyframes say of a feature, put into the observations of the keyframes.
+
+From a keyframe to the frames next to it the IMU knows the motion to a fraction of a pixel. So their
+reprojection errors are those of the keyframe, with other noise: their mean replaces the error of
+the keyframe's own observation, and has a standard deviation that is smaller by the root of their
+number. The cost has no more terms and no more poses for that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.tracks import Observations
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def nearest_keyframe(stamps_ns: IntArray, keyframes: IntArray) -> IntArray:
+    """Number (N,) of the keyframe next to each frame in time."""
+    times = stamps_ns[keyframes]
+    after = np.clip(np.searchsorted(times, stamps_ns), 1, max(len(times) - 1, 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(stamps_ns - times[before] <= times[after] - stamps_ns, before, after)
+
+
+def averaged(
+    obs: Observations,
+    own: Geometry,
+    seen: Observations,
+    all_frames: Geometry,
+    nearest: IntArray,
+    projection: RigProjection,
+    limit_px: float,
+) -> tuple[Observations, IntArray]:
+    """Observations of keyframes that stand for those of the frames around them.
+
+    Args:
+        obs: of the keyframes (frame k is keyframe k).
+        own: poses of the keyframes, and the features of `obs`.
+        seen: of all frames, of the same features.
+        all_frames: poses of all frames, and the features of `obs`.
+        nearest: number (N,) of the keyframe next to each frame.
+        projection: of the rig.
+        limit_px: observations with a larger error do not count.
+
+    Returns:
+        The observations, and how many (M,) each stands for: none where nothing fits.
+    """
+    residuals, depths = projection.residuals(seen, all_frames)
+    fits = (np.linalg.norm(residuals, axis=1) < limit_px) & (depths > 0.0)
+    cameras = len(projection.cameras)
+    key = _key(seen.feature, nearest[seen.frame], seen.camera, len(obs.frames), cameras)
+    own_key = _key(obs.feature, obs.frame, obs.camera, len(obs.frames), cameras)
+    row = np.minimum(np.searchsorted(own_key, key), len(own_key) - 1)
+    counted = fits & (own_key[row] == key)
+    row, residuals = row[counted], residuals[counted]
+    counts = np.bincount(row, minlength=len(obs))
+    sums = np.stack([np.bincount(row, residuals[:, i], len(obs)) for i in range(2)], axis=1)
+    mean = sums / np.maximum(counts, 1)[:, None]
+    predicted = obs.pixels - projection.residuals(obs, own)[0]
+    return replace(obs, pixels=predicted + mean), counts
+
+
+def _key(
+    feature: IntArray, keyframe: IntArray, camera: IntArray, keyframes: int, cameras: int
+) -> IntArray:
+    """A number for each observation, ascending where observations are sorted."""
+    return (feature * keyframes + keyframe) * cameras + camera
