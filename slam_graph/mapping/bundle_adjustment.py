@@ -132,11 +132,11 @@ class BundleAdjustment:
         """
         points, good = self._triangulated(self._candidates)
         obs = self._candidates.subset(good)
-        before, *_ = self._minimize(obs, points[good], np.ones(len(obs), np.int64))
+        before, *_ = self._minimize(obs, points[good], np.ones(len(obs)))
         points, good = self._triangulated(self._candidates)
         points, good = self._known(self._candidates, points, good)
-        obs, points, counts = self._without_outliers(good, points[good])
-        _, cost, imu_cost = self._minimize(obs, points, counts)
+        obs, points, variances = self._without_outliers(good, points[good])
+        _, cost, imu_cost = self._minimize(obs, points, variances)
         dynamics = 15 * max(len(self._piece.keyframes) - 1, 1)
         return Adjustment(
             self._states(),
@@ -169,8 +169,8 @@ class BundleAdjustment:
 
     def _without_outliers(
         self, good: BoolArray, points: FloatArray
-    ) -> tuple[Observations, FloatArray, IntArray]:
-        """Observations that fit, their features, and how many frames each stands for.
+    ) -> tuple[Observations, FloatArray, FloatArray]:
+        """Observations that fit, their features, and variances over that of a single one.
 
         Args:
             good: (J,) candidates that have a position.
@@ -187,11 +187,11 @@ class BundleAdjustment:
             nearest = nearest_keyframe(self._piece.stamps_ns, self._piece.keyframes)
         else:
             theirs, nearest = own, np.arange(len(self._piece.keyframes))
-        obs, counts = averaged(obs, own, seen, theirs, nearest, self._projection, limit_px)
-        used = counts > 0
-        obs, counts = obs.rows(used), counts[used]
+        obs, variances = averaged(obs, own, seen, theirs, nearest, self._projection, limit_px)
+        used = np.isfinite(variances)
+        obs, variances = obs.rows(used), variances[used]
         enough = np.bincount(views(obs)[0], minlength=len(obs.ids)) >= MIN_KEYFRAMES
-        return obs.subset(enough), points[enough], counts[enough[obs.feature]]
+        return obs.subset(enough), points[enough], variances[enough[obs.feature]]
 
     # --- the cost --------------------------------------------------------------------------------
 
@@ -231,23 +231,23 @@ class BundleAdjustment:
                 factors += zero_velocity_factors(k, k + 1, self._backend.zero_velocity)
         return factors
 
-    def _projections(self, obs: Observations, counts: IntArray) -> list[gtsam.NonlinearFactor]:
-        """A factor for each observation, which stands for some frames."""
+    def _projections(self, obs: Observations, variances: FloatArray) -> list[gtsam.NonlinearFactor]:
+        """A factor for each observation, with its variance over that of a single one."""
         robust = {
             "robust_loss": self._config.robust_loss,
             "robust_width": self._config.robust_width,
         }
         gating = self._backend.gating.model_copy(update=robust)
         factors: list[gtsam.NonlinearFactor] = []
-        for count in np.unique(counts).tolist():
-            noise = pixel_noise(self._backend.noise.pixel_sigma / math.sqrt(count), gating)
-            factors += ProjectionFactors(self._rig, noise).of(obs.rows(counts == count))
+        for variance in np.unique(variances).tolist():  # one for each size of a group
+            noise = pixel_noise(self._backend.noise.pixel_sigma * math.sqrt(variance), gating)
+            factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return factors
 
     # --- Levenberg-Marquardt ---------------------------------------------------------------------
 
     def _minimize(
-        self, obs: Observations, points: FloatArray, counts: IntArray
+        self, obs: Observations, points: FloatArray, variances: FloatArray
     ) -> tuple[float, float, float]:
         """Move the values to the minimum.
 
@@ -263,7 +263,7 @@ class BundleAdjustment:
             start.insert(L(j), point)
         inertial = _graph(self._prior() + self._dynamics())
         graph = gtsam.NonlinearFactorGraph(inertial)
-        graph.push_back(_graph(self._projections(obs, counts)))
+        graph.push_back(_graph(self._projections(obs, variances)))
         params = gtsam.LevenbergMarquardtParams()
         params.setOrdering(gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
