@@ -19,6 +19,7 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.config_tree import ConfigTree, closest, override, read_tree, validate
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
+from slam_graph.mapping.final_ba_config import FinalBaConfig
 
 DEFAULT_ALGORITHM = "msckf"
 
@@ -109,6 +110,8 @@ class RunConfig(Settings):
     """From images to features."""
     backend: BackendConfig = BackendConfig()
     """From features and IMU to states."""
+    final_ba: FinalBaConfig = FinalBaConfig()
+    """The bundle adjustment over the whole recording that ends a run."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 

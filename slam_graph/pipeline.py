@@ -13,6 +13,7 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.base import Sequence
 from slam_graph.errors import DataError
 from slam_graph.frontend.registry import build_frontend
+from slam_graph.final_stage import FinalStage
 from slam_graph.known_start import KnownStart
 from slam_graph.output.run_result import RunResult
 from slam_graph.output.timing import Stopwatch, milliseconds
@@ -30,6 +31,10 @@ class Progress(Protocol):
         """Called after each frame with its time."""
         ...
 
+    def adjusting(self, done: int, keyframes: int, steps: int) -> None:
+        """Called after each step of the final bundle adjustment, with keyframes done and all."""
+        ...
+
 
 class Recorder(Protocol):
     """Takes what the front end found, with the IMU samples that led up to it."""
@@ -43,6 +48,9 @@ class NullProgress:
     """Tells nobody."""
 
     def advance(self, stamp_ns: int, initialized: bool) -> None:
+        """Tell nobody."""
+
+    def adjusting(self, done: int, keyframes: int, steps: int) -> None:
         """Tell nobody."""
 
 
@@ -87,33 +95,36 @@ def run(
     estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
-    with (
-        outcome(result, estimator, sequence.diagnostics),
-        _watched(viewer, result),
-        interrupts_between_frames() as frame_done,
-    ):
-        for packet, clock in _packets(sequence, result):
-            features = frontend.track(packet.frame)
-            clock.lap("frontend", milliseconds(frontend.frame_stats))
-            start.apply(estimator, packet.frame.stamp_ns, result)
-            estimator.add_imu(packet.imu)
-            state = estimate(estimator, features)
-            clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
-            if estimator.costs:
-                result.steps.append(features.stamp_ns, estimator.costs, estimator.columns)
-            result.innovations.append(features.stamp_ns, estimator.innovations)
-            ids, points = estimator.landmarks()
-            if state is not None:
-                check_sane(state, config.limits)
-                result.history.append(state)
-                result.points.update(ids, points)
-            if state is not None and estimator.calibration is not None:
-                result.calibration.append(estimator.calibration)
-            result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
-            recorder.write(packet.imu, features)
-            progress.advance(features.stamp_ns, estimator.initialized)
-            viewer.show(packet.frame, features, state, points)
-            frame_done()
+    with FinalStage(result, sequence.diagnostics) as final:
+        with (
+            outcome(result, estimator, sequence.diagnostics),
+            _watched(viewer, result),
+            interrupts_between_frames() as frame_done,
+        ):
+            for packet, clock in _packets(sequence, result):
+                features = frontend.track(packet.frame)
+                clock.lap("frontend", milliseconds(frontend.frame_stats))
+                start.apply(estimator, packet.frame.stamp_ns, result)
+                estimator.add_imu(packet.imu)
+                state = estimate(estimator, features)
+                clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
+                if estimator.costs:
+                    result.steps.append(features.stamp_ns, estimator.costs, estimator.columns)
+                result.innovations.append(features.stamp_ns, estimator.innovations)
+                ids, points = estimator.landmarks()
+                if state is not None:
+                    check_sane(state, config.limits)
+                    result.history.append(state)
+                    result.points.update(ids, points)
+                if state is not None and estimator.calibration is not None:
+                    result.calibration.append(estimator.calibration)
+                result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
+                recorder.write(packet.imu, features)
+                final.keep(packet.imu, features, estimator.imu_noise)
+                progress.advance(features.stamp_ns, estimator.initialized)
+                viewer.show(packet.frame, features, state, points)
+                frame_done()
+        final.finish(progress.adjusting)
     return result
 
 

@@ -45,6 +45,11 @@ class EstimatorLike(Protocol):
         ...
 
     @property
+    def imu_noise(self) -> tuple[float, float]:
+        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
+        ...
+
+    @property
     def initialized(self) -> bool:
         """Whether there is a state."""
         ...

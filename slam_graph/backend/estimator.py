@@ -141,6 +141,11 @@ class Estimator:
         return self.window is not None
 
     @property
+    def imu_noise(self) -> tuple[float, float]:
+        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
+        return self._propagation.noise.factors
+
+    @property
     def waiting_for(self) -> str:
         """What a start still needs."""
         return self._initializer.waiting_for

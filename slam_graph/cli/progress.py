@@ -55,15 +55,31 @@ class ProgressBar:
         sys.stderr.write(f"\r{self._line}" if self._terminal else f"{self._line}\n")
         sys.stderr.flush()
 
+    def adjusting(self, done: int, keyframes: int, steps: int) -> None:
+        """Show how far the bundle adjustment over the whole recording is."""
+        now = time.monotonic()
+        if now - self._shown < self._period_s:
+            return
+        self._shown = now
+        bar = _bar(done / keyframes) if self._terminal else ""
+        text = f"{bar}final BA: {done} of {keyframes} keyframes done, step {steps}"
+        sys.stderr.write(f"\r{text:<90}" if self._terminal else f"{text}\n")
+        sys.stderr.flush()
+
     def _text(self, done_ns: int, elapsed_s: float, initialized: bool) -> str:
         """The line."""
         part = min(max(done_ns / self._length_ns, 0.0), 1.0)
-        filled = round(part * BAR_WIDTH)
         rate = self._frames / max(elapsed_s, 1e-9)
         factor = done_ns * 1e-9 / max(elapsed_s, 1e-9)
-        bar = f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] " if self._terminal else ""
+        bar = _bar(part) if self._terminal else ""
         state = "" if initialized else ", initialising"
         return (
             f"{bar}{part:4.0%} {self._frames} frames, {rate:.0f} frames/s, "
             f"{factor:.1f} x real time{state:<14}"
         ).rstrip() + (" " * 4 if self._terminal else "")
+
+
+def _bar(part: float) -> str:
+    """A bar of which a part is filled."""
+    filled = round(part * BAR_WIDTH)
+    return f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] "

@@ -63,6 +63,14 @@ def run(
     progress: Annotated[
         bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
     ] = True,
+    final_ba: Annotated[
+        bool | None,
+        typer.Option(
+            "--final-ba/--no-final-ba",
+            help="Solve the recording as a whole at the end (on by default).",
+            show_default=False,
+        ),
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -76,7 +84,14 @@ def run(
     from slam_graph.config import load_config
     from slam_graph.datasets.registry import open_dataset
 
-    said = {"algorithm": algorithm, "cameras": cameras, "start_s": start, "duration_s": duration}
+    said: dict[str, Any] = {
+        "algorithm": algorithm,
+        "cameras": cameras,
+        "start_s": start,
+        "duration_s": duration,
+    }
+    if final_ba is not None:
+        said["final_ba"] = {"enabled": final_ba}
     settings = load_config(config, set_ or (), **said, seed=seed)
     with _collected_log() as log:
         sequence = open_dataset(

@@ -28,10 +28,7 @@ IntArray = NDArray[np.int64]
 def nearest_keyframe(stamps_ns: IntArray, keyframes: IntArray) -> IntArray:
     """Number (N,) of the keyframe next to each frame in time."""
     times = stamps_ns[keyframes]
-    after = np.clip(np.searchsorted(times, stamps_ns), 1, max(len(times) - 1, 1))
-    after = np.minimum(after, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(stamps_ns - times[before] <= times[after] - stamps_ns, before, after)
+    return np.searchsorted(times[:-1] + np.diff(times) // 2, stamps_ns)
 
 
 def averaged(

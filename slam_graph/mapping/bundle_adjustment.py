@@ -51,8 +51,8 @@ MAX_START_ERROR_PX = 30.0
 MAX_LAMBDA = 1e5
 """Damping beyond which there is no step that lowers the cost."""
 
-Report = Callable[[float], None]
-"""Is told the relative change of the cost after each step."""
+Report = Callable[[int], None]
+"""Is told the number of steps after each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,7 +273,7 @@ class BundleAdjustment:
             self._iterations += 1
             fallen = cost - optimizer.error()
             cost = optimizer.error()
-            self._report(fallen / max(cost, 1e-300))
+            self._report(self._iterations)
             if fallen <= self._config.tolerance * cost or optimizer.lambda_() > MAX_LAMBDA:
                 break
         if not math.isfinite(cost):

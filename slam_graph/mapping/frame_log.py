@@ -28,8 +28,8 @@ from slam_graph.sensors.rig import Rig
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
-MAX_AHEAD_NS = 10_000_000_000
-"""A frame that is later than the last IMU sample by more than this has a wrong stamp."""
+MAX_BEYOND_NS = 100_000_000
+"""Frames that the first or last IMU sample is farther from than this have no motion."""
 JITTER = 0.95
 """A keyframe may come this much earlier than the spacing says: stamps jitter."""
 
@@ -57,7 +57,7 @@ class FrameLog:
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
         self._imu: list[ImuData] = []
-        self._newest_imu_ns: int | None = None
+        self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
 
     @classmethod
@@ -84,10 +84,9 @@ class FrameLog:
         """
         if len(imu):
             self._imu.append(imu)
-            self._newest_imu_ns = int(imu.stamps_ns[-1])
-        follows = not self._frames or frame.stamp_ns > self._frames[-1]
-        newest_ns = self._newest_imu_ns
-        if not follows or newest_ns is None or frame.stamp_ns > newest_ns + MAX_AHEAD_NS:
+            first, last = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
+            self._imu_ns = (first if self._imu_ns is None else self._imu_ns[0], last)
+        if not self._follows(frame.stamp_ns):
             return
         missing = len(self._rig.cameras) - len(frame.cameras)
         cameras = frame.cameras + (FeatureObservations.empty(),) * missing
@@ -120,6 +119,14 @@ class FrameLog:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = TrackRecordingSequence(self._path, diagnostics=_Silent())
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
+
+    def _follows(self, frame_ns: int) -> bool:
+        """Whether a frame follows those before, at a time of which the IMU tells."""
+        if self._imu_ns is None or (len(self._frames) and frame_ns <= self._frames[-1]):
+            return False
+        stamp_ns = frame_ns + round(self._rig.cameras[0].time_offset_s * 1e9)
+        first_ns, last_ns = self._imu_ns
+        return first_ns - MAX_BEYOND_NS <= stamp_ns <= last_ns + MAX_BEYOND_NS
 
     def _is_keyframe(self, frame: FeatureFrame) -> bool:
         if not self._keyframes:

@@ -40,6 +40,7 @@ def metrics_table(result: RunResult) -> Table:
             "seed": result.config.seed,
             "extent": _extent(result),
             "accuracy": _accuracy(result),
+            "final_ba": _final_ba(result),
             "nees": _nees(result),
             "nis": innovation_report(result.innovations.columns()),
             "calibration": result.calibration.table(),
@@ -97,6 +98,15 @@ def _accuracy(result: RunResult) -> Table | None:
     if truth is None or len(result.history) == 0:
         return None
     return accuracy_report(truth, result.trajectory)
+
+
+def _final_ba(result: RunResult) -> Table | None:
+    """What the bundle adjustment over the whole recording took and reached, if there was one."""
+    if result.final_ba is None:
+        return None
+    trajectory, truth = result.final_ba.trajectory, result.truth_of_run()
+    accuracy = None if truth is None else accuracy_report(truth, trajectory)
+    return {**asdict(result.final_ba.summary), "accuracy": accuracy}
 
 
 def _nees(result: RunResult) -> Table | None:

@@ -48,6 +48,9 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
     states = folder / "states.csv"
     write_text(states, state_lines(result.history))
     files = [trajectory, states]
+    if result.final_ba is not None:
+        files.append(folder / "trajectory_smoothed.tum")
+        write_text(files[-1], tum_lines(result.final_ba.trajectory))
     truth = result.truth_of_run()
     if truth is not None:
         files.append(folder / "groundtruth.tum")

@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A whole recording as one bundle adjustment, or as several that overlap where it is long.
+
+Without loop closures what a piece says of its inside hardly depends on what is far outside. So a
+long recording is solved in pieces, and each is laid on the one before, at a keyframe in the middle
+of what both share: position and yaw, which no piece knows of itself, are taken over from there.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_left
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.imu import preintegration_params
+from slam_graph.errors import EstimationError
+from slam_graph.geometry.history import StateHistory
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.mapping.bundle_adjustment import Adjustment, BundleAdjustment
+from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.mapping.frame_log import FrameLog
+from slam_graph.mapping.keyframe_states import states_at
+from slam_graph.mapping.keyframes import read_piece
+from slam_graph.sensors.rig import Rig
+
+IntArray = NDArray[np.int64]
+
+MIN_KEYFRAMES = 3
+MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
+MAX_PIXEL_RESIDUAL = 3.0
+"""Root mean square of what is left of the observations, in σ, beyond which they do not fit."""
+
+Report = Callable[[int, int, int], None]
+"""Is told after each step: keyframes that are done, all keyframes, steps so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class FinalBaSummary:
+    """What the bundle adjustment over a whole recording took.
+
+    Attributes:
+        pieces: in which the recording was solved.
+        frames: number of poses.
+        keyframes: number of keyframes, counted once for each piece.
+        features: number of features in the costs.
+        observations: number of observations in the costs.
+        iterations: Levenberg-Marquardt steps.
+        cost_before: of all observations, at the start.
+        cost_after: without outliers, at the minimum.
+        imu_residual: root mean square of the whitened residuals of the IMU.
+        pixel_residual: of the observations.
+        seconds: wall time.
+    """
+
+    pieces: int
+    frames: int
+    keyframes: int
+    features: int
+    observations: int
+    iterations: int
+    cost_before: float
+    cost_after: float
+    imu_residual: float
+    pixel_residual: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinalBa:
+    """The best trajectory of a recording.
+
+    Attributes:
+        trajectory: of all its frames, with velocities and biases.
+        summary: what it took.
+    """
+
+    trajectory: Trajectory
+    summary: FinalBaSummary
+
+
+def adjust_recording(
+    log: FrameLog,
+    causal: Trajectory,
+    rig: Rig,
+    backend: BackendConfig,
+    config: FinalBaConfig,
+    report: Report,
+) -> FinalBa:
+    """Solve a recording as a whole.
+
+    Args:
+        log: all its frames.
+        causal: the estimate to begin with, with velocities and biases, on the clock of the IMU. Its
+            first pose keeps its position and yaw, so that both live in one world.
+        rig: the best calibration there is.
+        backend: noise and triangulation.
+        config: how to solve.
+        report: is told of each step.
+
+    Raises:
+        EstimationError: if the recording does not determine a trajectory.
+    """
+    began = time.perf_counter()
+    keyframes = log.keyframes
+    if len(keyframes) < MIN_KEYFRAMES or len(causal) == 0:
+        raise EstimationError(f"{len(keyframes)} keyframes determine nothing")
+    params = preintegration_params(rig.imu, backend.noise.gravity)
+    states: list[NavState] = []
+    solved: list[Adjustment] = []
+    for first, stop in pieces(len(keyframes), config):
+        piece = read_piece(log, keyframes[first:stop], rig, backend.zero_velocity)
+        stamps_ns = piece.keyframe_stamps_ns
+        if not _reaches(causal, stamps_ns):
+            continue
+        start = states_at(causal, stamps_ns, piece.imu, params)
+        anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
+        if states:
+            anchor = min(config.overlap_keyframes // 2, len(stamps_ns) - 1)
+            states = states[: bisect_left(states, stamps_ns[anchor], key=_stamp_ns) + 1]
+            start = laid_on(start, start[anchor], states.pop())
+        steps = sum(part.iterations for part in solved)
+        told = partial(report, first, len(keyframes), steps)
+        solved.append(BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve())
+        _check(solved[-1])
+        states += solved[-1].states[piece.keyframes[anchor] if states else 0 :]
+    if not solved:
+        raise EstimationError("the causal estimate reaches none of the keyframes")
+    return FinalBa(_trajectory(states), _summary(solved, len(states), began))
+
+
+def pieces(keyframes: int, config: FinalBaConfig) -> Iterator[tuple[int, int]]:
+    """First keyframe of each piece, and the one behind its last."""
+    step = max(config.max_keyframes - config.overlap_keyframes, 1)
+    first = 0
+    while True:
+        stop = min(first + config.max_keyframes, keyframes)
+        yield first, stop
+        if stop == keyframes:
+            return
+        first += step
+
+
+def laid_on(states: list[NavState], moving: NavState, fixed: NavState) -> list[NavState]:
+    """States moved by the translation and yaw that take `moving` to `fixed`."""
+    turn = fixed.world_T_body.rotation().compose(moving.world_T_body.rotation().inverse())
+    yaw = gtsam.Rot3.Yaw(turn.yaw())
+    shift = fixed.world_T_body.translation() - yaw.rotate(moving.world_T_body.translation())
+    move = gtsam.Pose3(yaw, shift)
+    return [
+        replace(
+            state,
+            world_T_body=move.compose(state.world_T_body),
+            velocity=np.asarray(yaw.rotate(state.velocity)),
+        )
+        for state in states
+    ]
+
+
+def _stamp_ns(state: NavState) -> int:
+    return state.stamp_ns
+
+
+def _reaches(causal: Trajectory, stamps_ns: IntArray) -> bool:
+    """Whether there is a causal estimate at any of some times."""
+    return bool(np.any((stamps_ns >= causal.stamps_ns[0]) & (stamps_ns <= causal.stamps_ns[-1])))
+
+
+def _check(solved: Adjustment) -> None:
+    """Refuse what the images do not confirm."""
+    if solved.observations < MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
+        raise EstimationError(
+            f"{solved.observations} observations in {solved.keyframes} keyframes are too few"
+        )
+    if not solved.pixel_residual < MAX_PIXEL_RESIDUAL:
+        raise EstimationError(f"images do not fit: {solved.pixel_residual:.1f} σ are left")
+    if not all(np.isfinite(state.world_T_body.matrix()).all() for state in solved.states):
+        raise EstimationError("a pose is not finite")
+
+
+def _trajectory(states: list[NavState]) -> Trajectory:
+    history = StateHistory()
+    for state in states:
+        history.append(state)
+    return history.trajectory()
+
+
+def _summary(solved: list[Adjustment], frames: int, began: float) -> FinalBaSummary:
+    """The sum of all pieces."""
+
+    def total(name: str) -> int:
+        return sum(getattr(part, name) for part in solved)
+
+    def rms(name: str, weight: str) -> float:
+        weights = [getattr(part, weight) for part in solved]
+        squares = [getattr(part, name) ** 2 for part in solved]
+        return float(np.sqrt(np.average(squares, weights=weights)))
+
+    return FinalBaSummary(
+        len(solved),
+        frames,
+        total("keyframes"),
+        total("features"),
+        total("observations"),
+        total("iterations"),
+        sum(part.cost_before for part in solved),
+        sum(part.cost_after for part in solved),
+        rms("imu_residual", "keyframes"),
+        rms("pixel_residual", "observations"),
+        time.perf_counter() - began,
+    )
