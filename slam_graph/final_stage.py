@@ -87,6 +87,9 @@ class FinalStage:
                 self._give_up(error)
             except KeyboardInterrupt:
                 self._give_up(EstimationError("interrupted"))
+            except Exception as error:
+                logger.exception("internal error")
+                self._give_up(error)
         result.warnings = +self._diagnostics.counts
 
     def _solve(self, log: FrameLog, report: Report) -> None:

@@ -12,8 +12,8 @@ from slam_graph.backend.build import build_estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.base import Sequence
 from slam_graph.errors import DataError
-from slam_graph.frontend.registry import build_frontend
 from slam_graph.final_stage import FinalStage
+from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
 from slam_graph.output.run_result import RunResult
 from slam_graph.output.timing import Stopwatch, milliseconds

@@ -13,7 +13,6 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import gtsam
 import numpy as np
@@ -127,7 +126,7 @@ def adjust_recording(
             states = states[: bisect_left(states, stamps_ns[anchor], key=_stamp_ns) + 1]
             start = laid_on(start, start[anchor], states.pop())
         steps = sum(part.iterations for part in solved)
-        told = partial(report, first, len(keyframes), steps)
+        told = _told_of_all(report, first, len(keyframes), steps)
         solved.append(BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve())
         _check(solved[-1])
         states += solved[-1].states[piece.keyframes[anchor] if states else 0 :]
@@ -162,6 +161,11 @@ def laid_on(states: list[NavState], moving: NavState, fixed: NavState) -> list[N
         )
         for state in states
     ]
+
+
+def _told_of_all(report: Report, done: int, keyframes: int, steps: int) -> Callable[[int], None]:
+    """Tells of the steps of a piece as of those of the whole."""
+    return lambda step: report(done, keyframes, steps + step)
 
 
 def _stamp_ns(state: NavState) -> int:

@@ -14,6 +14,7 @@ from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.tracks import Observations
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.mapping.frame_log import FrameLog
+from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig
 
 IntArray = NDArray[np.int64]
@@ -74,6 +75,7 @@ def read_piece(
     pixels: list[FloatArray] = []
     for number, packet in enumerate(log.packets(first, stop)):
         frame = packet.frame
+        assert isinstance(frame, FeatureFrame)
         imu.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
         still.append(detector.is_still(imu, stamps[-1], frame))
@@ -100,7 +102,8 @@ def _table(
         rows = cameras == c
         normalized[rows] = mounted.camera.undistort(pixels[rows])
     order = np.lexsort((cameras, frames, ids))
-    order = order[np.isfinite(np.hstack([pixels, normalized])).all(axis=1)[order]]
+    finite = np.flatnonzero(np.isfinite(np.hstack([pixels, normalized])).all(axis=1))
+    order = order[np.isin(order, finite)]
     features, feature = np.unique(ids[order], return_inverse=True)
     return Observations(
         features,
