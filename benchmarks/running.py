@@ -78,7 +78,9 @@ class Run:
         groundtruth: Path | None = None,
         overrides: Iterable[str] = (),
         duration_s: float | None = None,
+        final_ba: bool = False,
     ) -> None:
+        overrides = (f"final_ba.enabled={str(final_ba).lower()}", *overrides)
         config = load_config(
             None, overrides, algorithm=algorithm, cameras=cameras, duration_s=duration_s
         )

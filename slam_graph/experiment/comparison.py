@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from slam_graph.config import RunConfig
+from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.sources import Source
@@ -114,6 +115,7 @@ def plan(
     runs: list[RunTask] = []
     common = next(iter(configs.values()))
     replay = {"start_s": 0.0, "duration_s": None, "cameras": None}  # the recording is cut already
+    alike = FinalBaConfig(enabled=False)  # it would end all of them in much the same
     for source in sources:
         for seed in range(seeds if source.random else 1):
             record = RecordTask(source=source, seed=seed, config=common, root=folder / "tracks")
@@ -123,7 +125,9 @@ def plan(
                     data=source.name,
                     algorithm=name,
                     seed=seed,
-                    config=_adapted(config, source).model_copy(update={**replay, "seed": seed}),
+                    config=_adapted(config, source).model_copy(
+                        update={**replay, "seed": seed, "final_ba": alike}
+                    ),
                     tracks=record.folder,
                     result=folder / "runs" / f"{source.name}_seed{seed}" / f"{name}.json",
                 )

@@ -32,6 +32,8 @@ from slam_graph.sensors.rig import Rig
 
 IntArray = NDArray[np.int64]
 
+STRIDE, SUPPORT = 10, 40
+"""Keyframes that the estimate is led back over at a time, and how many more help with it."""
 MIN_KEYFRAMES = 3
 MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
 MAX_PIXEL_RESIDUAL = 3.0
@@ -112,6 +114,7 @@ def adjust_recording(
     if len(keyframes) < MIN_KEYFRAMES or len(causal) == 0:
         raise EstimationError(f"{len(keyframes)} keyframes determine nothing")
     params = preintegration_params(rig.imu, backend.noise.gravity)
+    causal = led_back(log, causal, rig, backend, config, report)
     states: list[NavState] = []
     solved: list[Adjustment] = []
     for first, stop in pieces(len(keyframes), config):
@@ -133,6 +136,37 @@ def adjust_recording(
     if not solved:
         raise EstimationError("the causal estimate reaches none of the keyframes")
     return FinalBa(_trajectory(states), _summary(solved, len(states), began))
+
+
+def led_back(
+    log: FrameLog,
+    causal: Trajectory,
+    rig: Rig,
+    backend: BackendConfig,
+    config: FinalBaConfig,
+    report: Report,
+) -> Trajectory:
+    """A trajectory with an estimate of the time before it began.
+
+    The IMU alone leads back a few seconds, no more. So that is done in strides, each with a bundle
+    adjustment of the frames around it, up to a stride from the first frame.
+    """
+    keyframes, params = log.keyframes, preintegration_params(rig.imu, backend.noise.gravity)
+    stamps_ns = log.frames_ns[keyframes] + round(rig.cameras[0].time_offset_s * 1e9)
+    while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > STRIDE:
+        first = before - STRIDE
+        piece = read_piece(log, keyframes[first : before + SUPPORT], rig, backend.zero_velocity)
+        known = piece.keyframe_stamps_ns
+        if not _reaches(causal, known):
+            break
+        start = states_at(causal, known, piece.imu, params)
+        anchor = min(STRIDE, len(known) - 1)
+        told = _told_of_all(report, 0, len(keyframes), 0)
+        solved = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+        _check(solved)
+        earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
+        causal = _joined(_trajectory(earlier), causal)
+    return causal
 
 
 def pieces(keyframes: int, config: FinalBaConfig) -> Iterator[tuple[int, int]]:
@@ -194,6 +228,14 @@ def _trajectory(states: list[NavState]) -> Trajectory:
     for state in states:
         history.append(state)
     return history.trajectory()
+
+
+def _joined(before: Trajectory, after: Trajectory) -> Trajectory:
+    """Two trajectories with velocities and biases, one after the other."""
+    names = ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases", "accel_biases")
+    return Trajectory(
+        *(np.concatenate([getattr(before, name), getattr(after, name)]) for name in names)
+    )
 
 
 def _summary(solved: list[Adjustment], frames: int, began: float) -> FinalBaSummary:

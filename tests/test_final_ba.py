@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The bundle adjustment over a whole recording: exact, complete, in one world, and never in the way."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.association import select
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.mapping import final_adjustment
+from slam_graph.mapping.averaged_observations import nearest_keyframe
+from slam_graph.mapping.final_adjustment import FinalBa, adjust_recording, pieces
+from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.mapping.frame_log import FrameLog
+from slam_graph.output.run_result import RunResult
+from slam_graph.pipeline import run
+from slam_graph.simulation.config import (
+    FlightConfig,
+    LandmarkConfig,
+    SimulatedImuConfig,
+    SimulationConfig,
+    TrackConfig,
+)
+from slam_graph.simulation.sequence import SimulatedSequence
+from slam_graph.simulation.simulator import simulate
+
+LENGTH_S = 8.0
+DEFAULT = FinalBaConfig()
+
+
+def flight(cameras: int = 1, sigma: float = 0.0, **options: Any) -> SimulatedSequence:
+    """A flight whose sensors are as noisy as `sigma` says, relative to real ones."""
+    settings = {
+        "cameras": cameras,
+        "duration_s": LENGTH_S,
+        "rate_hz": 10.0,
+        "flight": FlightConfig(hover_s=0.0),
+        "imu": SimulatedImuConfig(rate_hz=1000.0 if sigma == 0.0 else None, noise_scale=sigma),
+        "landmarks": LandmarkConfig(density=10.0),
+        "tracks": TrackConfig(features=40, pixel_sigma=sigma),
+    }
+    return simulate(SimulationConfig(**{**settings, **options}))
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The frames of a sequence as a run keeps them."""
+
+    sequence: SimulatedSequence
+    log: FrameLog
+
+    @property
+    def truth(self) -> Trajectory:
+        truth = self.sequence.groundtruth()
+        at = np.searchsorted(truth.stamps_ns, self.log.frames_ns)
+        np.testing.assert_array_equal(truth.stamps_ns[at], self.log.frames_ns)
+        return select(truth, at)
+
+    def adjusted(
+        self, causal: Trajectory, config: FinalBaConfig = DEFAULT, report: Any = None
+    ) -> FinalBa:
+        told = report or (lambda *_: None)
+        return adjust_recording(
+            self.log, causal, self.sequence.rig, BackendConfig(), config, told
+        )
+
+
+Keep = Callable[[SimulatedSequence], Kept]
+
+
+@pytest.fixture
+def keep(tmp_path: Path) -> Keep:
+    def kept(sequence: SimulatedSequence) -> Kept:
+        with FrameLog.recording(sequence.rig, DEFAULT, tmp_path) as log:
+            for packet in sequence.packets():
+                log.add(packet.imu, packet.frame, (1.0, 1.0))
+        return Kept(sequence, log)
+
+    return kept
+
+
+def disturbed(truth: Trajectory, seed: int = 0) -> Trajectory:
+    """A trajectory with errors that a causal estimate may have; its first position has none."""
+    rng = np.random.default_rng(seed)
+    drift = np.cumsum(rng.normal(0.0, 0.005, (len(truth), 3)), axis=0)
+    drift -= drift[0]
+    assert truth.velocities is not None
+    return Trajectory(
+        truth.stamps_ns,
+        truth.positions + drift,
+        truth.quaternions,
+        truth.velocities + rng.normal(0.0, 0.05, (len(truth), 3)),
+        truth.gyro_biases,
+        truth.accel_biases,
+    )
+
+
+def worst_m(truth: Trajectory, estimate: Trajectory) -> float:
+    return float(np.linalg.norm(truth.positions - estimate.positions, axis=1).max())
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_without_noise_every_frame_is_exact(keep: Keep, cameras: int) -> None:
+    kept = keep(flight(cameras))
+    result = kept.adjusted(disturbed(kept.truth))
+    np.testing.assert_array_equal(result.trajectory.stamps_ns, kept.log.frames_ns)
+    assert worst_m(kept.truth, result.trajectory) < 1e-3
+    assert ape(kept.truth, result.trajectory, "angle_deg").statistics.max < 0.02
+    assert result.summary.cost_after < 1e-3 * result.summary.cost_before
+
+
+def test_the_time_before_the_start_is_covered(keep: Keep) -> None:
+    kept = keep(flight())
+    late = select(disturbed(kept.truth), np.arange(len(kept.truth) // 2, len(kept.truth)))
+    result = kept.adjusted(late)
+    np.testing.assert_array_equal(result.trajectory.stamps_ns, kept.log.frames_ns)
+    offset = result.trajectory.positions[len(kept.truth) // 2] - late.positions[0]
+    assert np.linalg.norm(offset) < 1e-3  # it lives in the world of the causal estimate
+    assert ape(kept.truth, result.trajectory, "trans_part", "yaw").statistics.max < 2e-3
+
+
+def test_pieces_join_to_one_trajectory(keep: Keep) -> None:
+    kept = keep(flight(2, sigma=1.0))
+    whole = kept.adjusted(kept.truth)
+    config = FinalBaConfig(max_keyframes=20, overlap_keyframes=10)
+    steps: list[tuple[int, int, int]] = []
+    cut = kept.adjusted(kept.truth, config, lambda *numbers: steps.append(numbers))
+    assert cut.summary.pieces > 1
+    np.testing.assert_array_equal(cut.trajectory.stamps_ns, whole.trajectory.stamps_ns)
+    assert worst_m(whole.trajectory, cut.trajectory) < 0.02
+    assert [step[2] for step in steps] == list(range(1, cut.summary.iterations + 1))
+    assert worst_m(kept.truth, whole.trajectory) < 0.03
+
+
+@pytest.mark.parametrize("keyframes", [3, 20, 21, 57, 100])
+def test_pieces_cover_all_keyframes_and_overlap(keyframes: int) -> None:
+    ranges = list(pieces(keyframes, FinalBaConfig(max_keyframes=20, overlap_keyframes=6)))
+    assert ranges[0][0] == 0
+    assert ranges[-1][1] == keyframes
+    assert all(stop - first <= 20 for first, stop in ranges)
+    assert all(a[1] - b[0] >= 6 for a, b in zip(ranges, ranges[1:], strict=False))
+
+
+def test_outliers_and_frames_without_features_are_survived(keep: Keep) -> None:
+    tracks = TrackConfig(features=60, outliers=0.1, loss=0.05)
+    kept = keep(flight(2, sigma=1.0, tracks=tracks))
+    result = kept.adjusted(disturbed(kept.truth))
+    assert ape(kept.truth, result.trajectory, "trans_part", "se3").statistics.rmse < 0.02
+
+
+def test_frames_belong_to_the_keyframe_next_to_them() -> None:
+    stamps = np.array([0, 10, 20, 30, 40, 50])
+    assert nearest_keyframe(stamps, np.array([0, 4, 5])).tolist() == [0, 0, 0, 1, 1, 2]
+
+
+# --- as the last stage of a run -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def demo() -> RunResult:
+    return run(open_dataset("demo"), load_config(overrides=["duration_s=15"]))
+
+
+@pytest.mark.data
+def test_it_is_better_than_the_causal_estimate_on_real_tracks(data_dir: Path) -> None:
+    truth = data_dir / "euroc_inertial" / "V1_01_easy"
+    result = run(open_dataset("demo", groundtruth=truth))
+    table = result.metrics
+    assert table["final_ba"]["frames"] == table["extent"]["frames"] == 601
+    errors = [
+        part["accuracy"]["se3"]["ate"]["translation_m"]["rmse"]
+        for part in (table, {**table["final_ba"]})
+        for part in ([part] if "accuracy" in part else [])
+    ]
+    assert errors[1] < 0.012
+    assert errors[1] < errors[0]
+
+
+def test_files_and_metrics_hold_it_and_the_causal_estimate_is_as_without(
+    demo: RunResult, tmp_path: Path
+) -> None:
+    off = run(
+        open_dataset("demo"), load_config(overrides=["duration_s=15", "final_ba.enabled=false"])
+    )
+    for result, folder in ((demo, tmp_path / "on"), (off, tmp_path / "off")):
+        result.save(folder)
+    texts = [(tmp_path / name / "trajectory.tum").read_text() for name in ("on", "off")]
+    assert texts[0] == texts[1]
+    rows = (tmp_path / "on" / "trajectory_smoothed.tum").read_text().splitlines()
+    assert len(rows) == demo.frames == demo.metrics["final_ba"]["frames"]
+    assert not (tmp_path / "off" / "trajectory_smoothed.tum").exists()
+    assert off.metrics["final_ba"] is None
+    assert demo.final_ba is not None
+    first = int(np.searchsorted(demo.final_ba.trajectory.stamps_ns, demo.trajectory.stamps_ns[0]))
+    moved = demo.final_ba.trajectory.positions[first] - demo.trajectory.positions[0]
+    assert np.linalg.norm(moved) < 0.02
+
+
+@pytest.mark.parametrize(
+    "fault", [RuntimeError("singular"), OSError("disk full"), KeyboardInterrupt(), KeyError("slip")]
+)
+def test_a_failure_leaves_the_causal_estimate_and_one_warning(
+    fault: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> Iterator[tuple[int, int]]:
+        raise fault
+
+    monkeypatch.setattr(final_adjustment, "pieces", broken)
+    result = run(open_dataset("demo"), load_config(overrides=["duration_s=3", "min_coverage=0.1"]))
+    assert result.status == "ok"
+    assert len(result.history) > 0
+    assert result.final_ba is None
+    assert result.warnings["final_ba_failed"] == 1
+
+
+def test_what_the_images_do_not_confirm_is_refused() -> None:
+    """A run that ends in its first moments, with nothing to triangulate."""
+    config = load_config(overrides=["duration_s=1.1", "min_coverage=0"])
+    result = run(open_dataset("demo"), config)
+    assert result.status == "ok"
+    assert result.final_ba is None
+    assert result.warnings["final_ba_failed"] == 1
