@@ -45,10 +45,13 @@ class FrameLog:
 
     A frame is a keyframe if it is the first or last one, if the last keyframe is as long ago as
     the spacing says, or if few of its features are left.
+
+    Attributes:
+        rig: by which the frames were undistorted.
     """
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
-        self._rig = rig
+        self.rig = rig
         self._config = config
         self._path = folder / "frames"
         self._recorder = TrackRecorder(self._path, rig)
@@ -87,7 +90,7 @@ class FrameLog:
             self._imu_ns = (first if self._imu_ns is None else self._imu_ns[0], last)
         if not self._follows(frame.stamp_ns):
             return
-        missing = len(self._rig.cameras) - len(frame.cameras)
+        missing = len(self.rig.cameras) - len(frame.cameras)
         cameras = frame.cameras + (FeatureObservations.empty(),) * missing
         frame = FeatureFrame(frame.stamp_ns, cameras)
         self._recorder.write(ImuData.concatenate(self._imu), frame)
@@ -123,7 +126,7 @@ class FrameLog:
         """Whether a frame follows those before, at a time of which the IMU tells."""
         if self._imu_ns is None or (len(self._frames) and frame_ns <= self._frames[-1]):
             return False
-        stamp_ns = frame_ns + round(self._rig.cameras[0].time_offset_s * 1e9)
+        stamp_ns = frame_ns + round(self.rig.cameras[0].time_offset_s * 1e9)
         first_ns, last_ns = self._imu_ns
         return first_ns - MAX_BEYOND_NS <= stamp_ns <= last_ns + MAX_BEYOND_NS
 

@@ -29,7 +29,7 @@ class Piece:
     Attributes:
         stamps_ns: (N,) of all frames, on the clock of the IMU.
         keyframes: (K,) numbers of the frames that are keyframes.
-        noise: (N, 2) factors on the white noise of gyroscope and accelerometer.
+        noise: (N, 2) factors on the white noise of gyroscope and accelerometer; one while it moves.
         still: (N,) whether the platform stands still.
         imu: all samples.
         seen: all observations of all frames; frame f of it is frame f.
@@ -72,7 +72,7 @@ def read_piece(
     detector, imu = StandstillDetector(standstill), ImuBuffer()
     stamps, still = [], []
     columns: list[tuple[IntArray, ...]] = []
-    pixels: list[FloatArray] = []
+    points: list[FloatArray] = []
     for number, packet in enumerate(log.packets(first, stop)):
         frame = packet.frame
         assert isinstance(frame, FeatureFrame)
@@ -81,38 +81,53 @@ def read_piece(
         still.append(detector.is_still(imu, stamps[-1], frame))
         for c, seen in enumerate(frame.cameras):
             columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
-            pixels.append(seen.pixels)
+            points.append(np.hstack([seen.pixels, seen.normalized]))
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
     return Piece(
         np.array(stamps),
         keyframes - first,
-        log.noise[first:stop],
+        _over_the_flight(log.noise[first:stop], np.array(still)),
         np.array(still),
         imu,
-        _table(ids, frames, cameras, np.concatenate(pixels), rig, stop - first),
+        _table(ids, frames, cameras, _recalibrated(np.concatenate(points), cameras, log, rig)),
     )
 
 
-def _table(
-    ids: IntArray, frames: IntArray, cameras: IntArray, pixels: FloatArray, rig: Rig, count: int
-) -> Observations:
+def _over_the_flight(noise: FloatArray, still: BoolArray) -> FloatArray:
+    """Factors (N, 2) on the noise of the IMU without the delay with which they were learned.
+
+    A causal estimate learns after some seconds that an airframe has begun to shake, and forgets it
+    at every calm moment. Here all of the motion is known: it is given the root mean square.
+    """
+    noise, moving = noise.copy(), ~still
+    if moving.any():
+        noise[moving] = np.sqrt(np.mean(noise[moving] ** 2, axis=0))
+    return noise
+
+
+def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig) -> FloatArray:
+    """Pixels and normalised coordinates (N, 4), the latter by the calibration of a rig."""
+    if rig is not log.rig:
+        for c, mounted in enumerate(rig.cameras):
+            rows = cameras == c
+            points[rows, 2:] = mounted.camera.undistort(points[rows, :2])
+    return points
+
+
+def _table(ids: IntArray, frames: IntArray, cameras: IntArray, points: FloatArray) -> Observations:
     """The observations that are finite, sorted by feature, then frame, then camera."""
-    normalized = np.empty_like(pixels)
-    for c, mounted in enumerate(rig.cameras):
-        rows = cameras == c
-        normalized[rows] = mounted.camera.undistort(pixels[rows])
-    order = np.lexsort((cameras, frames, ids))
-    finite = np.flatnonzero(np.isfinite(np.hstack([pixels, normalized])).all(axis=1))
-    order = order[np.isin(order, finite)]
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    order = finite[np.lexsort((cameras[finite], frames[finite], ids[finite]))]
     features, feature = np.unique(ids[order], return_inverse=True)
+    points = points[order]
     return Observations(
         features,
-        tuple(range(count)),
+        tuple(range(int(frames[-1]) + 1)),
         feature,
         frames[order],
         cameras[order],
-        pixels[order],
-        normalized[order],
+        points[:, :2],
+        points[:, 2:],
     )
 
 
