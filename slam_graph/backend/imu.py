@@ -106,11 +106,12 @@ class ImuBuffer:
         inside = slice(
             int(np.searchsorted(t, start_ns, side="right")), int(np.searchsorted(t, end_ns))
         )
+        around = slice(max(inside.start - 1, 0), inside.stop + 1)
         stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
-        seconds = (t - start_ns) * 1e-9
+        seconds = (t[around] - start_ns) * 1e-9
         at = (stamps - start_ns) * 1e-9
         gyro, accel = (
-            np.stack([np.interp(at, seconds, values[:, axis]) for axis in range(3)], axis=1)
+            np.stack([np.interp(at, seconds, values[around, axis]) for axis in range(3)], axis=1)
             for values in (self.data.gyro, self.data.accel)
         )
         return ImuData(stamps, gyro, accel)

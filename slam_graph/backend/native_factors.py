@@ -66,11 +66,18 @@ class ProjectionFactors:
         A point behind the camera gets a constant cost instead of an exception.
         """
         factors = []
-        for row in range(len(obs)):
-            model, factor, body_T_camera = self._cameras[int(obs.camera[row])]
-            x, j = X(obs.frames[int(obs.frame[row])]), L(int(obs.ids[obs.feature[row]]))
-            pixel = obs.pixels[row]
-            factors.append(factor(pixel, self._noise, x, j, model, False, False, body_T_camera))
+        poses, points = [X(i) for i in obs.frames], [L(j) for j in obs.ids.tolist()]
+        rows = zip(
+            obs.pixels,
+            obs.camera.tolist(),
+            obs.frame.tolist(),
+            obs.feature.tolist(),
+            strict=True,
+        )
+        for pixel, c, i, j in rows:
+            model, factor, body_T_camera = self._cameras[c]
+            keys = (poses[i], points[j])
+            factors.append(factor(pixel, self._noise, *keys, model, False, False, body_T_camera))
         return factors
 
 

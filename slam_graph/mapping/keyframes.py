@@ -14,12 +14,16 @@ from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.tracks import Observations
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.mapping.frame_log import FrameLog
-from slam_graph.sensors.measurements import FeatureFrame
+from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+
+RECENT_NS = 10_000_000_000
+"""How much of the IMU is looked through for standing still."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,19 +73,23 @@ def read_piece(
     """
     first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
     offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
-    detector, imu = StandstillDetector(standstill), ImuBuffer()
-    stamps, still = [], []
+    detector, recent = StandstillDetector(standstill), ImuBuffer()
+    samples, stamps, still = [], [], []
     columns: list[tuple[IntArray, ...]] = []
     points: list[FloatArray] = []
     for number, packet in enumerate(log.packets(first, stop)):
         frame = packet.frame
         assert isinstance(frame, FeatureFrame)
-        imu.add(packet.imu)
+        samples.append(packet.imu)
+        recent.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
-        still.append(detector.is_still(imu, stamps[-1], frame))
+        still.append(detector.is_still(recent, stamps[-1], frame))
+        recent.forget_before(stamps[-1] - RECENT_NS)
         for c, seen in enumerate(frame.cameras):
             columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
             points.append(np.hstack([seen.pixels, seen.normalized]))
+    imu = ImuBuffer()
+    imu.add(ImuData.concatenate(samples))
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
     return Piece(
         np.array(stamps),
