@@ -19,6 +19,7 @@ COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 
 FILES = {
     "trajectory.tum",
+    "trajectory_smoothed.tum",
     "states.csv",
     "map.ply",
     "timing.csv",
