@@ -30,6 +30,7 @@ class Association:
     points: Points
     found: Mask
     consistent: Mask
+    error: object = None
 
 
 class LucasKanade:
@@ -62,7 +63,7 @@ class LucasKanade:
         """
         if len(points) == 0:
             nothing = np.zeros(0, np.bool_)
-            return Association(np.zeros((0, 2), np.float32), nothing, nothing)
+            return Association(np.zeros((0, 2), np.float32), nothing, nothing, np.zeros(0))
         config = self._config
         levels = config.pyramid_levels if levels is None else levels
         start = points if guess is None else guess
@@ -72,7 +73,7 @@ class LucasKanade:
         # the patch that was found is, seen from the other side, the patch that was looked for.
         back, returned = self._lucas_kanade(target, source, forward, points, config.backward_levels)
         error = np.linalg.norm(back - points, axis=1)
-        return Association(forward, found, found & returned & (error < config.forward_backward_px))
+        return Association(forward, found, found & returned & (error < config.forward_backward_px), error)
 
     def _lucas_kanade(
         self, source: Image, target: Image, points: Points, start: Points, levels: int

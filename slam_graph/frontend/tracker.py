@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.frontend.association import LucasKanade
+from slam_graph.frontend.association import LucasKanade, Points
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor, read_mask
-from slam_graph.frontend.outliers import fundamental_inliers
+from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance, fundamental_inliers
 from slam_graph.frontend.stereo import StereoMatcher
 from slam_graph.frontend.tracks import Image, Mask, Tracks
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
@@ -89,8 +89,9 @@ class KltTracker:
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id
         if images[0] is not None:
+            before = self._tracks[0]
             self._tracks[0] = self._follow(0, images[0])
-            self._tracks[0] = self._replenish(self._tracks[0], images[0])
+            self._tracks[0] = self._replenish(before, self._tracks[0], images[0])
         for i, image in enumerate(images[1:], start=1):
             if image is None:
                 continue
@@ -180,15 +181,44 @@ class KltTracker:
         inlier[order] = fundamental_inliers(before[order], after[order], focal_px, self._config)
         return inlier
 
-    def _replenish(self, tracks: Tracks, image: Image) -> Tracks:
+    def _replenish(self, before: Tracks, tracks: Tracks, image: Image) -> Tracks:
         """The features of the reference camera, and new ones where it has few."""
         with self._timed("detect_ms"):
             corners = self._extractors[0].extract(image, tracks.pixels)
+            camera = self._rig.cameras[0].camera
+            normalized = camera.undistort(corners.astype(np.float64))
+        with self._timed("verify_ms"):
+            good = self._verified(before, tracks, corners, normalized)
+            corners, normalized = corners[good], normalized[good]
+            self._count(rejected_new=~good)
             ids = np.arange(self._next_id, self._next_id + len(corners), dtype=np.int64)
             self._next_id += len(corners)
             self.frame_stats["new"] = len(corners)
-            normalized = self._rig.cameras[0].camera.undistort(corners.astype(np.float64))
             return tracks.append(ids, corners, normalized)
+
+    def _verified(
+        self, before: Tracks, tracks: Tracks, corners: Points, normalized: NDArray[np.float64]
+    ) -> Mask:
+        """Which new corners (N, 2) can also be followed back to the last image.
+
+        Corners on edges and at occlusions, which would be lost in the next frame, fail here.
+        """
+        if before.image is None or tracks.image is None or len(tracks) < MIN_POINTS:
+            return np.ones(len(corners), np.bool_)
+        match = self._lucas_kanade.associate(tracks.image, before.image, corners, self._guess(before, tracks, corners))
+        camera = self._rig.cameras[0].camera
+        there = camera.undistort(match.points.astype(np.float64))
+        _, a, b = np.intersect1d(before.ids, tracks.ids, True, True)
+        F = eight_point(before.normalized[a], tracks.normalized[b])
+        distance = epipolar_distance(F, there, normalized) * camera.fx
+        import os; q=float(os.environ.get('Q','1')); return (match.error < q*self._config.forward_backward_px) & match.found & match.consistent & (distance < q*self._config.ransac_px)
+
+    def _guess(self, before, tracks, corners):
+        _, a, b = np.intersect1d(before.ids, tracks.ids, True, True)
+        from scipy.spatial import cKDTree
+        d, i = cKDTree(tracks.pixels[b]).query(corners, k=3)
+        flow = before.pixels[a] - tracks.pixels[b]
+        return (corners + np.median(flow[i], axis=1)).astype(np.float32)
 
     def _match(self, index: int, image: Image, first_new_id: int) -> Tracks:
         """The features of the reference camera that another camera sees too."""
