@@ -54,6 +54,11 @@ class EstimatorLike(Protocol):
         """Take the features of one time and estimate the state then."""
         ...
 
+    @property
+    def rejected(self) -> NDArray[np.int64]:
+        """Ids (N,) of the features that the gate rejected in the last step."""
+        ...
+
     def landmarks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Ids (N,) and world positions (N, 3) of features."""
         ...

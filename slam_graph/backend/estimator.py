@@ -178,6 +178,11 @@ class Estimator:
                 return None
             return self.window.current(self.window.prior)
 
+    @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected in the last step."""
+        return self._construction.rejected
+
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
         if self.window is None:

@@ -55,12 +55,14 @@ class SmootherFeatures:
 
     Attributes:
         active: ids (N,) of the features that are variables, ascending.
+        rejected: ids (N,) of those whose last observation the gate rejected.
     """
 
     def __init__(
         self, rig: Rig, policy: SmootherPolicy, config: BackendConfig, diagnostics: Diagnostics
     ) -> None:
         self.active = np.zeros(0, np.int64)
+        self.rejected = np.zeros(0, np.int64)
         self._policy = policy
         self._config = config
         self._diagnostics = diagnostics
@@ -110,6 +112,7 @@ class SmootherFeatures:
         self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray
     ) -> NDArray[np.bool_]:
         """Which observations (N,) are where the predicted pose lets them be."""
+        self.rejected = np.zeros(0, np.int64)
         if len(obs) == 0:
             return np.zeros(0, np.bool_)
         at = Geometry(
@@ -121,6 +124,7 @@ class SmootherFeatures:
         distances = squared_mahalanobis(residuals / sigma, by_pose / sigma, covariance)
         largest = GATE_SCALE * threshold(np.array([2]), self._config.gating.confidence)[0]
         good = (distances < largest) & (depths > 0.0)
+        self.rejected = np.unique(obs.ids[obs.feature[~good]])
         self._diagnostics.counts["feature_rejected_by_gate"] += int(np.sum(~good))
         return np.asarray(good)
 
