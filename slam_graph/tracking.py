@@ -55,7 +55,10 @@ class Tracking:
         self._feedback = feedback
 
     def run(self) -> Generator[TrackedPacket, None, None]:
-        """The packets, to be closed when no more are wanted. A fault in one is raised when its turn comes, not while it is read ahead."""
+        """The packets, to be closed when no more are wanted.
+
+        A fault in one is raised when its turn comes, not while it is read ahead.
+        """
         if self._overlap:
             yield from self._ahead()
             return

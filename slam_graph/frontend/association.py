@@ -36,10 +36,12 @@ class Births:
     Attributes:
         points: (M, 2) float32 pixels in the new image.
         origins: (M, 2) float32 pixels in the image before, or None if they were not looked for.
+        share: their epipolar distance must be below this share of what is allowed to others.
     """
 
     points: Points
     origins: Points | None
+    share: float = 1.0
 
 
 class Associator(Protocol):

@@ -81,7 +81,8 @@ class FrontendConfig(BaseModel):
     """Whether a new feature must also be found in the image before."""
 
     verification: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
-    """Errors allowed to a new feature, as a share of those allowed to one that is followed."""
+    """Errors allowed to a new corner of `klt`, as a share of those allowed to one that is
+    followed."""
 
     min_corner_score: Annotated[float, Field(ge=0.0)] = 2e-3
     """Smallest Shi-Tomasi eigenvalue of a corner (OpenCV's scale: grey levels / 255)."""

@@ -29,11 +29,9 @@ class Descriptor(Protocol):
     """Describes keypoints.
 
     Attributes:
-        norm: how two descriptors are compared, OpenCV's `NORM_L2` or `NORM_HAMMING`.
         max_distance: two descriptors further apart than this do not show the same point.
     """
 
-    norm: int
     max_distance: float
 
     def describe(self, image: Image, keypoints: Keypoints) -> tuple[Indices, Vectors]:
@@ -41,7 +39,8 @@ class Descriptor(Protocol):
 
         Returns:
             kept: (M,) indices of the keypoints (N) that are not too close to the edge, ascending.
-            descriptors: (M, D) float32, or uint8 with eight bits each.
+            descriptors: (M, D) float32, compared by Euclidean distance; or uint8 with eight bits
+                each, compared by the number of bits that differ.
         """
         ...
 
@@ -49,9 +48,8 @@ class Descriptor(Protocol):
 class OpenCvDescriptor:
     """A descriptor of OpenCV."""
 
-    def __init__(self, extractor: cv2.Feature2D, norm: int, max_distance: float) -> None:
+    def __init__(self, extractor: cv2.Feature2D, max_distance: float) -> None:
         self._extractor = extractor
-        self.norm = norm
         self.max_distance = max_distance
 
     def describe(self, image: Image, keypoints: Keypoints) -> tuple[Indices, Vectors]:
@@ -72,7 +70,7 @@ class Orb(OpenCvDescriptor):
 
     def __init__(self) -> None:
         orb = cv2.ORB.create(nlevels=ORB_LEVELS, edgeThreshold=ORB_EDGE_PX)
-        super().__init__(orb, cv2.NORM_HAMMING, 64.0)
+        super().__init__(orb, 64.0)
 
     def _prepared(self, keypoints: Keypoints) -> Keypoints:
         # the octave names a level of ORB's own pyramid, which other detectors do not have
@@ -90,7 +88,7 @@ class Sift(OpenCvDescriptor):
     """SIFT (Lowe 2004): histograms of gradients in 4 x 4 fields."""
 
     def __init__(self) -> None:
-        super().__init__(cv2.SIFT.create(), cv2.NORM_L2, 250.0)
+        super().__init__(cv2.SIFT.create(), 250.0)
 
     def _prepared(self, keypoints: Keypoints) -> Keypoints:
         """The layer of SIFT's pyramid that fits the size, packed as OpenCV packs it."""
@@ -114,22 +112,24 @@ class Surf:
         ConfigError: where mahotas is not installed.
     """
 
-    norm = cv2.NORM_L2
     max_distance = 0.45
 
     def __init__(self) -> None:
         self._surf = require("mahotas.features.surf", "descriptor SURF")
 
     def describe(self, image: Image, keypoints: Keypoints) -> tuple[Indices, Vectors]:
-        """Describe everything; beyond the edge the image counts as black."""
+        """Describe what is far enough from the edge."""
         if len(keypoints) == 0:
             return np.zeros(0, np.int64), np.zeros((0, 64), np.float32)
         scale = np.maximum(0.5 * keypoints.sizes_px, 1.0)
         v, u = keypoints.pixels[:, 1], keypoints.pixels[:, 0]
-        rows = np.column_stack([v, u, scale, keypoints.scores, np.ones(len(keypoints))])
-        vectors = self._surf.descriptors(image, rows, descriptor_only=True).astype(np.float32)
-        good = np.isfinite(vectors).all(axis=1) & (np.linalg.norm(vectors, axis=1) > 0.5)
-        return np.flatnonzero(good), vectors[good]
+        # what is in the column of the score comes back unchanged, so it can tell what was left out
+        index = np.arange(len(keypoints))
+        rows = np.column_stack([v, u, scale, index, np.ones(len(keypoints))])
+        described = self._surf.descriptors(image, rows)
+        kept, vectors = described[:, 3].astype(np.int64), described[:, 6:].astype(np.float32)
+        good = np.isfinite(vectors).all(axis=1)
+        return kept[good], vectors[good]
 
 
 class Brief:
@@ -139,7 +139,6 @@ class Brief:
         ConfigError: where scikit-image is not installed.
     """
 
-    norm = cv2.NORM_HAMMING
     max_distance = 64.0
 
     def __init__(self) -> None:
@@ -157,7 +156,7 @@ class Brief:
 
 def _brisk() -> Descriptor:
     """BRISK (Leutenegger et al. 2011): 512 comparisons on rings, with its own direction."""
-    return OpenCvDescriptor(cv2.BRISK.create(octaves=BRISK_OCTAVES), cv2.NORM_HAMMING, 110.0)
+    return OpenCvDescriptor(cv2.BRISK.create(octaves=BRISK_OCTAVES), 110.0)
 
 
 DESCRIPTORS: dict[str, Callable[[], Descriptor]] = {

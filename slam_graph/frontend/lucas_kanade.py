@@ -126,7 +126,7 @@ class CornerTracking:
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, GUIDED_LEVELS)
         limit_px = self._config.verification * self._config.forward_backward_px
         good = flow.found & (flow.error_px < limit_px)
-        return Births(points[good], flow.points[good])
+        return Births(points[good], flow.points[good], self._config.verification)
 
     def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
         """Nothing to remember: corners are found again by their image."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
@@ -26,6 +25,19 @@ SAME_PX = 3.0
 """Keypoints this close are the same corner at two scales, and do not rival one another."""
 
 
+def descriptor_distances(a: Vectors, b: Vectors) -> NDArray[np.float64]:
+    """Distances (N, M) of descriptors (N, D) and (M, D).
+
+    The number of bits that differ where they are uint8, Euclidean otherwise.
+    """
+    if a.dtype != np.uint8:
+        distances: NDArray[np.float64] = cdist(a, b)
+        return distances
+    words_a, words_b = (np.ascontiguousarray(v).view(np.uint64) for v in (a, b))
+    bits = np.bitwise_count(words_a[:, None] ^ words_b[None])
+    return np.asarray(bits.sum(axis=2), np.float64)
+
+
 def match(
     wanted: Vectors,
     offered: Vectors,
@@ -41,7 +53,7 @@ def match(
         offered: (M, D) descriptors to choose from.
         guess: (N, 2) where the first should be, in the image of the second.
         pixels: (M, 2) where the second are.
-        descriptor: its norm and largest distance.
+        descriptor: its largest distance.
         config: window, ratio and mutual check.
 
     Returns:
@@ -50,9 +62,7 @@ def match(
     n, m = len(wanted), len(offered)
     if n == 0 or m == 0:
         return np.full(n, -1, np.int64)
-    kind = cv2.CV_32S if descriptor.norm == cv2.NORM_HAMMING else cv2.CV_32F
-    distance = cv2.batchDistance(wanted, offered, kind, normType=descriptor.norm)[0]
-    distance = distance.astype(np.float64)
+    distance = descriptor_distances(wanted, offered)
     distance[cdist(guess, pixels) > config.search_radius_px] = np.inf
     rows = np.arange(n)
     best = np.argmin(distance, axis=1)
