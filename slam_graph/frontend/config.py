@@ -102,6 +102,10 @@ class FrontendConfig(BaseModel):
     pyramid_levels: Annotated[int, Field(ge=0, le=8)] = 3
     """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
 
+    guided_levels: Annotated[int, Field(ge=0, le=8)] = 1
+    """Halvings where a prediction tells Lucas-Kanade where to begin; features that are not found
+    that way are looked for again with all `pyramid_levels`."""
+
     lk_iterations: Count = 15
     """Most iterations on each level of the pyramid."""
 

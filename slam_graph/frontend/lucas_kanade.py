@@ -104,10 +104,17 @@ class CornerTracking:
         if before.image is None or len(before) == 0:
             nothing = np.zeros(0, np.bool_)
             return Match(np.zeros((0, 2), np.float32), nothing, {})
-        flow = self._lucas_kanade.flow(
-            before.image, image, before.pixels, guess, config.pyramid_levels
-        )
+        guided = config.prediction != "none"
+        levels = config.guided_levels if guided else config.pyramid_levels
+        flow = self._lucas_kanade.flow(before.image, image, before.pixels, guess, levels)
         good = flow.found & (flow.error_px < config.forward_backward_px)
+        if guided and levels < config.pyramid_levels and not good.all():
+            again = np.flatnonzero(~good)
+            second = self._lucas_kanade.flow(
+                before.image, image, before.pixels[again], guess[again], config.pyramid_levels
+            )
+            flow.points[again], flow.found[again] = second.points, second.found
+            good[again] = second.found & (second.error_px < config.forward_backward_px)
         fates = {"lost_klt": ~flow.found, "lost_fb": flow.found & ~good}
         return Match(flow.points, good, fates)
 
