@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.frontend.prediction import Prediction
 from slam_graph.frontend.tracks import Image, Tracks
 
 
@@ -50,13 +51,13 @@ class Associator(Protocol):
     For each image `follow`, `recover`, `births` and `adopt` are called in this order.
     """
 
-    def follow(self, before: Tracks, image: Image, guess: Points) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
         """Find features in the next image.
 
         Args:
             before: of the image before.
             image: the next one.
-            guess: (N, 2) where to look first.
+            guess: where to look first.
         """
         ...
 

@@ -102,7 +102,7 @@ class CameraTracker:
             points = births.points
             normalized = self._camera.undistort(points.astype(np.float64))
             good = np.ones(len(points), np.bool_)
-            drift = np.zeros((len(points), 2))
+            drift = np.full((len(points), 2), np.nan)
             if births.origins is not None:
                 origins = self._camera.undistort(births.origins.astype(np.float64))
                 F = eight_point(before.normalized[there], after.normalized[here])

@@ -31,7 +31,7 @@ class MatchingConfig(BaseModel):
     """A match lies within this distance of where the feature is predicted."""
 
     ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.85
-    """Ratio test: the best match is at most this share of the distance of the second best."""
+    """Ratio test: the best match is less than this share of the distance of the second best."""
 
     mutual: bool = True
     """Whether a match must be the best one seen from either image."""
@@ -103,8 +103,8 @@ class FrontendConfig(BaseModel):
     """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
 
     guided_levels: Annotated[int, Field(ge=0, le=8)] = 1
-    """Halvings where a prediction tells Lucas-Kanade where to begin; features that are not found
-    that way are looked for again with all `pyramid_levels`."""
+    """Halvings where the prediction is good (the rotation is measured, the rest known); features
+    that are not found that way are looked for again with all `pyramid_levels`."""
 
     lk_iterations: Count = 15
     """Most iterations on each level of the pyramid."""

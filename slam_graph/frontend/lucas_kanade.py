@@ -14,7 +14,7 @@ from slam_graph.frontend.association import Births, Match, inside
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor
 from slam_graph.frontend.keypoints import Mask, Points
-from slam_graph.frontend.prediction import neighbour_flow
+from slam_graph.frontend.prediction import Prediction, neighbour_flow
 from slam_graph.frontend.tracks import Image, Tracks
 
 GUIDED_LEVELS = 1
@@ -95,28 +95,25 @@ class CornerTracking:
         self._extractor = extractor
         self._config = config
         self._lucas_kanade = LucasKanade(config)
-        self._image: Image | None = None
+        self._guided = min(config.guided_levels, config.pyramid_levels)
 
-    def follow(self, before: Tracks, image: Image, guess: Points) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
         """Find features in the next image."""
-        config = self._config
-        self._image = image
-        if before.image is None or len(before) == 0:
-            nothing = np.zeros(0, np.bool_)
-            return Match(np.zeros((0, 2), np.float32), nothing, {})
-        guided = config.prediction != "none"
-        levels = config.guided_levels if guided else config.pyramid_levels
-        flow = self._lucas_kanade.flow(before.image, image, before.pixels, guess, levels)
-        good = flow.found & (flow.error_px < config.forward_backward_px)
-        if guided and levels < config.pyramid_levels and not good.all():
-            again = np.flatnonzero(~good)
-            second = self._lucas_kanade.flow(
-                before.image, image, before.pixels[again], guess[again], config.pyramid_levels
+        n = len(before)
+        points = np.zeros((n, 2), np.float32)
+        found, good = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        if before.image is None:
+            return Match(points, good, {})
+        # A guess that is good needs no pyramid, which can lead away from it; what is not found near
+        # it is looked for again like the features without one.
+        for levels, tried in ((self._guided, guess.trusted), (self._config.pyramid_levels, None)):
+            rows = np.flatnonzero(~good if tried is None else tried)
+            flow = self._lucas_kanade.flow(
+                before.image, image, before.pixels[rows], guess.points[rows], levels
             )
-            flow.points[again], flow.found[again] = second.points, second.found
-            good[again] = second.found & (second.error_px < config.forward_backward_px)
-        fates = {"lost_klt": ~flow.found, "lost_fb": flow.found & ~good}
-        return Match(flow.points, good, fates)
+            points[rows], found[rows] = flow.points, flow.found
+            good[rows] = flow.found & (flow.error_px < self._config.forward_backward_px)
+        return Match(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
 
     def recover(self, before: Tracks, after: Tracks) -> tuple[NDArray[np.int64], Points]:
         """Nothing: without an image of it, a corner that was lost cannot be told from others."""

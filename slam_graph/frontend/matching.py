@@ -17,7 +17,7 @@ from slam_graph.frontend.descriptors import DESCRIPTORS, Descriptor, Vectors
 from slam_graph.frontend.extraction import CornerExtractor
 from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points
 from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
-from slam_graph.frontend.prediction import neighbour_flow
+from slam_graph.frontend.prediction import Prediction, neighbour_flow
 from slam_graph.frontend.tracks import Image, Tracks
 from slam_graph.sensors.camera import Camera
 
@@ -69,7 +69,7 @@ def match(
     shortest = distance[rows, best]
     rivals = np.where(cdist(pixels, pixels)[best] < SAME_PX, np.inf, distance)
     good = (shortest <= descriptor.max_distance) & (
-        shortest <= config.ratio * np.min(rivals, axis=1)
+        shortest < config.ratio * np.min(rivals, axis=1)
     )
     if config.mutual:
         good &= np.argmin(distance, axis=0)[best] == rows
@@ -176,7 +176,7 @@ class DescriptorMatching:
         self._history: deque[Tracks] = deque(maxlen=self._matching.memory_frames + 1)
         self._images = 0
 
-    def follow(self, before: Tracks, image: Image, guess: Points) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
         """Find features in the next image."""
         self._last, self._last_free = self._offered, self._free
         keypoints = self._dense.candidates(image, self._matching.candidates)
@@ -188,9 +188,9 @@ class DescriptorMatching:
         chosen = np.full(len(before), -1, np.int64)
         known = np.isin(before.ids, self._ids)
         wanted = self._vectors[np.searchsorted(self._ids, before.ids[known])]
-        chosen[known] = self._match(wanted, guess[known], np.arange(len(pixels)))
+        chosen[known] = self._match(wanted, guess.points[known], np.arange(len(pixels)))
         good = chosen >= 0
-        points = guess.astype(np.float32)
+        points = guess.points.copy()
         points[good] = pixels[chosen[good]]
         good[good] = inside(points[good], image.shape, self._config.border_px)
         self._taken = chosen

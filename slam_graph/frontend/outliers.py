@@ -181,8 +181,8 @@ def map_inliers(
         normalized,
         np.eye(3),
         None,
-        rvec=gtsam.Rot3.Logmap(guess.rotation()).reshape(3, 1),
-        tvec=np.asarray(guess.translation()).reshape(3, 1),
+        rvec=np.array(gtsam.Rot3.Logmap(guess.rotation())).reshape(3, 1),  # copies: they are
+        tvec=np.array(guess.translation()).reshape(3, 1),  # overwritten
         useExtrinsicGuess=True,
         iterationsCount=100,
         reprojectionError=config.map_check_px / focal_px,

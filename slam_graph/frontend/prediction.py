@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.keypoints import Points
+from slam_graph.frontend.keypoints import Mask, Points
 from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.tracks import Tracks
 from slam_graph.sensors.rig import RigCamera
@@ -26,6 +28,19 @@ MAX_TANGENT = 2.0
 
 NEIGHBOURS = 3
 """The motion of this many neighbours stands for that of a new feature."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where features will be.
+
+    Attributes:
+        points: (N, 2) float32 pixels.
+        trusted: (N,) whether the rotation was measured and the rest is known of the frame before.
+    """
+
+    points: Points
+    trusted: Mask
 
 
 class PointPredictor:
@@ -48,14 +63,14 @@ class PointPredictor:
     def advance(self, start_ns: int, end_ns: int) -> None:
         """Integrate the rotation between two frames (times of the camera)."""
         start_R_end = self._motion.rotation(start_ns + self._offset_ns, end_ns + self._offset_ns)
-        self.rotation_known = start_R_end is not None
+        self.rotation_known = start_R_end is not None and self._mode != "flow"
         self.camera_R = np.eye(3)
         if start_R_end is not None:
             body_R_camera = self._body_T_camera.rotation().matrix()
             self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
 
-    def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Points:
-        """Pixels (N, 2) at which to look for the features of the image before.
+    def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Prediction:
+        """Where to look for the features of the image before.
 
         Args:
             before: in the image from which `advance` started.
@@ -63,19 +78,20 @@ class PointPredictor:
             feedback: the map, for the mode `state`.
         """
         if self._mode == "none" or len(before) == 0:
-            return before.pixels
+            return Prediction(before.pixels, np.zeros(len(before), np.bool_))
+        trusted: Mask = np.isfinite(before.drift[:, 0]) & self.rotation_known
         m = self._rotated(before.normalized)
-        m = m + before.drift * ((stamp_ns - before.stamp_ns) * 1e-9)
+        m = m + np.nan_to_num(before.drift) * ((stamp_ns - before.stamp_ns) * 1e-9)
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
-            m[known] = by_map[known]
+            m[known], trusted[known] = by_map[known], True
         sane = np.all(np.abs(m) < MAX_TANGENT, axis=1)
         pixels = before.pixels.copy()
         pixels[sane] = self._camera.distort(m[sane])[0]
         size = np.array([self._camera.width - 1, self._camera.height - 1])
         outside = np.any((pixels < 0) | (pixels > size), axis=1)
         pixels[outside] = before.pixels[outside]
-        return pixels
+        return Prediction(pixels, trusted & sane & ~outside)
 
     def body_pose(self, stamp_ns: int) -> gtsam.Pose3 | None:
         """world_T_body at a time of the camera; None where it is not known."""

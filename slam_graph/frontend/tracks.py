@@ -27,7 +27,7 @@ class Tracks:
         pixels: (N, 2) float32 in `image`.
         normalized: (N, 2) undistorted coordinates on the plane z = 1.
         drift: (N, 2) velocity of `normalized` in 1/s beyond what the rotation of the camera makes;
-            zero where it is not known.
+            NaN where it is not known.
     """
 
     image: Image | None
@@ -46,7 +46,7 @@ class Tracks:
         normalized: FloatArray,
     ) -> Tracks:
         """Features whose velocity is not known."""
-        return Tracks(image, stamp_ns, ids, pixels, normalized, np.zeros((len(ids), 2)))
+        return Tracks(image, stamp_ns, ids, pixels, normalized, np.full((len(ids), 2), np.nan))
 
     @staticmethod
     def empty(image: Image | None = None, stamp_ns: int = 0) -> Tracks:
