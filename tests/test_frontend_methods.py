@@ -200,7 +200,7 @@ def test_a_rejected_feature_is_dropped_if_so_configured(texture: Spline) -> None
 
 
 def test_features_off_the_map_are_dropped(texture: Spline) -> None:
-    config = CONFIG.model_copy(update={"map_check_px": 2.0, "prediction": "state"})
+    config = CONFIG.model_copy(update={"map_check_px": 2.0})
     frontend = build_frontend(MONO, config)
     (first,) = feed(frontend, (view(texture),))
     seen = first.cameras[0]
