@@ -17,7 +17,7 @@ from slam_graph.geometry.trajectory import Trajectory
 RECORDING = "euroc/MH_01_easy_17s"
 
 START_BAR_S = 3.0
-ATE_BAR_M = 0.02
+ATE_BAR_M = 0.01
 
 PEERS = {
     1: {"openvins": "openvins_mono"},

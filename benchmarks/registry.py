@@ -7,12 +7,13 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 
 from __future__ import annotations
 
-from benchmarks import mh01, openvins_sim, speed, wheel
+from benchmarks import frontend, mh01, openvins_sim, speed, wheel
 from benchmarks.suite import Benchmark
 
 BENCHMARKS: dict[str, Benchmark] = {
     **wheel.BENCHMARKS,
     **mh01.BENCHMARKS,
     **openvins_sim.BENCHMARKS,
+    **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
 }
