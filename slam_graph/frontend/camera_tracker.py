@@ -107,7 +107,7 @@ class CameraTracker:
                 origins = self._camera.undistort(births.origins.astype(np.float64))
                 F = eight_point(before.normalized[there], after.normalized[here])
                 distance_px = epipolar_distance(F, origins, normalized) * self._camera.fx
-                good = distance_px < births.share * self._config.ransac_px
+                good = distance_px < births.share * self._config.epipolar_px
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
                 drift = self._predictor.drift(origins, normalized, seconds)
             self._stats.count(rejected_new=~good, new=good)

@@ -36,6 +36,10 @@ class MatchingConfig(BaseModel):
     mutual: bool = True
     """Whether a match must be the best one seen from either image."""
 
+    epipolar_px: Pixels = 1.5
+    """What `ransac_px` is for corners that are followed; keypoints are found anew in each image,
+    which is less exact."""
+
     memory_frames: Annotated[int, Field(ge=0)] = 5
     """A feature that found no match is looked for in so many more frames before it is lost."""
 
@@ -127,7 +131,7 @@ class FrontendConfig(BaseModel):
     (2)."""
 
     ransac_px: Pixels = 1.0
-    """Largest epipolar distance of an inlier between two frames."""
+    """Largest epipolar distance of an inlier between two frames, for `klt`."""
 
     ransac_confidence: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.999
     """Probability with which RANSAC draws at least one sample without an outlier."""
@@ -165,3 +169,8 @@ class FrontendConfig(BaseModel):
         if self.detector != "auto":
             return self.detector
         return OWN_DETECTORS.get(self.method, "shi_tomasi")
+
+    @property
+    def epipolar_px(self) -> float:
+        """Largest epipolar distance of an inlier between two frames, for the method chosen."""
+        return self.ransac_px if self.method == "klt" else self.matching.epipolar_px

@@ -292,7 +292,7 @@ class DescriptorMatching:
     def _fits(self, missing: Missing, found: Indices, after: Tracks) -> Mask:
         """Which of the features (N,) that were found again fit the motion since they were seen."""
         fits = np.zeros(len(found), np.bool_)
-        limit = self._config.ransac_px / self._camera.fx
+        limit = self._config.epipolar_px / self._camera.fx
         for number in np.unique(missing.seen[found >= 0]).tolist():
             back = self._images - number
             if back > len(self._history):

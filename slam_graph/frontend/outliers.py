@@ -48,7 +48,7 @@ def fundamental_inliers(
         if np.count_nonzero(result) < MIN_POINTS:
             break
         F = eight_point(before[result], after[result])
-        refined: Mask = epipolar_distance(F, before, after) * focal_px < config.ransac_px
+        refined: Mask = epipolar_distance(F, before, after) * focal_px < config.epipolar_px
         if np.count_nonzero(refined) <= np.count_nonzero(result):
             break
         result = refined
@@ -67,7 +67,7 @@ def _sampled(
             np.eye(3),
             cv2.RANSAC,
             config.ransac_confidence,
-            config.ransac_px / focal_px,
+            config.epipolar_px / focal_px,
             MAX_ITERATIONS,
         )
     else:
@@ -76,7 +76,7 @@ def _sampled(
             before * focal_px,
             after * focal_px,
             cv2.USAC_MAGSAC if config.outliers == "magsac" else cv2.FM_RANSAC,
-            config.ransac_px,
+            config.epipolar_px,
             config.ransac_confidence,
             MAX_ITERATIONS,
         )
@@ -123,7 +123,7 @@ def direction_inliers(
     length = np.linalg.norm(directions, axis=1)
     directions = directions[length > 0] / length[length > 0, None]
     # m'ᵀ [t]× R m = t · n, and its gradients by m and m' are of the length |t × m|, first two rows
-    tolerance = config.ransac_px / focal_px
+    tolerance = config.epipolar_px / focal_px
     if len(directions) == 0:
         return np.ones(n, np.bool_)
     best = _within(directions, normals, turned, seen, tolerance)
