@@ -98,7 +98,8 @@ def test_descriptors_follow_the_known_motion(texture: Spline, method: str, H: np
     a, b = common(first.cameras[0], second.cameras[0])
     error = transfer(H, first.cameras[0].pixels[a]) - second.cameras[0].pixels[b]
     assert len(a) > 15
-    assert np.median(np.linalg.norm(error, axis=1)) < 1.0
+    # mahotas' blobs are found less exactly than the others
+    assert np.median(np.linalg.norm(error, axis=1)) < (1.5 if method == "surf" else 1.0)
     assert np.mean(np.linalg.norm(error, axis=1) > 3.0) < 0.1
 
 
