@@ -104,7 +104,7 @@ def run(
             if estimator.costs:
                 result.steps.append(features.stamp_ns, estimator.costs)
             ids, points = estimator.landmarks()
-            tracking.tell(Feedback(state, estimator.rejected, ids, points))
+            tracking.tell(Feedback.of(state, estimator.rejected, ids, points))
             if state is not None:
                 check_sane(state, config.limits)
                 result.history.append(state)

@@ -30,6 +30,17 @@ class Feedback:
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
+    @staticmethod
+    def of(
+        state: NavState | None,
+        rejected: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        points: NDArray[np.float64],
+    ) -> Feedback:
+        """The same from features in any order."""
+        order = np.argsort(ids, kind="stable")
+        return Feedback(state, rejected, ids[order], points[order])
+
 
 @runtime_checkable
 class Frontend(Protocol):
