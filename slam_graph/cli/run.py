@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
-from slam_graph.cli.data import Calibration, Data, Format, Groundtruth, Json
+from slam_graph.cli.data import (
+    Calibration,
+    Data,
+    Format,
+    Groundtruth,
+    Json,
+    Sources,
+    sources_from,
+)
 from slam_graph.cli.output import echo_json
 from slam_graph.cli.progress import ProgressBar
 from slam_graph.cli.summary import echo_summary
@@ -58,6 +66,7 @@ def run(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     as_json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording and write the results.
@@ -76,6 +85,7 @@ def run(
             cameras=settings.cameras,
             calibration=calibration,
             groundtruth=groundtruth,
+            sources=sources_from(sources),
         )
         result, folder, files = _execute(sequence, settings, output, rerun, progress, log)
     if as_json:
@@ -170,9 +180,10 @@ def _collected_log() -> Iterator[list[str]]:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    """Take away the folder of a run that wrote nothing."""
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    """Take away the folder of a run that wrote nothing, and that of its data set if it is empty."""
+    for empty in (folder, folder.parent):
+        if empty.is_dir() and not any(empty.iterdir()):
+            empty.rmdir()
 
 
 def _leave(result: RunResult) -> None:

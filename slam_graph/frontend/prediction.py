@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 NEAREST_DEPTH_M = 0.1
 """Points of the map nearer than this, or behind the camera, predict nothing."""
 
-MAX_TANGENT = 2.0
+MAX_TANGENT = 2.75
 """Largest normalised coordinate that a camera model is asked about."""
 
 NEIGHBOURS = 3

@@ -41,7 +41,10 @@ def overlap(reference: RigCamera, other: RigCamera) -> float:
     u, v = np.meshgrid(
         np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID)
     )
-    rays = camera.undistort(np.column_stack([u.ravel(), v.ravel()]))
+    rays, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
+    if not usable.any():
+        return 0.0
+    rays = rays[usable]
     ends = np.column_stack([rays, np.ones(len(rays))])
     other_T_reference = other.body_T_camera.between(reference.body_T_camera)
     shares = []
@@ -57,7 +60,7 @@ def _sees(mounted: RigCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     ahead = points[:, 2] > 0
     m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
     ahead &= np.all(np.abs(m) < MAX_TANGENT, axis=1)
-    pixels = camera.distort(m)[0]
+    pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
     sees: NDArray[np.bool_] = (
         ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
     )

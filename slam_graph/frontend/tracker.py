@@ -14,7 +14,7 @@ from slam_graph.frontend.association import Associator
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.camera_tracker import CameraTracker
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.extraction import CornerExtractor, read_mask
+from slam_graph.frontend.extraction import CornerExtractor, camera_mask
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.motion import ImuMotion
@@ -212,7 +212,7 @@ def _associator(
 
 
 def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
-    """The mask of each camera."""
+    """The mask of each camera: what is told, and what a wide lens cannot use."""
     if len(config.masks) > len(rig.cameras):
         raise ConfigError(
             f"frontend.masks lists {len(config.masks)} masks, "
@@ -220,6 +220,6 @@ def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
         )
     paths = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
     return [
-        None if path is None else read_mask(path, mounted.camera.width, mounted.camera.height)
+        camera_mask(mounted.camera, path, config.window_px)
         for mounted, path in zip(rig.cameras, paths, strict=True)
     ]
