@@ -88,7 +88,7 @@ class FrontendConfig(BaseModel):
     """Errors allowed to a new corner of `klt`, as a share of those allowed to one that is
     followed."""
 
-    min_corner_score: Annotated[float, Field(ge=0.0)] = 2e-3
+    min_corner_score: Annotated[float, Field(ge=0.0)] = 1e-3
     """Smallest Shi-Tomasi eigenvalue of a corner (OpenCV's scale: grey levels / 255)."""
 
     corner_window_px: Annotated[int, Field(ge=2)] = 7

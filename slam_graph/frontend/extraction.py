@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.detectors import DETECTORS, refine
-from slam_graph.frontend.keypoints import Keypoints, Mask, Points, spread
+from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points, spread
 from slam_graph.frontend.tracks import Image
 from slam_graph.sensors.camera import WIDE, Camera
 
@@ -37,6 +37,28 @@ class Cell:
     top: int
     right: int
     bottom: int
+
+
+@dataclass(frozen=True, eq=False)
+class Extracted:
+    """New points, in groups of one cell each.
+
+    Attributes:
+        points: (N, 2) float32 pixels, the best of a group first.
+        group: (N,) ascending number of each one's group.
+        quotas: (G,) how many of each group are wanted.
+    """
+
+    points: Points
+    group: Indices
+    quotas: Indices
+
+    def within_quotas(self, good: Mask) -> Mask:
+        """The first of the good points (N,) of each group, as many as are wanted."""
+        count = np.cumsum(good)
+        before = np.concatenate([[0], count])[np.searchsorted(self.group, self.group)]
+        wanted: Mask = good & (count - before <= self.quotas[self.group])
+        return wanted
 
 
 class CornerExtractor:
@@ -78,33 +100,43 @@ class CornerExtractor:
         result: Mask = self._allowed[v, u] > 0
         return result
 
-    def extract(self, image: Image, occupied: Points) -> Points:
-        """New points (M, 2) that fill up the cells in which few of the `occupied` (N, 2) lie."""
-        wanted = self._wanted(occupied)
-        if not wanted:
-            return np.zeros((0, 2), np.float32)
+    def extract(self, image: Image, occupied: Points, surplus: int = 1) -> Extracted:
+        """New points that fill up the cells in which few of the `occupied` (N, 2) lie.
+
+        Args:
+            image: to look at.
+            occupied: features that are there.
+            surplus: so many times the points that are wanted, if not all will do.
+        """
         free = self._free(occupied)
         found: list[Points] = []
+        quotas: list[int] = []
         missing = self._config.features - len(occupied)
-        whole = None if self._detector.local else self._whole(image, free)
-        for i, share in wanted:
-            count = min(missing, share)
+        whole: Keypoints | None = None
+        for i, share in self._wanted(occupied):
+            quota = min(missing, share)
             cell = self._cells[i]
-            if whole is None:
-                best = self._in_cell(image, free, cell, count)
+            if self._detector.local:
+                best = self._in_cell(image, free, cell, surplus * quota)
             else:
+                whole = self._whole(image, free) if whole is None else whole
                 best = whole.select(_inside(whole.pixels, cell))
             best = best.select(self._still_free(free, best.pixels))
-            pixels = best.pixels[spread(best.pixels, count, self._config.min_distance_px)]
-            if len(pixels) < count:
+            chosen = spread(best.pixels, surplus * quota, self._config.min_distance_px)
+            pixels = best.pixels[chosen]
+            if len(pixels) < quota:
                 self._rest[i] = REST_FRAMES
             self._occupy(free, pixels)
             found.append(pixels)
-            missing -= len(pixels)
+            quotas.append(quota)
+            missing -= min(quota, len(pixels))
             if missing <= 0:
                 break
-        pixels = np.concatenate(found)
-        return refine(image, pixels) if self._config.subpixel else pixels
+        pixels = np.concatenate([np.zeros((0, 2), np.float32), *found])
+        if self._config.subpixel:
+            pixels = refine(image, pixels)
+        group = np.repeat(np.arange(len(found)), [len(part) for part in found])
+        return Extracted(pixels, group, np.array(quotas, np.int64))
 
     def candidates(self, image: Image, count: int) -> Keypoints:
         """Keypoints all over the image, whatever is there already: what matching chooses from.

@@ -20,6 +20,9 @@ from slam_graph.frontend.tracks import Image, Tracks
 GUIDED_LEVELS = 1
 """Pyramid levels where the guess is good; more of them lead away from it."""
 
+SURPLUS = 2
+"""So many corners are tried for each new feature: not all can be followed back."""
+
 
 @dataclass(frozen=True, eq=False)
 class Flow:
@@ -122,14 +125,15 @@ class CornerTracking:
     def births(self, before: Tracks, after: Tracks, verify: bool) -> Births:
         """New corners that can be followed back to the image before."""
         assert after.image is not None
-        points = self._extractor.extract(after.image, after.pixels)
         if not verify or before.image is None:
-            return Births(points, None)
+            return Births(self._extractor.extract(after.image, after.pixels).points, None)
+        found = self._extractor.extract(after.image, after.pixels, SURPLUS)
+        points = found.points
         here, there = after.common(before)
         guess = points + neighbour_flow(after.pixels[here], before.pixels[there], points)
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, GUIDED_LEVELS)
         limit_px = self._config.verification * self._config.forward_backward_px
-        good = flow.found & (flow.error_px < limit_px)
+        good = found.within_quotas(flow.found & (flow.error_px < limit_px))
         return Births(points[good], flow.points[good], self._config.verification)
 
     def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
