@@ -182,10 +182,10 @@ def _orb(config: FrontendConfig) -> Detector:
     """ORB's detector (Rublee et al. 2011): FAST on a pyramid, ranked by Harris, with direction."""
     return WholeImage(
         cv2.ORB.create(
-            8 * config.features,
+            20 * config.features,
             nlevels=ORB_LEVELS,
             edgeThreshold=ORB_EDGE_PX,
-            fastThreshold=config.fast_threshold // 2,
+            fastThreshold=max(1, config.fast_threshold // 4),
         )
     )
 
