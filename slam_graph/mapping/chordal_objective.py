@@ -6,8 +6,8 @@
 
 with X of shape d × (n + dn): the n translations, then the n rotations side by side. κ and τ are the
 isotropic noise that fits an information matrix best (Rosen, Carlone, Bandeira and Leonard 2019,
-"SE-Sync", equations 8 to 17 and appendix). Taken as the information of g2o, where the rotation in 3D
-is that of the vector part of the quaternion.
+"SE-Sync", equations 8 to 17 and appendix). Taken as the information of g2o, where the rotation in
+3D is that of the vector part of the quaternion.
 """
 
 from __future__ import annotations

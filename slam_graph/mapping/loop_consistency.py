@@ -3,10 +3,10 @@
 """Which loop closures confirm each other, judged by short ways of odometry between them.
 
 Two loop closures (a, b) and (c, d) whose ends are near each other close a cycle a → b → d → c → a
-with the odometry between b and d and between c and a. The cycle is the identity up to its noise, which
-is small as long as these ways are short: true loop closures of one revisit confirm each other, and
-false ones agree with their neighbours only by chance. The test is that of pairwise consistency
-(Mangelson, Dominic, Eustice and Vasudevan 2018), between neighbours only.
+with the odometry between b and d and between c and a. The cycle is the identity up to its noise,
+which is small as long as these ways are short: true loop closures of one revisit confirm each
+other, and false ones agree with their neighbours only by chance. The test is that of pairwise
+consistency (Mangelson, Dominic, Eustice and Vasudevan 2018), between neighbours only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def confirmed_loops(graph: PoseGraph, along_odometry: Poses, confidence: float) 
     group = connected_components(links, directed=False)[1]
     large = np.bincount(group)[group] >= MIN_GROUP
     friends, foes = (np.bincount(rows.ravel(), minlength=count) for rows in (agreeing, contrary))
-    return loops[large & (friends > foes)]
+    confirmed: IntArray = loops[large & (friends > foes)]
+    return confirmed
 
 
 def _compare(graph: PoseGraph, loops: IntArray, along: Poses, confidence: float) -> Pairs:
@@ -101,7 +102,7 @@ class _Noise:
 
     @staticmethod
     def of(graph: PoseGraph, loops: IntArray) -> _Noise:
-        d, covariance = graph.dimension, np.linalg.inv(graph.information)
+        d, covariance = graph.dimension, np.linalg.inv(graph.angle_information)
         axes = np.diagonal(covariance, axis1=1, axis2=2)
         variances = np.stack([axes[:, d:].mean(axis=1), axes[:, :d].mean(axis=1)])
         steps = np.full((2, len(graph.keys)), np.nan)

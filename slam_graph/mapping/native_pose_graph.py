@@ -27,22 +27,22 @@ ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def edge_factors(
-    graph: PoseGraph, rows: Iterable[int], loss: RobustLoss = "none", width: float = 1.0
+    graph: PoseGraph, rows: Iterable[int], loss: str = "none", width: float = 1.0
 ) -> list[gtsam.NonlinearFactor]:
     """Between factors of some edges, under a robust loss of a given width on the whitened length.
 
     Of `dcs`, width is the Φ of Agarwal et al. 2013, which is compared with the squared length.
     """
-    between = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
-    information = graph.information
+    between: Any = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
+    information = graph.angle_information
     if graph.dimension == 3:
         information = information[:, ROTATION_FIRST[:, None], ROTATION_FIRST]
     estimator = None if loss == "none" else robust_estimator(loss, width)
     gaussian, robust = gtsam.noiseModel.Gaussian.Information, gtsam.noiseModel.Robust.Create
     poses, ends = native(graph.measured), graph.edges.tolist()
-    factors = []
+    factors: list[gtsam.NonlinearFactor] = []
     for row in rows:
-        noise = gaussian(information[row], False)
+        noise: Any = gaussian(information[row], False)
         if estimator is not None:
             noise = robust(estimator, noise)
         factors.append(between(*ends[row], poses[row], noise))
@@ -63,9 +63,7 @@ def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.Nonlinear
         graph: the pose graph.
         held: without any freedom, so that covariances are those relative to the first pose.
     """
-    prior, k = (
-        (gtsam.PriorFactorPose2, 3) if graph.dimension == 2 else (gtsam.PriorFactorPose3, 6)
-    )
+    prior, k = (gtsam.PriorFactorPose2, 3) if graph.dimension == 2 else (gtsam.PriorFactorPose3, 6)
     noise = (
         gtsam.noiseModel.Constrained.All(k)
         if held
@@ -79,7 +77,7 @@ def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.Nonlinear
 
 def typical_information(graph: PoseGraph) -> float:
     """The median of the diagonals of the information, which conditions a gauge well."""
-    return float(np.median(np.diagonal(graph.information, axis1=1, axis2=2)))
+    return float(np.median(np.diagonal(graph.angle_information, axis1=1, axis2=2)))
 
 
 def factor_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

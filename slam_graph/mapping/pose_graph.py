@@ -3,14 +3,16 @@
 """A pose graph as arrays: poses, and measured relative poses between them, in 2D or 3D.
 
 Conventions: a pose is world_T_pose. An edge (i, j) measures i_T_j = world_T_i⁻¹ world_T_j.
-Information matrices are in the order of files, translation before rotation, and are those of
-GTSAM's residual Log(i_T_j⁻¹ world_T_i⁻¹ world_T_j): the rotation is an angle in radians.
+Information matrices are in the order of files, translation before rotation. g2o means that of a 3D
+rotation for the vector part of the quaternion, about half the angle; GTSAM and most programs that
+read these files take it for the angle. Which one is meant goes with the graph.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ from slam_graph.geometry.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+RotationInformation = Literal["angle", "quaternion"]
 
 MAX_STAMP_S = 9_000_000_000
 """Ids of poses beyond this do not fit into nanoseconds as seconds."""
@@ -45,7 +49,7 @@ class Poses:
     @property
     def dimension(self) -> int:
         """2 or 3."""
-        return self.translations.shape[1]
+        return int(self.translations.shape[1])
 
     def select(self, index: IntArray) -> Poses:
         """Some of the poses."""
@@ -92,6 +96,8 @@ class PoseGraph:
         edges: (M, 2) rows of the two poses of each edge.
         measured: M relative poses i_T_j.
         information: (M, k, k), k = 3 in 2D and 6 in 3D: translation, then rotation.
+        rotation_information: what that of a 3D rotation belongs to: the angle (GTSAM), or the
+            vector part of the quaternion (g2o).
         name: of the graph.
     """
 
@@ -100,6 +106,7 @@ class PoseGraph:
     edges: IntArray
     measured: Poses
     information: FloatArray
+    rotation_information: RotationInformation = "angle"
     name: str = "pose graph"
 
     @property
@@ -111,6 +118,15 @@ class PoseGraph:
     def tangent_size(self) -> int:
         """Degrees of freedom of a pose: 3 or 6."""
         return 3 * (self.dimension - 1)
+
+    @property
+    def angle_information(self) -> FloatArray:
+        """(M, k, k) information of the translation and the angle, to first order."""
+        if self.dimension == 2 or self.rotation_information == "angle":
+            return self.information
+        half = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+        information: FloatArray = self.information * half[:, None] * half
+        return information
 
     @property
     def is_odometry(self) -> NDArray[np.bool_]:

@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether an optimum of a pose graph is the global one: a dual certificate, after SE-Sync.
 
-For a stationary point X of F = tr(X M Xᵀ) let Λ be the block-diagonal multipliers of R_iᵀ R_i = I and
-S = M - Λ. For all rotations Y, with the translations that fit them best,
+For a stationary point X of F = tr(X M Xᵀ) let Λ be the block-diagonal multipliers of R_iᵀ R_i = I
+and S = M - Λ. For all rotations Y, with the translations that fit them best,
 
     F(Y) = tr(Y S Yᵀ) + tr Λ  ≥  tr Λ + d n λ,        tr Λ = F(X),
 
-where λ is the smallest eigenvalue of S after the translations are eliminated. It is never positive, as
-S X = 0. If it is zero, nothing is better than X (Rosen, Carlone, Bandeira and Leonard 2019).
+where λ is the smallest eigenvalue of S after the translations are eliminated. It is never positive,
+as S X = 0. If it is zero, nothing is better than X (Rosen, Carlone, Bandeira and Leonard 2019).
 
-The certificate is one of SE-Sync's objective, not of GTSAM's: both are small at the same places, but
-their minima differ by the noise. So the estimate is first led to the minimum of F next to it, by
-Newton's method, and what is certified is that minimum.
+The certificate is one of SE-Sync's objective, not of GTSAM's: both are small at the same places,
+but their minima differ by the noise. So the estimate is first led to the minimum of F next to it,
+by Newton's method, and what is certified is that minimum.
 """
 
 from __future__ import annotations
@@ -158,9 +158,9 @@ def _slope(B: csr_matrix, poses: Poses) -> FloatArray:
 def smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
     """λ: the smallest eigenvalue of S over rotations, translations being what fits them best.
 
-    S with η on the diagonal of its rotations is factorised; the signs of its pivots tell whether λ is
-    above -η (Sylvester's law of inertia). From the first η that is enough, Lanczos' method on the
-    inverse finds λ itself.
+    S with η on the diagonal of its rotations is factorised; the signs of its pivots tell whether λ
+    is above -η (Sylvester's law of inertia). From the first η that is enough, Lanczos' method on
+    the inverse finds λ itself.
 
     Raises:
         EstimationError: if no η is enough.

@@ -56,7 +56,7 @@ def connected(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGra
     """
     _check_information(graph.information, rows)
     loops = graph.edges[:, 0] == graph.edges[:, 1]
-    for row in np.flatnonzero(loops):
+    for row in np.flatnonzero(loops).tolist():
         diagnostics.warn("pose_graph_edge_to_itself", f"{rows.where(row)}: left out")
     graph = graph.keep_edges(~loops) if loops.any() else graph
     if len(graph.edges) == 0:

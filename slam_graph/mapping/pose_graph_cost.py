@@ -66,7 +66,8 @@ def construct(graph: PoseGraph, policy: PoseGraphCostPolicy, weights: FloatArray
     factors = edge_factors(scaled, range(len(rows)))
     if policy.robust not in ("none", "gnc"):
         suspects = suspected(scaled, policy)
-        robust = edge_factors(scaled, suspects.tolist(), policy.robust, robust_width(graph, policy))
+        width = robust_width(graph, policy)
+        robust = edge_factors(scaled, suspects.tolist(), policy.robust, width)
         for row, factor in zip(suspects.tolist(), robust, strict=True):
             factors[row] = factor
     return PoseGraphCost(graph, policy, rows, factors, anchor_factors(graph))
@@ -100,7 +101,9 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
     return weights
 
 
-def chi2_table(graph: PoseGraph, poses: Poses, weights: FloatArray | None = None) -> dict[str, float]:
+def chi2_table(
+    graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
+) -> dict[str, float]:
     """What some poses cost in the conventions of three programs.
 
     Args:
@@ -109,8 +112,8 @@ def chi2_table(graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
         weights: (M,) of the edges; all 1 if not said.
 
     Returns:
-        `gtsam_error` ½ Σ ‖Log‖²_Ω and `gtsam_chi2`, twice that; `g2o_chi2`, in 3D with the vector part
-        of the quaternion instead of the angle; `sesync_objective`.
+        `gtsam_error` ½ Σ ‖Log‖²_Ω and `gtsam_chi2`, twice that; `g2o_chi2`, in 3D with the vector
+        part of the quaternion instead of the angle; `sesync_objective`.
     """
     if weights is not None:
         rows = np.flatnonzero(weights > 0)
@@ -125,11 +128,9 @@ def chi2_table(graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
 
 
 def g2o_chi2(graph: PoseGraph, poses: Poses) -> float:
-    """χ² with g2o's residuals: translation and angle in 2D, and vector part of a quaternion in 3D."""
+    """χ² with g2o's residuals: translation, and the angle or the vector part of a quaternion."""
     i, j = graph.edges.T
-    error = graph.measured.inverse().compose(
-        poses.select(i).inverse().compose(poses.select(j))
-    )
+    error = graph.measured.inverse().compose(poses.select(i).inverse().compose(poses.select(j)))
     if graph.dimension == 2:
         turn = error.angles()[:, None]
     else:

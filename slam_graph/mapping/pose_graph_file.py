@@ -11,10 +11,6 @@
 | `EDGE2`, `ODOMETRY` | x y θ, information as TORO orders it: xx xy yy θθ xθ yθ |
 | `EDGE_SE3:QUAT` | x y z qx qy qz qw, upper triangle of the information by rows |
 | `EDGE3` | x y z roll pitch yaw, upper triangle of the information by rows |
-
-g2o means the information of a 3D rotation for the vector part of the quaternion, about half the
-angle; GTSAM and most programs that read these files take it for the angle. Which one is meant is a
-choice of the reader (`RotationInformation`).
 """
 
 from __future__ import annotations
@@ -31,12 +27,19 @@ from scipy.spatial.transform import Rotation
 from slam_graph.datasets.rows import Rows, parse
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.mapping.pose_graph import FloatArray, IntArray, PoseGraph, Poses
-from slam_graph.mapping.pose_graph_checks import check_numbers, connected, drop_repeated, rows_of_keys
-
-RotationInformation = Literal["angle", "quaternion"]
-"""What the information of a 3D rotation belongs to: the angle (GTSAM), or the vector part of the
-quaternion (g2o)."""
+from slam_graph.mapping.pose_graph import (
+    FloatArray,
+    IntArray,
+    PoseGraph,
+    Poses,
+    RotationInformation,
+)
+from slam_graph.mapping.pose_graph_checks import (
+    check_numbers,
+    connected,
+    drop_repeated,
+    rows_of_keys,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,38 +106,38 @@ class Block:
 
 
 def read_pose_graph(
-    path: Path,
-    diagnostics: Diagnostics,
+    path: Path | str,
+    diagnostics: Diagnostics | None = None,
     rotation_information: RotationInformation = "angle",
 ) -> PoseGraph:
     """Read a pose graph.
 
-    What does not change the problem is repaired and counted in `diagnostics`; lines of unknown kinds
-    are left out and counted.
+    What does not change the problem is repaired and counted in `diagnostics`; lines of unknown
+    kinds are left out and counted.
 
     Raises:
-        DataError: naming file and line, if the file cannot be read, holds no edges, is cut short, or
+        DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
+        or
             has an edge to a missing vertex, numbers that are not finite, or an information matrix
             that is not positive definite.
     """
+    path, diagnostics = Path(path), diagnostics or Diagnostics()
     blocks = [_parse(rows, tag) for tag, rows in _by_kind(path, diagnostics).items()]
     vertices = [block for block in blocks if block.ids.shape[1] == 1]
-    edges = [block for block in blocks if block.ids.shape[1] == 2]
-    if not edges:
+    between = [block for block in blocks if block.ids.shape[1] == 2]
+    if not between:
         raise DataError(f"{path}: no edges; known are lines that begin with {', '.join(LINES)}")
     if len({block.poses.dimension for block in blocks}) > 1:
         raise DataError(f"{path}: 2D and 3D poses in one file")
-    rows, ids, measured, information = _joined(edges)
-    if rotation_information == "quaternion" and measured.dimension == 3:
-        half = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-        information = information * half[:, None] * half
+    rows, ids, measured, information = _joined(between)
     keys, estimates = np.unique(ids), None
     if vertices:
         vertex_rows, vertex_ids, poses, _ = _joined(vertices)
         kept = drop_repeated(vertex_rows, vertex_ids[:, 0], diagnostics)
         keys, estimates = vertex_ids[kept, 0], poses.select(kept)
+    edges = rows_of_keys(keys, ids, rows)
     graph = PoseGraph(
-        keys, estimates, rows_of_keys(keys, ids, rows), measured, information, path.stem
+        keys, estimates, edges, measured, information, rotation_information, path.stem
     )
     return connected(graph, rows, diagnostics)
 
@@ -181,8 +184,8 @@ def _parse(rows: Rows, tag: str) -> Block:
 def _information(entries: FloatArray, order: tuple[int, ...]) -> FloatArray:
     """(L, k, k) symmetric matrices from their upper triangles.
 
-    Some writers put the triangle of a 2D edge by rows behind TORO's `EDGE2`: where TORO's order would
-    say that nothing is known of y or θ, it is meant by rows.
+    Some writers put the triangle of a 2D edge by rows behind TORO's `EDGE2`: where TORO's order
+    would say that nothing is known of y or θ, it is meant by rows.
     """
     if order == TORO_2D and not (entries[:, 2:4] > 0).any(axis=0).all():
         order = BY_ROWS_2D

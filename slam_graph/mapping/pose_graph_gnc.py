@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Graduated non-convexity: which loop closures are false, decided while the poses are estimated.
 
-Yang, Antonante, Tzoumas and Carlone 2020, with truncated least squares: weights of the edges and poses
-take turns. With μ small all edges count a little, whatever their residual; as μ grows, weights part
-into 0 and 1 at the χ² bound. Two things are done otherwise. Between two updates of the weights there
-is one Gauss-Newton step, and edges without weight are not in it, which keeps the problem sparse. And
-where loop closures confirm each other (`loop_consistency.py`) the first poses are the optimum of these
-alone, and μ starts larger: from odometry, hundreds of false loop closures lead into wrong minima.
+Yang, Antonante, Tzoumas and Carlone 2020, with truncated least squares: weights of the edges and
+poses take turns. With μ small all edges count a little, whatever their residual; as μ grows,
+weights part into 0 and 1 at the χ² bound. Two things are done otherwise. Between two updates of the
+weights there is one Gauss-Newton step, and edges without weight are not in it, which keeps the
+problem sparse. And where loop closures confirm each other (`loop_consistency.py`) the first poses
+are the optimum of these alone, and μ starts larger: from odometry, hundreds of false loop closures
+lead into wrong minima.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from slam_graph.mapping.native_pose_graph import (
     poses_of,
     values_of,
 )
-from slam_graph.mapping.pose_graph import FloatArray, PoseGraph, Poses
+from slam_graph.mapping.pose_graph import FloatArray, IntArray, PoseGraph, Poses
 from slam_graph.mapping.pose_graph_cost import suspected
 from slam_graph.mapping.pose_graph_initialization import along_tree, initialize, tree_edges
 from slam_graph.mapping.pose_graph_policy import PoseGraphCostPolicy
@@ -91,7 +92,7 @@ def truncated_weights(squared: FloatArray, bound: float, control: float) -> Floa
 
 
 def _start(
-    graph: PoseGraph, policy: PoseGraphCostPolicy, suspects: FloatArray, diagnostics: Diagnostics
+    graph: PoseGraph, policy: PoseGraphCostPolicy, suspects: IntArray, diagnostics: Diagnostics
 ) -> tuple[Poses, FloatArray, float | None]:
     """First poses and weights, and the first μ if it does not depend on residuals."""
     along = along_tree(graph)
@@ -121,4 +122,4 @@ def _step(
     factors = factor_graph([*edge_factors(weighted, range(len(rows))), *anchors])
     optimizer = gtsam.GaussNewtonOptimizer(factors, values, parameters)
     optimizer.iterate()
-    return optimizer.values()
+    return gtsam.Values(optimizer.values())

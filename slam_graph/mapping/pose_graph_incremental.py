@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pose graph solved pose by pose with iSAM2, as if it were being recorded.
 
-Kaess, Johannsson, Roberts, Ila, Leonard and Dellaert 2012. When all poses are there, updates go on
-until the cost no longer falls, so that the result is that of the batch solvers.
+Kaess, Johannsson, Roberts, Ila, Leonard and Dellaert 2012.
 """
 
 from __future__ import annotations
@@ -18,61 +17,65 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.mapping.native_pose_graph import factor_graph, native, poses_of
 from slam_graph.mapping.pose_graph import PoseGraph, Poses
 from slam_graph.mapping.pose_graph_cost import PoseGraphCost
-from slam_graph.mapping.pose_graph_policy import Minimum, PoseGraphStepsPolicy
+from slam_graph.mapping.pose_graph_policy import PoseGraphStepsPolicy
 
 
 def incremental(
     cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
+) -> Poses:
     """Add poses in the order of their ids, each with its edges to those before it.
 
     Args:
         cost: all factors.
         start: where the anchors are; all other poses begin where their first edge puts them.
-        policy: when poses are linearised anew, and when updates end.
-        diagnostics: not used; nothing can be repaired here.
+        policy: when poses are linearised anew.
+        diagnostics: counts if variables had to be eliminated by QR, which is slower and exact.
 
     Raises:
         RuntimeError: if the problem cannot be solved.
     """
-    parameters = gtsam.ISAM2Params()
-    parameters.setRelinearizeThreshold(policy.relinearize_threshold)
-    parameters.relinearizeSkip = policy.relinearize_skip
-    isam2 = gtsam.ISAM2(parameters)
+    try:
+        return _added_one_by_one(cost, start, policy, "CHOLESKY")
+    except RuntimeError:
+        diagnostics.warn(
+            "pose_graph_eliminated_by_qr",
+            f"{cost.graph.name}: too poorly conditioned for Cholesky; iSAM2 begins anew with QR",
+        )
+        return _added_one_by_one(cost, start, policy, "QR")
+
+
+def _added_one_by_one(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, factorization: str
+) -> Poses:
+    """The estimates of iSAM2 when the last pose has come."""
+    isam2 = gtsam.ISAM2(_parameters(policy, factorization))
     graph = cost.graph.keep_edges(cost.rows)
-    measured, at_anchors = native(graph.measured), native(start.select(graph.anchors))
-    anchors = dict(zip(graph.anchors.tolist(), range(len(graph.anchors)), strict=True))
-    ends = graph.edges.tolist()
+    ends, measured = graph.edges.tolist(), native(graph.measured)
+    anchors = graph.anchors.tolist()
+    priors = dict(zip(anchors, cost.anchors, strict=True))
+    guesses = dict(zip(anchors, native(start.select(graph.anchors)), strict=True))
     for pose, edges in _arrivals(graph):
         factors = [cost.edges[row] for row in edges]
-        if pose in anchors:
-            guess = at_anchors[anchors[pose]]
-            factors.append(cost.anchors[anchors[pose]])
+        if pose in priors:
+            guess = guesses[pose]
+            factors.append(priors[pose])
         else:
-            i, j = ends[edges[0]]
+            (i, j), step = ends[edges[0]], measured[edges[0]]
             known = _estimate(isam2, j if i == pose else i, graph.dimension)
-            step = measured[edges[0]]
             guess = known.compose(step.inverse() if i == pose else step)
         values = gtsam.Values()
         values.insert(pose, guess)
         isam2.update(factor_graph(factors), values)
-    return _settled(isam2, cost, policy, graph.dimension)
+    return poses_of(isam2.calculateEstimate(), graph.dimension)
 
 
-def _settled(
-    isam2: gtsam.ISAM2, cost: PoseGraphCost, policy: PoseGraphStepsPolicy, dimension: int
-) -> Minimum:
-    """The end of updates that linearise all poses anew until the cost no longer falls."""
-    everything, steps = cost.factors(), len(cost.graph.keys)
-    values = isam2.calculateEstimate()
-    error = everything.error(values)
-    for further in range(1, policy.max_steps + 1):
-        isam2.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), force_relinearize=True)
-        values = isam2.calculateEstimate()
-        before, error = error, everything.error(values)
-        if abs(before - error) <= policy.tolerance * before:
-            return Minimum(poses_of(values, dimension), steps + further, True)
-    return Minimum(poses_of(values, dimension), steps + policy.max_steps, False)
+def _parameters(policy: PoseGraphStepsPolicy, factorization: str) -> gtsam.ISAM2Params:
+    """Parameters of iSAM2."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(policy.relinearize_threshold)
+    parameters.relinearizeSkip = policy.relinearize_skip
+    parameters.setFactorization(factorization)
+    return parameters
 
 
 def _estimate(isam2: gtsam.ISAM2, key: int, dimension: int) -> gtsam.Pose2 | gtsam.Pose3:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from slam_graph.diagnostics import Diagnostics
@@ -61,7 +61,7 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
 
 
 def chordal_rotations(graph: PoseGraph) -> FloatArray:
-    """(N, d, d) rotations that minimise Σ κ ‖R_j - R_i R_ij‖², the constraint relaxed, projected."""
+    """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on rotations."""
     d, n = graph.dimension, len(graph.keys)
     rows = rotation_rows(graph, precisions(graph)[0])[:, n:]
     held = (d * graph.anchors[:, None] + np.arange(d)).ravel()
@@ -82,7 +82,9 @@ def lago_rotations(graph: PoseGraph) -> FloatArray:
         problem.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(0.0, 0.0, angle), noise))
     _lago_applies(graph)
     unit = gtsam.noiseModel.Unit.Create(3)
-    problem.addPriorPose2(0, gtsam.Pose2(0.0, 0.0, np.arctan2(first[0, 1, 0], first[0, 0, 0])), unit)
+    problem.addPriorPose2(
+        0, gtsam.Pose2(0.0, 0.0, np.arctan2(first[0, 1, 0], first[0, 0, 0])), unit
+    )
     found = gtsam.lago.initializeOrientations(problem)
     theta = np.array([found.at(k)[0] for k in range(len(graph.keys))])
     cos, sin = np.cos(theta), np.sin(theta)
@@ -109,7 +111,9 @@ def translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
     return _solved(rows[:, :n], graph.anchors, graph.anchor_poses().translations, -offsets)
 
 
-def _solved(rows, held: IntArray, values: FloatArray, right: FloatArray | None = None) -> FloatArray:  # type: ignore[no-untyped-def]  # sparse
+def _solved(
+    rows: csr_matrix, held: IntArray, values: FloatArray, right: FloatArray | None = None
+) -> FloatArray:
     """Least-squares solution x (n, c) of rows · x = right, some entries of x held at values."""
     count = rows.shape[1]
     free = np.setdiff1d(np.arange(count), held)

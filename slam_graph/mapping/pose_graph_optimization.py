@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose-graph optimisation: the loop of every algorithm here, with the policies of PGO.
 
-Cost construction takes all poses and no features, Gauss-Newton goes on until convergence, and nothing
-is marginalised, so that one pass of the loop is all there is.
+Cost construction takes all poses and no features, Gauss-Newton goes on until convergence, and
+nothing is marginalised, so that one pass of the loop is all there is.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from slam_graph.mapping.pose_graph_policy import (
 from slam_graph.mapping.pose_graph_steps import minimize
 
 
-def optimize(
+def optimize_pose_graph(
     graph: PoseGraph,
     policy: PoseGraphPolicy | None = None,
     diagnostics: Diagnostics | None = None,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from slam_graph.backend.config import Settings
@@ -96,3 +97,8 @@ class PoseGraphSolution:
     def poses(self) -> Poses:
         """The estimates."""
         return self.minimum.poses
+
+    def weighted_graph(self) -> PoseGraph:
+        """The problem that was solved in the end: with weights, and without rejected edges."""
+        rows = np.flatnonzero(self.weights > 0)
+        return self.graph.keep_edges(rows).weighted(self.weights[rows])

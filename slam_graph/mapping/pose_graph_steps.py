@@ -54,9 +54,9 @@ def _gauss_newton(
     )
     nothing = NOTHING_PER_EDGE * len(cost.edges)
     for step in range(1, policy.max_steps + 1):
-        values, error = optimizer.values(), optimizer.error()
+        values, error = gtsam.Values(optimizer.values()), optimizer.error()  # its own do not last
         lower = _iterated(optimizer)
-        if lower <= nothing or 0.0 <= error - lower <= policy.tolerance * error:
+        if lower <= nothing or abs(error - lower) <= policy.tolerance * error:
             return Minimum(poses_of(optimizer.values(), start.dimension), step, True)
         if not lower < error:
             diagnostics.warn(
@@ -88,6 +88,15 @@ def _levenberg_marquardt(
     return _optimized(
         gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), cost, start, policy
     )
+
+
+def _isam2(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """iSAM2 pose by pose, and then Gauss-Newton, which leaves nothing of its approximations."""
+    last = incremental(cost, start, policy, diagnostics)
+    settled = _gauss_newton(cost, last, policy, diagnostics)
+    return Minimum(settled.poses, len(start) + settled.steps, settled.converged)
 
 
 def _dogleg(
@@ -124,5 +133,5 @@ METHODS = {
     "gauss_newton": _gauss_newton,
     "levenberg_marquardt": _levenberg_marquardt,
     "dogleg": _dogleg,
-    "isam2": incremental,
+    "isam2": _isam2,
 }
