@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
 
 from slam_graph.mapping.pose_graph import FloatArray, IntArray, PoseGraph, Poses
 
@@ -42,7 +41,7 @@ class Pairs:
     agree: NDArray[np.bool_]
 
 
-def confirmed_loops(graph: PoseGraph, along_odometry: Poses, confidence: float) -> IntArray:
+def confirmed_loops(graph: PoseGraph, along_odometry: Poses, bound: float) -> IntArray:
     """Rows of the edges that are loop closures and confirmed by others.
 
     Such a one belongs to a group of at least `MIN_GROUP` that agreement ties together, and agrees
@@ -51,12 +50,12 @@ def confirmed_loops(graph: PoseGraph, along_odometry: Poses, confidence: float) 
     Args:
         graph: the pose graph.
         along_odometry: poses composed along consecutive edges.
-        confidence: χ² quantile of a cycle that agrees.
+        bound: χ² of a cycle that still agrees.
     """
     loops = np.flatnonzero(~graph.is_odometry)
     if len(loops) < MIN_GROUP:
         return loops[:0]
-    pairs, count = _compare(graph, loops, along_odometry, confidence), len(loops)
+    pairs, count = _compare(graph, loops, along_odometry, bound), len(loops)
     agreeing, contrary = pairs.members[pairs.agree], pairs.members[~pairs.agree]
     links = coo_matrix((np.ones(len(agreeing)), tuple(agreeing.T)), shape=(count, count))
     group = connected_components(links, directed=False)[1]
@@ -66,7 +65,7 @@ def confirmed_loops(graph: PoseGraph, along_odometry: Poses, confidence: float) 
     return confirmed
 
 
-def _compare(graph: PoseGraph, loops: IntArray, along: Poses, confidence: float) -> Pairs:
+def _compare(graph: PoseGraph, loops: IntArray, along: Poses, bound: float) -> Pairs:
     """Cycles of all loop closures that are near each other."""
     ends, measured = _ordered(graph.edges[loops], graph.measured.select(loops))
     members = cKDTree(ends).query_pairs(NEIGHBOURHOOD, p=np.inf, output_type="ndarray")
@@ -83,7 +82,7 @@ def _compare(graph: PoseGraph, loops: IntArray, along: Poses, confidence: float)
     squared = cycle.angles() ** 2 / of_R + np.sum(cycle.translations**2, axis=1) / (
         of_t + of_R * lever**2
     )
-    return Pairs(members, squared < chi2.ppf(confidence, graph.tangent_size))
+    return Pairs(members, squared < bound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from slam_graph.mapping.chordal_objective import chordal_cost
 from slam_graph.mapping.native_pose_graph import (
@@ -82,8 +82,13 @@ def robust_width(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
     """The width of the robust loss: as said, or what true edges stay within."""
     if policy.robust_width is not None:
         return policy.robust_width
-    squared = chi2.ppf(policy.confidence, graph.tangent_size)
-    return float(squared if policy.robust == "dcs" else np.sqrt(squared))
+    squared = true_bound(graph, policy)
+    return squared if policy.robust == "dcs" else float(np.sqrt(squared))
+
+
+def true_bound(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
+    """The χ² quantile below which squared residuals of true edges stay."""
+    return float(2.0 * gammaincinv(0.5 * graph.tangent_size, policy.confidence))
 
 
 def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:

@@ -117,7 +117,6 @@ def read_pose_graph(
 
     Raises:
         DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
-        or
             has an edge to a missing vertex, numbers that are not finite, or an information matrix
             that is not positive definite.
     """

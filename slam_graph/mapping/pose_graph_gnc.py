@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.mapping.loop_consistency import confirmed_loops
@@ -27,8 +26,8 @@ from slam_graph.mapping.native_pose_graph import (
     poses_of,
     values_of,
 )
-from slam_graph.mapping.pose_graph import FloatArray, IntArray, PoseGraph, Poses
-from slam_graph.mapping.pose_graph_cost import suspected
+from slam_graph.mapping.pose_graph import FloatArray, PoseGraph, Poses
+from slam_graph.mapping.pose_graph_cost import suspected, true_bound
 from slam_graph.mapping.pose_graph_initialization import along_tree, initialize, tree_edges
 from slam_graph.mapping.pose_graph_policy import PoseGraphCostPolicy
 
@@ -52,13 +51,12 @@ def graduated_nonconvexity(
     Raises:
         RuntimeError: if a step has no solution.
     """
-    bound = float(chi2.ppf(policy.confidence, graph.tangent_size))
+    bound = true_bound(graph, policy)
     suspects = suspected(graph, policy)
-    poses, weights, control = _start(graph, policy, suspects, diagnostics)
-    least = np.zeros(len(graph.edges))
+    weights, least = np.ones(len(graph.edges)), np.zeros(len(graph.edges))
     least[tree_edges(graph)] = LEAST_TREE_WEIGHT
     plain, anchors = edge_factors(graph, range(len(graph.edges))), anchor_factors(graph)
-    values = _step(graph, weights, anchors, values_of(poses))
+    values, control = _start(graph, policy, anchors, diagnostics)
     for _ in range(MAX_UPDATES):
         squared = edge_chi2(plain, values)[suspects]
         if control is None:
@@ -92,20 +90,24 @@ def truncated_weights(squared: FloatArray, bound: float, control: float) -> Floa
 
 
 def _start(
-    graph: PoseGraph, policy: PoseGraphCostPolicy, suspects: IntArray, diagnostics: Diagnostics
-) -> tuple[Poses, FloatArray, float | None]:
-    """First poses and weights, and the first μ if it does not depend on residuals."""
-    along = along_tree(graph)
-    confirmed = confirmed_loops(graph, along, policy.confidence)
-    weights = np.ones(len(graph.edges))
-    weights[np.setdiff1d(suspects, tree_edges(graph))] = 0.0
+    graph: PoseGraph,
+    policy: PoseGraphCostPolicy,
+    anchors: list[gtsam.NonlinearFactor],
+    diagnostics: Diagnostics,
+) -> tuple[gtsam.Values, float | None]:
+    """First poses, and the first μ if it does not depend on residuals."""
     if policy.initialization != "auto":
-        return initialize(graph, policy.initialization, diagnostics), weights, None
+        return values_of(initialize(graph, policy.initialization, diagnostics)), None
+    if not policy.trust_odometry:
+        return values_of(initialize(graph, "chordal", diagnostics)), None
+    along = along_tree(graph)
+    confirmed = confirmed_loops(graph, along, true_bound(graph, policy))
     if len(confirmed) == 0:
-        return along, weights, None
-    weights[confirmed] = 1.0
+        return values_of(along), None
+    weights = graph.is_odometry.astype(float)
+    weights[np.concatenate([confirmed, tree_edges(graph)])] = 1.0
     poses = initialize(graph.keep_edges(weights > 0), "chordal", diagnostics)
-    return poses, weights, CONTROL_AFTER_CONFIRMATION
+    return _step(graph, weights, anchors, values_of(poses)), CONTROL_AFTER_CONFIRMATION
 
 
 def _step(
