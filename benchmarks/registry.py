@@ -7,7 +7,7 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 
 from __future__ import annotations
 
-from benchmarks import mh01, openvins_sim, speed, wheel
+from benchmarks import mh01, openvins_sim, posegraphs, speed, wheel
 from benchmarks.suite import Benchmark
 
 BENCHMARKS: dict[str, Benchmark] = {
@@ -15,4 +15,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **mh01.BENCHMARKS,
     **openvins_sim.BENCHMARKS,
     **speed.BENCHMARKS,
+    **posegraphs.BENCHMARKS,
 }

@@ -19,16 +19,6 @@ from scipy.sparse.linalg import SuperLU, splu
 from slam_graph.mapping.pose_graph import FloatArray, IntArray, PoseGraph, Poses
 
 
-def precisions(graph: PoseGraph) -> tuple[FloatArray, FloatArray]:
-    """Isotropic precisions (κ of rotations, τ of translations), each (M,)."""
-    d, information = graph.dimension, graph.information
-    τ = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)
-    if d == 2:
-        return information[:, 2, 2], τ
-    κ = 1.5 / np.trace(np.linalg.inv(information[:, 3:, 3:]), axis1=1, axis2=2)
-    return κ, τ
-
-
 def translation_rows(graph: PoseGraph, τ: FloatArray) -> csr_matrix:
     """(M, n + dn) whitened rows b with X bᵀ = √τ (t_j - t_i - R_i t_ij)."""
     d, n, m = graph.dimension, len(graph.keys), len(graph.edges)
@@ -67,7 +57,7 @@ def _rotation_columns(index: IntArray, n: int, d: int) -> IntArray:
 
 def whitened_rows(graph: PoseGraph) -> csr_matrix:
     """All rows B, (M + dM, n + dn): F = ‖X Bᵀ‖², so that M = Bᵀ B."""
-    κ, τ = precisions(graph)
+    κ, τ = graph.precisions
     return vstack([translation_rows(graph, τ), rotation_rows(graph, κ)], format="csr")
 
 
@@ -87,7 +77,7 @@ def unstacked(X: FloatArray) -> Poses:
 
 def chordal_cost(graph: PoseGraph, poses: Poses) -> float:
     """The value F of SE-Sync's objective."""
-    κ, τ = precisions(graph)
+    κ, τ = graph.precisions
     i, j = graph.edges.T
     first, second = poses.select(i), poses.select(j)
     there = first.compose(graph.measured)

@@ -128,6 +128,19 @@ class PoseGraph:
         information: FloatArray = self.information * half[:, None] * half
         return information
 
+    @cached_property
+    def precisions(self) -> tuple[FloatArray, FloatArray]:
+        """Isotropic precisions that fit the information best: κ of rotations, τ of translations.
+
+        Each (M,), as SE-Sync has them (`chordal_objective.py`).
+        """
+        d, information = self.dimension, self.information
+        τ = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)
+        if d == 2:
+            return information[:, 2, 2], τ
+        κ = 1.5 / np.trace(np.linalg.inv(information[:, 3:, 3:]), axis1=1, axis2=2)
+        return κ, τ
+
     @property
     def is_odometry(self) -> NDArray[np.bool_]:
         """(M,) whether an edge joins a pose to the next one; all others are loop closures."""

@@ -16,7 +16,6 @@ from slam_graph.errors import DataError
 from slam_graph.mapping.chordal_objective import (
     factorized,
     nearest_rotations,
-    precisions,
     rotation_rows,
     translation_rows,
 )
@@ -63,7 +62,7 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
 def chordal_rotations(graph: PoseGraph) -> FloatArray:
     """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on rotations."""
     d, n = graph.dimension, len(graph.keys)
-    rows = rotation_rows(graph, precisions(graph)[0])[:, n:]
+    rows = rotation_rows(graph, graph.precisions[0])[:, n:]
     held = (d * graph.anchors[:, None] + np.arange(d)).ravel()
     first = graph.anchor_poses().rotations.transpose(0, 2, 1).reshape(-1, d)
     transposed = _solved(rows, held, first).reshape(n, d, d)
@@ -105,7 +104,7 @@ def _lago_applies(graph: PoseGraph) -> None:
 def translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
     """(N, d) translations that fit given rotations best, a linear problem."""
     n, d = len(graph.keys), graph.dimension
-    rows = translation_rows(graph, precisions(graph)[1])
+    rows = translation_rows(graph, graph.precisions[1])
     side_by_side = rotations.transpose(1, 0, 2).reshape(d, -1)
     offsets = rows[:, n:] @ side_by_side.T
     return _solved(rows[:, :n], graph.anchors, graph.anchor_poses().translations, -offsets)

@@ -68,11 +68,13 @@ class Minimum:
 
     Attributes:
         poses: all of them.
+        cost: what they cost in the end.
         steps: number of steps.
         converged: whether the cost stopped falling before the number of steps was used up.
     """
 
     poses: Poses
+    cost: float
     steps: int
     converged: bool
 

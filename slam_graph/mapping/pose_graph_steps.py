@@ -8,6 +8,7 @@ Orderings are COLAMD's: METIS, GTSAM's default elsewhere, crashes on poses that 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -22,6 +23,9 @@ from slam_graph.mapping.pose_graph_policy import Minimum, PoseGraphStepsPolicy
 
 NOTHING_PER_EDGE = 1e-14
 """A cost of less than this for each edge is rounding: all edges agree."""
+
+ROUNDING = 1e-9
+"""A cost that rises by no more than this part of it has not risen."""
 
 
 def minimize(
@@ -56,8 +60,8 @@ def _gauss_newton(
     for step in range(1, policy.max_steps + 1):
         values, error = gtsam.Values(optimizer.values()), optimizer.error()  # its own do not last
         lower = _iterated(optimizer)
-        if lower <= nothing or abs(error - lower) <= policy.tolerance * error:
-            return Minimum(poses_of(optimizer.values(), start.dimension), step, True)
+        if lower <= nothing or -ROUNDING * error <= error - lower <= policy.tolerance * error:
+            return Minimum(poses_of(optimizer.values(), start.dimension), lower, step, True)
         if not lower < error:
             diagnostics.warn(
                 "pose_graph_step_damped",
@@ -68,8 +72,9 @@ def _gauss_newton(
             damped = _levenberg_marquardt(
                 cost, poses_of(values, start.dimension), rest, diagnostics
             )
-            return Minimum(damped.poses, step + damped.steps, damped.converged)
-    return Minimum(poses_of(optimizer.values(), start.dimension), policy.max_steps, False)
+            return replace(damped, steps=step + damped.steps)
+    last = poses_of(optimizer.values(), start.dimension)
+    return Minimum(last, optimizer.error(), policy.max_steps, False)
 
 
 def _iterated(optimizer: gtsam.GaussNewtonOptimizer) -> float:
@@ -96,7 +101,7 @@ def _isam2(
     """iSAM2 pose by pose, and then Gauss-Newton, which leaves nothing of its approximations."""
     last = incremental(cost, start, policy, diagnostics)
     settled = _gauss_newton(cost, last, policy, diagnostics)
-    return Minimum(settled.poses, len(start) + settled.steps, settled.converged)
+    return replace(settled, steps=len(start) + settled.steps)
 
 
 def _dogleg(
@@ -117,7 +122,8 @@ def _optimized(
     optimizer = optimizer_of(cost.factors(), values_of(start), _parameters(parameters, policy))
     values = optimizer.optimize()
     steps = int(optimizer.iterations())
-    return Minimum(poses_of(values, start.dimension), steps, steps < policy.max_steps)
+    poses = poses_of(values, start.dimension)
+    return Minimum(poses, optimizer.error(), steps, steps < policy.max_steps)
 
 
 def _parameters(parameters: Any, policy: PoseGraphStepsPolicy) -> Any:

@@ -80,6 +80,7 @@ class PoseGraphResult:
                 },
                 "method": self.policy.gauss_newton.method,
                 "robust": self.policy.cost.robust,
+                "cost": solution.minimum.cost,
                 "steps": solution.minimum.steps,
                 "converged": solution.minimum.converged,
                 "rejected_edges": int(np.count_nonzero(solution.weights < 0.5)),
