@@ -5,14 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from slam_graph.mapping.pose_graph import FloatArray, PoseGraph, Poses
-
-RobustLoss = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
 _LOSSES: dict[str, Callable[[float], Any]] = {
     "huber": gtsam.noiseModel.mEstimator.Huber.Create,

@@ -14,9 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from slam_graph.backend.config import Settings
-from slam_graph.mapping.native_pose_graph import RobustLoss
 from slam_graph.mapping.pose_graph import FloatArray, PoseGraph, Poses
-from slam_graph.mapping.pose_graph_initialization import Initialization
 
 Steps = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
 
@@ -24,9 +22,9 @@ Steps = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
 class PoseGraphCostPolicy(Settings):
     """Module 1: all poses and all edges. What is open is how far an edge is trusted."""
 
-    initialization: Initialization | Literal["auto"] = "auto"
+    initialization: Literal["auto", "chordal", "lago", "odometry", "file"] = "auto"
     """First estimates. auto: chordal; along odometry under a robust loss."""
-    robust: RobustLoss | Literal["gnc"] = "none"
+    robust: Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"] = "none"
     """How false loop closures are held back: by a robust loss, or by graduated non-convexity
     (`gnc`), which decides for each whether it is one."""
     robust_width: float | None = Field(None, gt=0)
