@@ -20,6 +20,9 @@ help:  ## List these commands
 
 demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path for another one)
 	@$(BIN)/slam-graph run "$(DATA)" $(if $(GROUNDTRUTH),--groundtruth "$(GROUNDTRUTH)") $(ARGS)
+	@echo
+	@$(BIN)/slam-graph compare "$(DATA)" $(if $(GROUNDTRUTH),--groundtruth "$(notdir $(DATA))=$(GROUNDTRUTH)") \
+		--algorithms ekf,iekf,msckf,swf,okvis --output results/comparison --no-progress
 
 test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
 	@$(BIN)/python -m pytest $(ARGS)

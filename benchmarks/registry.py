@@ -7,13 +7,27 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 
 from __future__ import annotations
 
-from benchmarks import mh01, openvins_sim, posegraphs, speed, wheel
+from benchmarks import (
+    cost_over_time,
+    memory,
+    mh01,
+    monte_carlo,
+    openvins_sim,
+    posegraphs,
+    real_imu,
+    speed,
+    wheel,
+)
 from benchmarks.suite import Benchmark
 
 BENCHMARKS: dict[str, Benchmark] = {
     **wheel.BENCHMARKS,
     **mh01.BENCHMARKS,
     **openvins_sim.BENCHMARKS,
+    **monte_carlo.BENCHMARKS,
+    **real_imu.BENCHMARKS,
+    **cost_over_time.BENCHMARKS,
+    **memory.BENCHMARKS,
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
 }

@@ -77,8 +77,11 @@ class Run:
         cameras: int | None = None,
         groundtruth: Path | None = None,
         overrides: Iterable[str] = (),
+        duration_s: float | None = None,
     ) -> None:
-        config = load_config(None, overrides, algorithm=algorithm, cameras=cameras)
+        config = load_config(
+            None, overrides, algorithm=algorithm, cameras=cameras, duration_s=duration_s
+        )
         sequence = open_dataset(recording, cameras=cameras, groundtruth=groundtruth)
         counter = _StateCounter()
         with threadpool_limits(limits=1, user_api="blas"):
@@ -101,9 +104,11 @@ class Run:
 
     @property
     def frames_lost(self) -> float:
-        """Frames from the first state to the end of the recording without one; NaN if all."""
+        """Frames from the first state to the end without one; NaN if all."""
         states = len(self.result.history)
-        return self.result.info.frames - self.frames_waited - states if states else math.nan
+        whole = self.result.config.duration_s is None or not self.ok
+        frames = self.result.info.frames if whole else self.result.frames
+        return frames - self.frames_waited - states if states else math.nan
 
     def errors(self, alignment: AlignmentMode) -> Errors:
         """The errors of the causal estimate."""
@@ -136,6 +141,11 @@ class _StateCounter(NullViewer):
         """Look whether there is a state."""
         self._started |= state is not None
         self.waited += not self._started
+
+
+def clipped(algorithm: str, duration_s: float | None) -> str:
+    """The name of an algorithm in a table, with the length of the clip if there is one."""
+    return algorithm if duration_s is None else f"{algorithm}_{duration_s:g}s"
 
 
 def within(trajectory: Trajectory, span: Trajectory) -> Trajectory:

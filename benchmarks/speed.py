@@ -138,18 +138,22 @@ def undisturbed(mode: str, recording: Path, algorithm: str) -> dict[str, Any]:
     """
     tables: list[dict[str, Any]] = []
     while len(tables) < ATTEMPTS and not (tables and share(tables[-1]) >= ENOUGH_SHARE):
-        tables.append(worker(mode, recording, algorithm))
+        tables.append(worker("benchmarks.speed_worker", mode, str(recording), algorithm))
     return max(tables, key=share)
 
 
-def worker(mode: str, recording: Path, algorithm: str) -> dict[str, Any]:
-    """Run `speed_worker` in a fresh process.
+def worker(module: str, *arguments: str) -> dict[str, Any]:
+    """Run a module in a fresh process, and read what it prints.
+
+    Args:
+        module: e.g. ``benchmarks.speed_worker``.
+        arguments: of its command line.
 
     Raises:
         EstimationError: if the run did not end well, with what it said.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.speed_worker", mode, str(recording), algorithm],
+        [sys.executable, "-m", module, *arguments],
         cwd=Path(__file__).resolve().parent.parent,
         env=os.environ | ONE_THREAD,
         capture_output=True,
@@ -158,7 +162,7 @@ def worker(mode: str, recording: Path, algorithm: str) -> dict[str, Any]:
     )
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise EstimationError(f"speed of {algorithm} ({mode}) could not be measured: {last}")
+        raise EstimationError(f"{module} {' '.join(arguments)} could not measure: {last}")
     table: dict[str, Any] = json.loads(done.stdout)
     return table
 

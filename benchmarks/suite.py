@@ -5,17 +5,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.metric import Metric
+from benchmarks.metric import Metric, info
 from slam_graph.errors import DataError
 
 DATA_VARIABLE = "SLAM_GRAPH_DATA"
 
 ALGORITHMS = ("msckf", "swf")
-"""The algorithms that every benchmark of a whole run compares."""
+"""The algorithms whose speed is measured in detail."""
+
+RECURSIVE = ("msckf", "swf", "okvis", "ekf", "iekf")
+"""The algorithms of the engine."""
+
+PEERS = ("fixed_lag_isam2", "fixed_lag_batch", "isam2")
+"""GTSAM's smoothers behind the same interface."""
+
+UNBOUNDED = ("ekf", "iekf")
+"""Algorithms whose cost of a step grows with the map: on long recordings they run on a clip."""
 
 
 @dataclass(slots=True)
@@ -31,6 +40,12 @@ class Outcome:
     metrics: list[Metric] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     failure: str = ""
+
+    def add(self, variant: str, metrics: Iterable[Metric], judged: bool = True) -> None:
+        """Add figures of a variant, its name before their keys; those not judged are only shown."""
+        for metric in metrics:
+            shown = metric if judged else info(metric.key, metric.value, metric.unit)
+            self.metrics.append(shown.under(variant))
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,12 +100,15 @@ def run(
             state = estimate(estimator, features)
             clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
             if estimator.costs:
-                result.steps.append(features.stamp_ns, estimator.costs)
+                result.steps.append(features.stamp_ns, estimator.costs, estimator.columns)
+            result.innovations.append(features.stamp_ns, estimator.innovations)
             ids, points = estimator.landmarks()
             if state is not None:
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
+            if state is not None and estimator.calibration is not None:
+                result.calibration.append(estimator.calibration)
             result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
             recorder.write(packet.imu, features)
             progress.advance(features.stamp_ns, estimator.initialized)

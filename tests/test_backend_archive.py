@@ -8,7 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.backend.archive import FeatureArchive
-from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.marginalization import LinearizationPoints, marginalize
 from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.state import State, dims_of, imu_state_keys
 from slam_graph.geometry.trajectory import NavState
@@ -20,10 +20,10 @@ STEPS = 9
 class Filter:
     """A filter on random rows, with features that leave put aside or held on to."""
 
-    def __init__(self, archive: bool, first_estimates: bool) -> None:
+    def __init__(self, archive: bool, points: LinearizationPoints) -> None:
         self.state = State()
         self.archive = FeatureArchive()
-        self.put_aside, self.first_estimates = archive, first_estimates
+        self.put_aside, self.points = archive, points
         self.prior = SquareRootInformation.empty()
         self.tracked: set[int] = set()
         self.kept: list[int] = []
@@ -55,16 +55,16 @@ class Filter:
             posterior.shifted(delta),
             self.state,
             [*features, *imu_state_keys(frame)],
-            self.first_estimates,
+            self.points,
             self.archive if self.put_aside else None,
         )
 
 
-@pytest.mark.parametrize("first_estimates", [True, False])
+@pytest.mark.parametrize("points", ["first", "current"])
 @pytest.mark.parametrize("seed", range(4))
-def test_put_aside_and_recalled_is_held_on_to(seed: int, first_estimates: bool) -> None:
+def test_put_aside_and_recalled_is_held_on_to(seed: int, points: LinearizationPoints) -> None:
     rng = np.random.default_rng(seed)
-    archive, joint = (Filter(aside, first_estimates) for aside in (True, False))
+    archive, joint = (Filter(aside, points) for aside in (True, False))
     for frame in range(STEPS):
         tracked = set(rng.choice(FEATURES, rng.integers(1, 4), replace=False).tolist())
         for one in (archive, joint):

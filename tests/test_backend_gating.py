@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The χ² gate: correct measurements are distributed as it assumes, wrong ones are rejected."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.stats import chi2, kstest
 
 from slam_graph.backend.config import BackendConfig, GatingConfig, NoiseConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
-from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.reprojection import Geometry, RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 from slam_graph.backend.state import State, dims_of
@@ -165,11 +165,11 @@ def test_the_gate_passes_its_share_of_correct_features(
     config = CONFIG.model_copy(update={"gating": gating})
     passed: list[bool] = []
     for case, cost, linear in solved:
-        tracked, fresh = replace(cost, config=config).gate(
-            linear, known(case.covariance, case.layout)
-        )
-        assert len(tracked) == 0
-        passed += fresh.tolist()
+        gate = replace(cost, config=config).gate(linear, known(case.covariance, case.layout))
+        assert len(gate.tracked) == 0
+        passed += gate.fresh.tolist()
+        assert gate.innovations.tested == len(gate.fresh)
+        assert gate.innovations.rejected == np.sum(~gate.fresh)
     error = np.sqrt(confidence * (1 - confidence) / len(passed))
     assert abs(np.mean(passed) - confidence) < 4 * error + 0.01
 
@@ -185,7 +185,7 @@ def test_wrong_features_are_rejected_and_right_ones_are_not() -> None:
         rows = np.flatnonzero(bad[case.obs.feature] & (case.obs.slots == 3))
         case.obs.pixels[rows] += 15.0 * rng.choice([-1.0, 1.0], (len(rows), 2))
         cost, linear = fresh_cost(case)
-        fresh = cost.gate(linear, known(case.covariance, case.layout))[1]
+        fresh = cost.gate(linear, known(case.covariance, case.layout)).fresh
         caught, wrong = caught + int((~fresh[bad]).sum()), wrong + int(bad.sum())
         spared, right = spared + int(fresh[~bad].sum()), right + int((~bad).sum())
     assert wrong > 50
@@ -202,13 +202,38 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
     cost, _, P, layout = tracked_cost(case, rng)
     assert cost.tracked is not None
     case.obs.pixels[bad] += 60.0
-    tracked, fresh = cost.gate(cost.linearize(), known(P, layout))
-    assert len(fresh) == 0
-    assert not tracked[bad].any()
-    assert tracked[~bad].mean() > 0.8
+    gate = cost.gate(cost.linearize(), known(P, layout))
+    assert len(gate.fresh) == 0
+    assert not gate.tracked[bad].any()
+    assert gate.tracked[~bad].mean() > 0.8
 
 
 def test_thresholds_are_quantiles() -> None:
     dof = np.array([2, 1, 27, 3])
     np.testing.assert_allclose(threshold(dof, 0.95), chi2.ppf(0.95, dof))
     assert len(threshold(np.zeros(0, np.int64), 0.95)) == 0
+
+
+@pytest.mark.parametrize("dof", [2, 5, 40])
+def test_what_the_gate_cuts_off_is_known(dof: int) -> None:
+    """Of correct measurements, those that pass have the mean distance that is expected of them."""
+    distances = np.random.default_rng(41).chisquare(dof, 20_000)
+    k = np.full(len(distances), dof)
+    largest = threshold(k, 0.9)
+    sums = Innovations.of(distances, k, largest, distances < largest)
+    assert sums.rejected == pytest.approx(0.1 * sums.tested, rel=0.1)
+    assert sums.distance == pytest.approx(sums.dof, rel=0.02)
+    assert sums.passed_distance == pytest.approx(sums.expected, rel=0.02)
+    assert sums.expected < sums.passed_dof
+    assert astuple(sums + sums) == pytest.approx([2 * value for value in astuple(sums)])
+
+
+def test_the_joint_distance_is_what_measurements_add_to_the_least_cost() -> None:
+    rng = np.random.default_rng(43)
+    A, b = rng.normal(size=(7, 4)), rng.normal(size=7)
+    triangle = np.triu(rng.normal(size=(5, 5))) + 2.0 * np.eye(5)
+    predicted = SquareRootInformation(Layout({1: 4}), np.asfortranarray(triangle))
+    posterior = predicted.updated(np.column_stack([A, b]))
+    r = b - A @ predicted.solution()
+    expected = r @ np.linalg.solve(A @ predicted.covariance() @ A.T + np.eye(7), r)
+    assert posterior.residual - predicted.residual == pytest.approx(expected)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost
 from slam_graph.backend.gauss_newton import minimize
-from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.marginalization import LinearizationPoints, marginalize
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
@@ -189,7 +189,8 @@ def test_the_loop_is_a_kalman_filter(first_estimates: bool, max_steps: int) -> N
         dynamics = linear_factor(state, [*old, *new], transition, F @ old_point + u - new_point, Q)
         measurement = linear_factor(state, new, H, z - H @ new_point, R)
         cost = cost_of(state, prior, [dynamics, measurement])
-        prior = marginalize(minimize(cost, steps).posterior, state, new, first_estimates)
+        points: LinearizationPoints = "first" if first_estimates else "current"
+        prior = marginalize(minimize(cost, steps).posterior, state, new, points)
 
         x, P = F @ x + u, F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)

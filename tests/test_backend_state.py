@@ -181,7 +181,7 @@ def test_the_prior_is_a_function_of_the_offsets(state: State, first_estimates: b
     state.update(wide, delta(KEYS))
     keep = [X(1), L(5)]
     expected = posterior.marginal(keep)
-    prior = marginalize(posterior, state, keep, first_estimates)
+    prior = marginalize(posterior, state, keep, "first" if first_estimates else "current")
     assert not state.estimate.exists(X(0))
     assert state.estimate.exists(X(1))
     offset = state.offset(prior.layout)

@@ -105,6 +105,18 @@ def test_the_noise_is_the_best_possible() -> None:
     np.testing.assert_allclose(error.std(axis=0), bound, rtol=0.08)
 
 
+def test_the_depth_is_known_as_well_as_it_says() -> None:
+    cameras, rng = rig(1), np.random.default_rng(3)
+    positions = np.stack([np.zeros(6), np.linspace(-0.6, 0.6, 6), np.zeros(6)], axis=1)
+    points = np.tile([[3.0, 0.2, 0.3]], (3000, 1))
+    noise = rng.normal(0.0, 0.5, (len(points) * len(positions), 2))
+    result = solve(cameras, seen_from(cameras, points, positions, noise), positions)
+    inverse_depth = 1.0 / (result.points[:, 0] - cameras.cameras[0].body_T_camera.x())
+    error = inverse_depth.std() / inverse_depth.mean()
+    said = 0.5 / cameras.cameras[0].camera.fx * result.depth_error.mean()
+    np.testing.assert_allclose(error, said, rtol=0.08)
+
+
 def test_refuses_what_was_seen_without_parallax() -> None:
     cameras = rig(1)
     still = np.zeros((5, 3))

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import baseline, report, run, speed, speed_worker
+from benchmarks import baseline, cost_over_time, monte_carlo, report, run, speed, speed_worker
 from benchmarks.metric import Bar, Direction, Metric, info
+from benchmarks.openvins_sim import Quality, best
 from benchmarks.registry import BENCHMARKS
 from benchmarks.running import Errors
 from benchmarks.suite import DATA_VARIABLE, Benchmark, Outcome
@@ -303,3 +304,57 @@ def test_the_least_disturbed_run_counts_and_one_is_enough_if_alone(
 
 def test_the_peak_of_memory_is_of_this_program() -> None:
     assert 10.0 < speed_worker.peak_memory_mb() < 100_000.0
+
+
+def test_what_is_not_judged_is_shown_without_its_bar() -> None:
+    outcome = Outcome()
+    metrics = [Metric("ate", 1.0, "m", "lower", 0.5)]
+    outcome.add("judged", metrics)
+    outcome.add("shown", metrics, judged=False)
+    assert [metric.key for metric in outcome.metrics] == ["judged.ate", "shown.ate"]
+    assert [metric.meets_bar for metric in outcome.metrics] == [False, None]
+    assert [metric.has_baseline for metric in outcome.metrics] == [True, False]
+
+
+def test_the_best_is_judged_by_the_figures_of_the_other_system() -> None:
+    theirs = Quality(0.03, 0.5, nees_position=0.3, nees_orientation=3.2)
+    accurate = Quality(0.02, 0.2, nees_position=2.0, nees_orientation=3.1)
+    too_sure = Quality(0.01, 0.6, nees_position=9.0, nees_orientation=3.0)
+    assert accurate.no_worse_than(theirs)
+    assert not too_sure.no_worse_than(theirs)
+    found = {metric.key: metric for metric in best({"a": accurate, "b": too_sure}, theirs)}
+    assert (found["best.position"].value, found["best.position"].bar) == (0.01, 0.03)
+    assert (found["best.orientation"].value, found["best.orientation"].bar) == (0.2, 0.5)
+    assert found["no_worse_in_all"].value == 1
+    assert not any(metric.meets_bar for metric in best({"b": too_sure}, accurate)[1:])
+
+
+def test_growth_is_that_of_the_last_quarter_over_the_second() -> None:
+    flat, growing = np.full(101, 7.0), np.arange(1.0, 102.0)
+    assert cost_over_time.last_over_second_quarter(flat) == 1.0
+    assert cost_over_time.last_over_second_quarter(growing) == pytest.approx(89 / 38)
+    series = {
+        "ms_backend": np.array([1.0, 9.0, 1.0, 8.0]),
+        "ms_backend.smoother": np.array([NAN, 8.0, NAN, 7.0]),
+    }
+    assert cost_over_time.stepped_ms(series).tolist() == [9.0, 8.0]
+
+
+@pytest.mark.parametrize(("scale", "met"), [(0.5, True), (1.0, True), (1.6, False)])
+def test_monte_carlo_accepts_a_right_or_careful_covariance(scale: float, met: bool) -> None:
+    rng = np.random.default_rng(3)
+    dof = {"orientation": 3, "position": 3, "pose": 6}
+    runs = [
+        {f"nees_{part}": scale * rng.chisquare(k, 200) for part, k in dof.items()}
+        for _ in range(monte_carlo.SEEDS)
+    ]
+    judged = [m for m in monte_carlo.consistency(runs) if m.bar is not None]
+    assert len(judged) == len(dof)
+    assert all(metric.meets_bar is met for metric in judged)
+    assert not any(metric.meets_bar for metric in monte_carlo.consistency([]))
+
+
+def test_a_long_flight_is_measured_in_a_process_of_its_own() -> None:
+    table = speed.worker("benchmarks.memory_worker", "msckf", "1")
+    assert table["frames"] == 11
+    assert 50.0 < table["peak_mb"] < 1000.0

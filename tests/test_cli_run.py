@@ -28,7 +28,7 @@ FILES = {
     "run.log",
 }
 
-TIMEOUT_S = 120
+TIMEOUT_S = 600
 STATIC = ("--set", "backend.initialization.mode=static", "--no-progress")
 SHORT = ("--duration", "3", "--set", "min_coverage=0.1", *STATIC)
 """The demo stands still when it begins: looking for a motion there would only take time."""

@@ -20,32 +20,13 @@ from slam_graph.backend.imu import imu_factor, preintegrate, preintegration_para
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.square_root import Layout
 from slam_graph.backend.state import State, dims_of
+from slam_graph.backend.unseen import unseen_directions
 from slam_graph.config import load_config
 from slam_graph.sensors.measurements import FeatureFrame
 
 FloatArray = NDArray[np.float64]
 CONFIG = BackendConfig(initialization=InitializationConfig(mode="given", fix_gauge=False))
 WEAK = np.array([0.1, 0.5, 0.3, 0.1, 0.02])
-UP = np.array([0.0, 0.0, 1.0])
-
-
-def unseen_directions(values: gtsam.Values, layout: Layout) -> FloatArray:
-    """Tangents (n, 4) of a shift and a turn of the world."""
-    directions = np.zeros((layout.size, 4))
-    for key, columns in layout.columns.items():
-        kind, block = chr(gtsam.Symbol(key).chr()), directions[columns]
-        if kind == "x":
-            pose = values.atPose3(key)
-            world_to_body = pose.rotation().matrix().T
-            block[3:, :3] = world_to_body
-            block[:3, 3] = world_to_body @ UP
-            block[3:, 3] = world_to_body @ np.cross(UP, pose.translation())
-        elif kind == "v":
-            block[:, 3] = np.cross(UP, values.atVector(key))
-        elif kind == "l":
-            block[:, :3] = np.eye(3)
-            block[:, 3] = np.cross(UP, values.atPoint3(key))
-    return directions
 
 
 def claimed_information(estimator: Estimator) -> FloatArray:

@@ -5,9 +5,10 @@
 import gtsam
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from slam_graph.evaluation.consistency import mean_bounds, nees
-from slam_graph.evaluation.report import consistency_report
+from slam_graph.evaluation.consistency import average_nees, mean_bounds, nees
+from slam_graph.evaluation.report import consistency_report, innovation_report
 from slam_graph.geometry.alignment import Similarity
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import NavState, Trajectory
@@ -133,3 +134,38 @@ def test_mean_bounds_close_in_on_the_degrees_of_freedom(dof: int) -> None:
         assert low < dof < high
         widths.append(high - low)
     assert widths == sorted(widths, reverse=True)
+
+
+def test_the_average_over_runs_of_a_right_covariance_is_inside_its_bounds() -> None:
+    runs = np.random.default_rng(5).chisquare(6, (20, 4000))
+    average = average_nees(runs, 6)
+    assert average.bounds == mean_bounds(6, 20)
+    assert average.inside == pytest.approx(0.95, abs=0.02)
+    assert average.mean == pytest.approx(6.0, rel=0.02)
+    assert average_nees(2.0 * runs, 6).inside < 0.1
+
+
+def test_innovations_are_judged_by_what_passes_the_gate() -> None:
+    rng = np.random.default_rng(6)
+    dof, frames = 3, 3000
+    distances = rng.chisquare(dof, (frames, 50))
+    largest = chi2.ppf(0.95, dof)
+    passed = distances < largest
+    entered = passed.sum(axis=1)
+    columns = {
+        "tested": np.full(frames, 50.0),
+        "rejected": 50.0 - entered,
+        "distance": distances.sum(axis=1),
+        "dof": np.full(frames, 50.0 * dof),
+        "passed_distance": np.where(passed, distances, 0.0).sum(axis=1),
+        "passed_dof": dof * entered.astype(float),
+        "expected": dof * entered * chi2.cdf(largest, dof + 2) / 0.95,
+    }
+    report = innovation_report(columns)
+    assert report is not None
+    assert report["mean_before_gate"] == pytest.approx(1.0, rel=0.01)
+    assert report["mean"] == pytest.approx(report["expected_mean"], rel=0.01)
+    assert report["mean"] < 0.95
+    assert report["inside_bounds"] >= 0.95
+    assert report["rejected"] == pytest.approx(0.05, rel=0.05)
+    assert innovation_report({name: np.zeros(0) for name in columns}) is None

@@ -108,6 +108,21 @@ def test_map_keeps_the_last_estimate_and_reads_back(tmp_path: Path) -> None:
     )
 
 
+def test_map_of_many_features_is_what_a_table_of_them_would_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("slam_graph.output.point_map.RECENT", 300)
+    rng, points = np.random.default_rng(2), PointMap()
+    table: dict[int, list[float]] = {}
+    for _ in range(40):
+        ids = rng.choice(2000, 50, replace=False)
+        positions = rng.normal(size=(50, 3))
+        points.update(ids, positions)
+        table.update(zip(ids.tolist(), positions.tolist(), strict=True))
+    assert len(points) == len(table)
+    assert sorted(points.points().tolist()) == sorted(table.values())
+
+
 def test_what_json_cannot_hold_becomes_null() -> None:
     table = {"a": float("nan"), "b": [1.0, float("inf")], "c": {"d": (2, "x")}}
     assert json.loads(json.dumps(finite(table), allow_nan=False)) == {

@@ -31,7 +31,7 @@ from slam_graph.backend.square_root import (
     SquareRootInformation,
     triangularize,
 )
-from slam_graph.backend.state import State, dims_of
+from slam_graph.backend.state import POINT_DIM, State, dims_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -68,6 +68,11 @@ class FeatureArchive:
     def __len__(self) -> int:
         """How many features are put aside."""
         return len(self._places)
+
+    @property
+    def size(self) -> int:
+        """Dimension of what is put aside."""
+        return POINT_DIM * len(self._places)
 
     def put(self, conditional: Conditional, state: State) -> None:
         """Put eliminated variables aside.

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.gating import Innovations
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.smoother import SmootherEstimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -30,6 +32,16 @@ class EstimatorLike(Protocol):
     @property
     def costs(self) -> tuple[float, ...]:
         """The cost before the first step of the last frame and after each; empty if not known."""
+        ...
+
+    @property
+    def columns(self) -> int:
+        """Dimension of the state in the last step that has costs."""
+        ...
+
+    @property
+    def innovations(self) -> Innovations:
+        """How far the last frame was from what was predicted of it."""
         ...
 
     @property
@@ -52,6 +64,11 @@ class EstimatorLike(Protocol):
 
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
         """Take the features of one time and estimate the state then."""
+        ...
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
         ...
 
     def landmarks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -140,6 +140,39 @@ class InitializationConfig(Settings):
     """Take the position and yaw of the first state as the definition of the world frame."""
 
 
+class CalibrationConfig(Settings):
+    """Which parameters of the rig are estimated with the states, and how well they are known.
+
+    Sigmas are standard deviations of the calibration that the data brings, for each component.
+    """
+
+    extrinsics: bool = False
+    """Estimate where each camera is mounted on the body."""
+    time_offset: bool = False
+    """Estimate the offset from the clock of the cameras to that of the IMU, one for all cameras."""
+    intrinsics: bool = False
+    """Estimate focal lengths and principal point of each camera."""
+    distortion: bool = False
+    """Estimate the distortion coefficients of each camera."""
+    rotation_sigma_rad: float = Field(0.02, gt=0)
+    """Rotation of a camera."""
+    position_sigma_m: float = Field(0.02, gt=0)
+    """Position of a camera."""
+    time_offset_sigma_s: float = Field(0.01, gt=0)
+    """Time offset."""
+    focal_length_sigma: float = Field(0.01, gt=0)
+    """Focal lengths, as a share of them."""
+    principal_point_sigma_px: float = Field(5.0, gt=0)
+    """Principal point."""
+    distortion_sigma: float = Field(0.01, gt=0)
+    """Distortion coefficients."""
+
+    @property
+    def anything(self) -> bool:
+        """Whether any parameter is estimated."""
+        return self.extrinsics or self.time_offset or self.intrinsics or self.distortion
+
+
 class BackendConfig(Settings):
     """Settings of the back end that do not depend on the algorithm."""
 
@@ -153,3 +186,5 @@ class BackendConfig(Settings):
     """Standing still."""
     initialization: InitializationConfig = InitializationConfig()
     """Start-up."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """Online calibration."""

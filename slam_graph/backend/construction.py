@@ -11,7 +11,7 @@ first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam.symbol_shorthand import L, X
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, Linearization, NewFeatures
-from slam_graph.backend.gating import threshold
+from slam_graph.backend.gating import Gate, Innovations, threshold
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
-from slam_graph.backend.state import stacked_poses
+from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
@@ -47,6 +47,8 @@ class ConstructedCost:
         features: ids of the features that stay in the state, ascending.
         leaving: (J,) those of the cost's new features that are used for the last time.
         keep_lost_features: whether features that leave are put aside for when they are seen again.
+        predicted: what was known of the variables before the images; None if these are left out.
+        innovations: distances of the images from that.
     """
 
     cost: Cost
@@ -56,6 +58,22 @@ class ConstructedCost:
     features: IntArray
     leaving: BoolArray
     keep_lost_features: bool
+    predicted: SquareRootInformation | None = None
+    innovations: Innovations = field(default_factory=Innovations)
+
+    def innovations_under(self, posterior: SquareRootInformation) -> Innovations:
+        """The innovations with the joint distance of all measurements that entered.
+
+        What they add to the least of the cost is rᵀ (H P Hᵀ + I)⁻¹ r of all of them stacked, with
+        the correlations that they have by their common poses.
+        """
+        if self.predicted is None:
+            return Innovations()
+        joint = posterior.residual - self.predicted.residual
+        known = replace(self.innovations, passed_distance=joint)
+        if known.dof:
+            return known
+        return replace(known, distance=joint, dof=known.passed_dof)  # nothing was gated before
 
     def drop_features(self) -> None:
         """Leave only the prior and the factors."""
@@ -63,7 +81,7 @@ class ConstructedCost:
             new = self.cost.fresh.obs.ids[self.cost.fresh.in_state]
             self.cost.state.remove(L(int(j)) for j in new)
             self.features = self.features[~is_in(self.features, new)]
-        self.cost.tracked = self.cost.fresh = self.linear = None
+        self.cost.tracked = self.cost.fresh = self.linear = self.predicted = None
         self.leaving = np.zeros(0, np.bool_)
 
 
@@ -97,7 +115,7 @@ class CostConstruction:
             return self._constructed(window, cost, None, past, window.features, nothing)
         window.recall_features()
         cost.prior = window.prior
-        past = POSE_CHOICES[self.policy.past_poses](window, self.policy)
+        past = POSE_CHOICES[self.policy.past_poses](window, self.policy, self.rig)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
         seen = np.intersect1d(window.features, window.tracks.ids_in(window.frame), True)
         cost.tracked = window.tracks.observations(seen, [window.frame])
@@ -105,14 +123,17 @@ class CostConstruction:
         leaving_frames = [i for i in window.past if i not in past]
         cost.fresh = self._new_features(window, leaving_frames, len(seen))
         linear = cost.linearize(summed=self.policy.gate == "residual")
-        tracked_ok, fresh_ok = cost.gate(linear, predicted)
-        linear = self._leave_out(window, cost, linear, tracked_ok, fresh_ok)
+        gate = cost.gate(linear, predicted)
+        linear = self._leave_out(window, cost, linear, gate)
         leaving = self._leaving(window, cost, leaving_frames)
         if self.policy.features != "window":
             # a pose that no unused observation refers to has nothing more to give
             useful = window.tracks.frames()
             past = [i for i in past if i in useful]
-        return self._constructed(window, cost, linear, past, self._in_state(window, cost), leaving)
+        features = self._in_state(window, cost)
+        constructed = self._constructed(window, cost, linear, past, features, leaving)
+        constructed.predicted, constructed.innovations = predicted, gate.innovations
+        return constructed
 
     def _constructed(
         self,
@@ -141,7 +162,11 @@ class CostConstruction:
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
         fits = cost.squared_errors(obs, cost.fresh.points) < limit
         window.tracks.forget(obs.rows(~fits))
-        self.diagnostics.counts["observation_rejected_by_gate"] += int(np.sum(~fits))
+        rejected = int(np.sum(~fits))
+        self.diagnostics.counts["observation_rejected_by_gate"] += rejected
+        constructed.innovations = replace(
+            constructed.innovations, tested=len(fits), rejected=rejected
+        )
         cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
 
     # --- features --------------------------------------------------------------------------------
@@ -178,32 +203,28 @@ class CostConstruction:
         # steps may have sent a feature with little parallax to infinity
         good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
         if not good.all():
-            new = ~good
-            poses = stacked_poses(window.state.estimate, obs.frames)
-            result = triangulate(obs.subset(new), self.rig, *poses, self.config.triangulation)
-            wide = result.parallax_rad > self.policy.state_feature_parallax_rad
-            points[new], good[new] = result.points, result.good & (wide | ~lasting[new])
+            new, rig = ~good, self.rig.at(window.state)
+            poses = rig.poses(window.state.estimate, obs.frames)
+            observed = rig.renormalized(obs.subset(new))
+            result = triangulate(observed, rig, *poses, self.config.triangulation)
+            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
+            known = noise * result.depth_error < self.policy.state_feature_depth_error
+            points[new], good[new] = result.points, result.good & (known | ~lasting[new])
         return points, good
 
     def _leave_out(
-        self,
-        window: Window,
-        cost: Cost,
-        linear: Linearization,
-        tracked_ok: BoolArray,
-        fresh_ok: BoolArray,
+        self, window: Window, cost: Cost, linear: Linearization, gate: Gate
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
-        rejected = int(np.sum(~tracked_ok) + np.sum(~fresh_ok))
-        self.diagnostics.counts["feature_rejected_by_gate"] += rejected
+        self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
         if linear.tracked is not None and cost.tracked is not None:
-            cost.tracked = cost.tracked.rows(tracked_ok)
+            cost.tracked = cost.tracked.rows(gate.tracked)
         if linear.fresh is not None and cost.fresh is not None:
-            window.tracks.consume(cost.fresh.obs.ids[~fresh_ok])
-            cost.fresh = cost.fresh.subset(fresh_ok)
+            window.tracks.consume(cost.fresh.obs.ids[~gate.fresh])
+            cost.fresh = cost.fresh.subset(gate.fresh)
             for row in np.flatnonzero(cost.fresh.in_state):
                 cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])
-        return linear.subset(tracked_ok, fresh_ok)
+        return linear.subset(gate.tracked, gate.fresh)
 
     def _in_state(self, window: Window, cost: Cost) -> IntArray:
         """The features that stay in the state: those that are tracked, old and new, or all."""

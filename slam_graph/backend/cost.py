@@ -26,11 +26,11 @@ from slam_graph.backend.feature_factors import (
     robust_loss,
     whiten,
 )
-from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.reprojection import Geometry, RigProjection
 from slam_graph.backend.schur import CondensedFeatures, condense_features
 from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.state import POINT_DIM, State, dims_of, stacked_points, stacked_poses
+from slam_graph.backend.state import POINT_DIM, State, dims_of, stacked_points
 from slam_graph.backend.tracks import Observations
 
 FloatArray = NDArray[np.float64]
@@ -103,7 +103,7 @@ class Cost:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
         if self.fresh is not None:
-            keys += [X(i) for i in self.fresh.obs.frames]
+            keys += self.rig.keys_of(self.fresh.obs)
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
         return self.prior.layout.extended(
             dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
@@ -127,7 +127,7 @@ class Cost:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""
         offset = self.state.offset(self.prior.layout)
         total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
-        total += 0.5 * float(self.prior.Rd[-1, -1] ** 2)
+        total += 0.5 * self.prior.residual
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
         if self.tracked is not None and len(self.tracked):
             total += self._loss(self.tracked, None)
@@ -146,7 +146,8 @@ class Cost:
             obs: of features at `points` (J, 3), or of features of the state where these are None.
             points: in the world.
         """
-        residuals, _ = self.rig.residuals(obs, self._geometry(self.state.estimate, obs, points))
+        rig = self.rig.at(self.state)
+        residuals, _ = rig.residuals(obs, self._geometry(rig, self.state.estimate, obs, points))
         squares = np.einsum("ni,ni->n", residuals, residuals)
         return np.asarray(squares / self.config.noise.pixel_sigma**2, dtype=np.float64)
 
@@ -170,21 +171,24 @@ class Cost:
         return Linearization(tracked, fresh)
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
+        rig = self.rig.at(self.state)
         first, estimate = (
-            self._geometry(values, obs, points)
+            self._geometry(rig, values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
-        return whiten(
-            obs, self.rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating
-        )
+        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating)
 
     def _geometry(
-        self, values: gtsam.Values, obs: Observations, points: FloatArray | None
+        self,
+        rig: RigProjection,
+        values: gtsam.Values,
+        obs: Observations,
+        points: FloatArray | None,
     ) -> Geometry:
         """Poses and points of observations; the points of features of the state if not given."""
         if points is None:
             points = stacked_points(values, obs.ids.tolist())
-        return Geometry(*stacked_poses(values, obs.frames), points)
+        return Geometry(*rig.poses(values, obs.frames), points)
 
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
@@ -203,10 +207,12 @@ class Cost:
         """Rows [A b] (m, n + 1) of all observations."""
         parts = [np.zeros((0, layout.size + 1))]
         if linear.tracked is not None and self.tracked is not None:
-            parts.append(_tracked_rows(self.tracked, linear.tracked, layout))
+            columns = self._tracked_columns(self.tracked, layout)
+            parts.append(_tracked_rows(linear.tracked, columns, layout))
         if linear.fresh is not None and self.fresh is not None:
-            parts.append(_null_space_rows(self.fresh, linear.fresh, layout))
-            parts.append(_new_variable_rows(self.fresh, linear.fresh, layout))
+            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
+            parts.append(_null_space_rows(linear.fresh, columns, layout))
+            parts.append(_new_variable_rows(self.fresh, linear.fresh, columns, layout))
         return np.concatenate(parts)
 
     # --- moving --------------------------------------------------------------------------------
@@ -214,8 +220,8 @@ class Cost:
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the estimates by an increment (n,), and the new features with them."""
         if self.fresh is not None and linear.fresh is not None:
-            poses = layout.indices(X(i) for i in self.fresh.obs.frames)
-            step = linear.fresh.point_increments(delta[poses])
+            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
+            step = linear.fresh.point_increments(delta[columns])
             self.fresh = replace(self.fresh, points=self.fresh.points + step)
         self.state.update(layout, delta)
 
@@ -230,10 +236,10 @@ class Cost:
 
     # --- gating --------------------------------------------------------------------------------
 
-    def gate(
-        self, linear: Linearization, predicted: SquareRootInformation
-    ) -> tuple[BoolArray, BoolArray]:
-        """Which tracked observations (N,) and new features (J,) that are apart pass the χ² test.
+    def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
+        """Which tracked observations and new features pass the χ² test.
+
+        New features that are summed up all pass: they are not told apart before the steps.
 
         Args:
             linear: of this cost.
@@ -241,71 +247,80 @@ class Cost:
         """
         tracked = np.zeros(0, np.bool_)
         fresh = np.zeros(0, np.bool_)
-        confidence = self.config.gating.confidence
+        innovations, confidence = Innovations(), self.config.gating.confidence
         if linear.tracked is not None and self.tracked is not None:
-            keys = [X(i) for i in self.tracked.frames]
+            keys = self.rig.keys_of(self.tracked)
             keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
-            columns = _tracked_columns(self.tracked, Layout(dims_of(keys)))
-            H = np.concatenate([linear.tracked.by_pose, linear.tracked.by_point], axis=2)
+            columns = self._tracked_columns(self.tracked, Layout(dims_of(keys)))
             P = predicted.covariance_blocks(keys, columns)
-            distance = squared_mahalanobis(linear.tracked.r, H, P)
-            tracked = distance < threshold(np.array([2]), confidence)[0]
-        if isinstance(linear.fresh, CondensedFeatures):
-            fresh = np.ones(len(linear.fresh.R_f), np.bool_)
-        elif linear.fresh is not None and self.fresh is not None:
-            P = predicted.covariance_of([X(i) for i in self.fresh.obs.frames])
+            distance = squared_mahalanobis(linear.tracked.r, linear.tracked.H, P)
+            dof = np.full(len(distance), 2)
+            largest = threshold(dof, confidence)
+            # nearer or behind, the slope of the projection is so large that any residual would pass
+            near = linear.tracked.depths < self.config.triangulation.min_depth_m
+            tracked = (distance < largest) & ~near
+            innovations += Innovations.of(distance, dof, largest, tracked)
+        if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
+            fresh = np.ones(len(self.fresh.points), np.bool_)
+            innovations += Innovations.untested(2 * self.fresh.obs.counts - POINT_DIM)
+        elif isinstance(linear.fresh, ReducedFeatures) and self.fresh is not None:
+            P = predicted.covariance_of(self.rig.keys_of(self.fresh.obs))
             distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
-            fresh = distance < threshold(linear.fresh.dof, confidence)
-        return tracked, fresh
+            largest = threshold(linear.fresh.dof, confidence)
+            fresh = distance < largest
+            innovations += Innovations.of(distance, linear.fresh.dof, largest, fresh)
+        return Gate(tracked, fresh, innovations)
+
+    def _tracked_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
+        """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
+        poses = np.array([layout.columns[X(i)].start for i in obs.frames])
+        keys = [L(j) for j in obs.ids.tolist()]
+        points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
+        calibration = layout.indices(self.rig.calibration_keys)
+        return np.concatenate(
+            [
+                poses[obs.frame][:, None] + np.arange(6),
+                points[obs.feature][:, None] + np.arange(POINT_DIM),
+                np.broadcast_to(calibration, (len(obs), len(calibration))),
+            ],
+            axis=1,
+        )
 
 
-def _tracked_columns(obs: Observations, layout: Layout) -> NDArray[np.intp]:
-    """Columns (N, 9) of the pose and the feature of each observation."""
-    poses = np.array([layout.columns[X(i)].start for i in obs.frames])
-    keys = [L(j) for j in obs.ids.tolist()]
-    points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
-    return np.concatenate(
-        [
-            poses[obs.frame][:, None] + np.arange(6),
-            points[obs.feature][:, None] + np.arange(POINT_DIM),
-        ],
-        axis=1,
-    )
-
-
-def _tracked_rows(obs: Observations, linear: WhitenedObservations, layout: Layout) -> FloatArray:
-    Ab = np.zeros((len(obs), 2, layout.size + 1))
-    columns = _tracked_columns(obs, layout)
-    rows = np.arange(len(obs))[:, None]
-    Ab[rows, :, columns[:, :6]] = linear.by_pose.transpose(0, 2, 1)
-    Ab[rows, :, columns[:, 6:]] = linear.by_point.transpose(0, 2, 1)
+def _tracked_rows(
+    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """The rows of observations of features of the state."""
+    Ab = np.zeros((len(columns), 2, layout.size + 1))
+    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
     Ab[:, :, -1] = linear.r
     return Ab.reshape(-1, layout.size + 1)
 
 
 def _null_space_rows(
-    fresh: NewFeatures, linear: ReducedFeatures | CondensedFeatures, layout: Layout
+    linear: ReducedFeatures | CondensedFeatures, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
-    """What new features say of the poses, compressed to at most 6 F + 1 rows."""
-    poses = layout.indices(X(i) for i in fresh.obs.frames)
+    """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
     compact = linear.null_space_rows()
-    if len(compact) > len(poses):
+    if len(compact) > len(columns):
         compact = triangularize(compact)
     Ab = np.zeros((len(compact), layout.size + 1))
-    Ab[:, poses] = compact[:, :-1]
+    Ab[:, columns] = compact[:, :-1]
     Ab[:, -1] = compact[:, -1]
     return Ab
 
 
 def _new_variable_rows(
-    fresh: NewFeatures, linear: ReducedFeatures | CondensedFeatures, layout: Layout
+    fresh: NewFeatures,
+    linear: ReducedFeatures | CondensedFeatures,
+    columns: NDArray[np.intp],
+    layout: Layout,
 ) -> FloatArray:
     """The three rows that determine each feature that stays in the state."""
-    poses = layout.indices(X(i) for i in fresh.obs.frames)
     features = np.flatnonzero(fresh.in_state)
     Ab = np.zeros((len(features), POINT_DIM, layout.size + 1))
     for row, j in enumerate(features):
         Ab[row][:, layout.columns[L(int(fresh.obs.ids[j]))]] = linear.R_f[j]
-    Ab[:, :, poses] = linear.T[features]
+    Ab[:, :, columns] = linear.T[features]
     Ab[:, :, -1] = linear.r_1[features]
     return Ab.reshape(-1, layout.size + 1)

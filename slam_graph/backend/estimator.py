@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from slam_graph.backend.calibrated_projection import CalibratedProjection
+from slam_graph.backend.calibration import CalibrationVariables
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.gating import Innovations
 from slam_graph.backend.gauss_newton import Minimum, minimize
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.backend.initialization import Initializer, start_from
@@ -24,11 +27,13 @@ from slam_graph.backend.marginalization import marginalize_step
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.propagation import Propagation
 from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -50,6 +55,8 @@ class Estimator:
         window: variables, prior and tracks; None as long as there is no state.
         timings: seconds that each module took in the last step.
         costs: the cost before the first Gauss-Newton step of the last frame and after each.
+        columns: dimension of the state in the last step, with the features that are put aside.
+        innovations: how far the last frame was from what was predicted of it.
     """
 
     def __init__(
@@ -66,18 +73,23 @@ class Estimator:
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
         self.costs: tuple[float, ...] = ()
+        self.columns = 0
+        self.innovations = Innovations()
+        self._calibration = CalibrationVariables(rig, self.config.calibration)
         projection = RigProjection(rig)
+        if self._calibration.keys:
+            projection = CalibratedProjection(self._calibration)
         self._propagation = Propagation(rig.imu, self.config, self.diagnostics)
         self._construction = CostConstruction(
             algorithm.cost, projection, self.config, self.diagnostics
         )
         self._initializer = Initializer(
-            projection, self._propagation.noise.params(), algorithm, self.config
+            projection, self._propagation.noise.params(), algorithm, self.config, self._calibration
         )
         self._standstill = StandstillDetector(self.config.zero_velocity)
         self._imu = ImuBuffer()
         self._latest_ns = np.iinfo(np.int64).min
-        self._time_offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
+        self._posterior: SquareRootInformation | None = None
         # the matrices are small: waking threads for them costs many times what they save
         self._threads = ThreadpoolController()
 
@@ -87,16 +99,19 @@ class Estimator:
         """One turn of the loop: the three modules, in order."""
         with self._timed("propagation"):
             self._propagation.append_frame(window, self._imu, stamp_ns, still)
-            window.tracks.add(window.frame, frame)
+            self._add_tracks(window, frame)
         with self._timed("cost"):
             constructed = self._construction.construct(window, still)
         with self._timed("gauss_newton"):
             minimum = self._minimize(constructed)
             self.costs = minimum.costs
+            self.columns = minimum.posterior.layout.size + window.archive.size
             self._construction.reject_residuals(window, constructed)
+            self.innovations = constructed.innovations_under(minimum.posterior)
         with self._timed("marginalization"):
             policy = self.algorithm.marginalization
-            marginalize_step(window, constructed, minimum.posterior, policy)
+            marginalize_step(window, constructed, minimum, policy)
+        self._posterior = minimum.posterior
         state = window.current(minimum.posterior)
         self._propagation.learn(state)
         return state
@@ -104,8 +119,9 @@ class Estimator:
     def _minimize(self, constructed: ConstructedCost) -> Minimum:
         """Take the steps; without the features if these leave something undetermined."""
         policy = self.algorithm.gauss_newton
+        again = self._calibration.moved_far if self._calibration.keys else None
         try:
-            return minimize(constructed.cost, policy, constructed.linear)
+            return minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
             self.diagnostics.warn("features_degenerate", "one frame goes without its features")
             constructed.drop_features()
@@ -140,7 +156,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        self.window = start_from(state, self.config)
+        self.window = start_from(state, self.config, self._calibration)
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
@@ -156,8 +172,9 @@ class Estimator:
             The causal estimate with its covariance, stamped on the clock of the IMU. None as long
             as there is no state, and for a frame that does not follow those before.
         """
-        stamp_ns = frame.stamp_ns + self._time_offset_ns
-        self.timings, self.costs = {}, ()
+        state = self.window.state if self.window is not None else None
+        stamp_ns = self._calibration.stamp(frame.stamp_ns, state, self._imu)
+        self.timings, self.costs, self.innovations = {}, (), Innovations()
         if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
@@ -173,16 +190,31 @@ class Estimator:
             elif stamp_ns > self.window.stamp_ns:
                 return self._step(self.window, stamp_ns, frame, still)
             elif stamp_ns == self.window.stamp_ns:
-                self.window.tracks.add(self.window.frame, frame)
+                self._add_tracks(self.window, frame)
             if self.window is None or stamp_ns < self.window.stamp_ns:
                 return None
             return self.window.current(self.window.prior)
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
+        if self.window is None or not self._calibration.keys:
+            return None
+        information = self._posterior or self.window.prior
+        return self._calibration.estimate(self.window.stamp_ns, self.window.state, information)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
         if self.window is None:
             return np.zeros(0, np.int64), np.zeros((0, 3))
         return self.window.points()
+
+    def _add_tracks(self, window: Window, frame: FeatureFrame) -> None:
+        """Add what the current frame has seen."""
+        window.tracks.add(window.frame, frame)
+        self._calibration.note_motion(
+            window.state, window.frame, window.stamp_ns, frame.stamp_ns, self._imu
+        )
 
     def _usable(self, frame: FeatureFrame) -> FeatureFrame:
         """The frame with all cameras of the rig, without observations that are not finite."""

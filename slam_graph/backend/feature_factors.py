@@ -34,26 +34,43 @@ class WhitenedObservations:
         r: (N, 2) residuals.
         by_pose: (N, 2, 6) derivatives of the projection.
         by_point: (N, 2, 3).
+        by_calibration: (N, 2, C), by the parameters of the rig that are estimated.
+        depths: (N,) in metres.
     """
 
     r: FloatArray
     by_pose: FloatArray
     by_point: FloatArray
+    by_calibration: FloatArray
+    depths: FloatArray
+
+    @property
+    def H(self) -> FloatArray:
+        """(N, 2, 9 + C) by the pose, the point and the calibration, in this order."""
+        return np.concatenate([self.by_pose, self.by_point, self.by_calibration], axis=2)
 
     def subset(self, keep: NDArray[np.bool_]) -> WhitenedObservations:
         """The observations where `keep` (N,) holds."""
-        return WhitenedObservations(self.r[keep], self.by_pose[keep], self.by_point[keep])
+        return WhitenedObservations(
+            self.r[keep],
+            self.by_pose[keep],
+            self.by_point[keep],
+            self.by_calibration[keep],
+            self.depths[keep],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedFeatures:
-    """J features after the rotation by QR, over the poses of F frames.
+    """J features after the rotation by QR, over the poses of F frames and C further columns.
+
+    The further columns are those of the calibration; there are none if nothing of it is estimated.
 
     Attributes:
         R_f: (J, 3, 3) upper triangular.
-        T: (J, 3, 6 F).
+        T: (J, 3, 6 F + C).
         r_1: (J, 3).
-        N: (J, K, 6 F); rows beyond `dof` are zero.
+        N: (J, K, 6 F + C); rows beyond `dof` are zero.
         r_2: (J, K).
         dof: (J,) number of rows of N that are in use.
     """
@@ -77,13 +94,13 @@ class ReducedFeatures:
         )
 
     def null_space_rows(self) -> FloatArray:
-        """The rows [N r₂] of all features, (rows, 6 F + 1)."""
+        """The rows [N r₂] of all features, (rows, 6 F + C + 1)."""
         rows = np.arange(self.N.shape[1]) < self.dof[:, None]
         return np.concatenate([self.N[rows], self.r_2[rows][:, None]], axis=1)
 
-    def point_increments(self, delta_poses: FloatArray) -> FloatArray:
-        """The δf (J, 3) that go with an increment of the poses (6 F,)."""
-        rest = self.r_1 - self.T @ delta_poses
+    def point_increments(self, delta: FloatArray) -> FloatArray:
+        """The δf (J, 3) that go with an increment of poses and calibration (6 F + C,)."""
+        rest = self.r_1 - self.T @ delta
         increments = np.linalg.solve(self.R_f, rest[:, :, None])[:, :, 0]
         return np.asarray(increments, dtype=np.float64)
 
@@ -97,14 +114,16 @@ def whiten(
     gating: GatingConfig,
 ) -> WhitenedObservations:
     """Linearise observations: Jacobians at the first estimates, residuals at the current ones."""
-    residuals, _ = rig.residuals(obs, estimate)
-    by_pose, by_point = rig.jacobians(obs, first)
+    residuals, depths = rig.residuals(obs, estimate)
+    by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     r = residuals / sigma_px
     weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=1), gating)) / sigma_px
     return WhitenedObservations(
         residuals * weight[:, None],
         by_pose * weight[:, None, None],
         by_point * weight[:, None, None],
+        by_calibration * weight[:, None, None],
+        depths,
     )
 
 
@@ -133,7 +152,9 @@ def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedF
     F = len(obs.frames)
     by_poses = np.zeros((len(obs), 2, F, 6))
     by_poses[np.arange(len(obs)), :, obs.frame] = linear.by_pose
-    others = np.concatenate([by_poses.reshape(-1, 2, 6 * F), linear.r[:, :, None]], axis=2)
+    others = np.concatenate(
+        [by_poses.reshape(-1, 2, 6 * F), linear.by_calibration, linear.r[:, :, None]], axis=2
+    )
     R_f, rest = eliminate_points(obs, linear.by_point, others)
     H, r = rest[:, :, :-1], rest[:, :, -1]
     return ReducedFeatures(R_f, H[:, :3], r[:, :3], H[:, 3:], r[:, 3:], 2 * obs.counts - 3)

@@ -4,22 +4,29 @@
 
 Each step linearises every residual, stacks the rows under the prior's triangular factor, restores
 the triangle by QR, and moves the estimates by the solution. The triangle of the last step is the
-posterior Gaussian that marginalization works on. Levenberg-Marquardt adds rows that hold the step
-back, and takes a step only if it lowers the cost.
+posterior Gaussian that marginalization works on. After the first step, which makes a filter, steps
+are only taken as long as they lower the cost; Levenberg-Marquardt adds rows that hold a step back
+that would not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.backend.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 
+FloatArray = NDArray[np.float64]
+
 INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e6
+MAX_REPEATED_STEPS = 4
+"""How often a step is repeated at most where it is too large to be linear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,37 +36,70 @@ class Minimum:
     Attributes:
         posterior: over an increment of the final estimates, linearised where the last step was.
         costs: the cost before the first step and after each step that was taken.
+        repeated: whether there were more steps than the policy has, because one was too large.
     """
 
     posterior: SquareRootInformation
     costs: tuple[float, ...]
+    repeated: bool = False
 
 
-def minimize(cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None = None) -> Minimum:
+Again = Callable[[SquareRootInformation, FloatArray], bool]
+"""Whether a step (n,) under its posterior asks for one more."""
+
+
+def minimize(
+    cost: Cost,
+    policy: GaussNewtonPolicy,
+    linear: Linearization | None = None,
+    again: Again | None = None,
+) -> Minimum:
     """Take steps on a cost.
 
     Args:
         cost: moved in place: its state, and its new features.
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
+        again: asks for more steps than the policy has, up to `MAX_REPEATED_STEPS` in all.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
     """
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
-    layout, costs = cost.layout(), [cost.value()]
-    for step in range(policy.max_steps):
-        if linear is None or step > 0:
-            linear = cost.linearize(summed=True)
-        posterior = _system(cost, linear, layout)
-        delta = posterior.solution()
-        cost.apply(delta, linear, layout)
-        posterior = posterior.shifted(delta)
-        costs.append(cost.value())
-        if np.max(np.abs(delta), initial=0.0) < policy.tolerance:
+    layout, before = cost.layout(), cost.value()
+    posterior, delta = _step(cost, linear or cost.linearize(summed=True), layout)
+    minimum = Minimum(posterior, (before, cost.value()))
+    while _another(policy, minimum, delta, again):
+        undo = cost.snapshot()
+        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
+        value = cost.value()
+        if not value < minimum.costs[-1]:
+            cost.restore(undo)
             break
-    return Minimum(posterior, tuple(costs))
+        steps = len(minimum.costs)
+        minimum = Minimum(posterior, (*minimum.costs, value), repeated=steps > policy.max_steps)
+    return minimum
+
+
+def _another(
+    policy: GaussNewtonPolicy, minimum: Minimum, delta: FloatArray, again: Again | None
+) -> bool:
+    """Whether the last step asks for one more."""
+    steps = len(minimum.costs) - 1
+    if steps < policy.max_steps:
+        return bool(np.max(np.abs(delta), initial=0.0) >= policy.tolerance)
+    return again is not None and steps < MAX_REPEATED_STEPS and again(minimum.posterior, delta)
+
+
+def _step(
+    cost: Cost, linear: Linearization, layout: Layout
+) -> tuple[SquareRootInformation, FloatArray]:
+    """Move a cost by one step: the posterior, at the new estimates, and the step (n,)."""
+    posterior = _system(cost, linear, layout)
+    delta = posterior.solution()
+    cost.apply(delta, linear, layout)
+    return posterior.shifted(delta), delta
 
 
 def linearized(cost: Cost) -> SquareRootInformation:

@@ -16,20 +16,21 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 
+from slam_graph.backend.calibration import CalibrationVariables
 from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.cost import Cost, NewFeatures
 from slam_graph.backend.feature_factors import ReducedFeatures
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
-from slam_graph.backend.marginalization import marginalize
+from slam_graph.backend.marginalization import LinearizationPoints, marginalize
 from slam_graph.backend.motion_start import StartWindow, guess_states
 from slam_graph.backend.policies import AlgorithmConfig, GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import State, dims_of, imu_state_keys, stacked_poses
+from slam_graph.backend.state import State, dims_of, imu_state_keys
 from slam_graph.backend.static_start import fix_gauge, prior_covariance, state_at_rest
-from slam_graph.backend.tracks import TrackWindow, is_in, sorted_unique
-from slam_graph.backend.triangulation import triangulate
+from slam_graph.backend.tracks import Observations, TrackWindow, is_in, sorted_unique
+from slam_graph.backend.triangulation import Triangulation, triangulate
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.geometry.trajectory import NavState
@@ -45,14 +46,20 @@ OUTLIER_PX = 3.0
 """Features with a larger root mean square reprojection error leave the window, in units of σ."""
 
 
-def start_from(given: NavState, config: BackendConfig) -> Window:
-    """Start from a state with a covariance."""
+def start_from(
+    given: NavState, config: BackendConfig, calibration: CalibrationVariables | None = None
+) -> Window:
+    """Start from a state with a covariance, and from what is known of an estimated calibration."""
     if config.initialization.fix_gauge:
         given = fix_gauge(given, config.initialization.prior)
     state = State()
     state.insert_imu_state(0, given)
     state.freeze(imu_state_keys(0))
-    return Window(0, given.stamp_ns, state, prior_of(given))
+    prior = prior_of(given)
+    if calibration is None:
+        return Window(0, given.stamp_ns, state, prior)
+    prior = calibration.enter(state, prior)
+    return Window(0, given.stamp_ns, state, prior, calibration=calibration.keys)
 
 
 def prior_of(given: NavState, frame: int = 0) -> SquareRootInformation:
@@ -92,12 +99,14 @@ class Initializer:
         params: gtsam.PreintegrationCombinedParams,
         algorithm: AlgorithmConfig,
         config: BackendConfig,
+        calibration: CalibrationVariables,
     ) -> None:
         self.waiting_for = "the first frames"
         self._rig = rig
         self._params = params
         self._algorithm = algorithm
         self._config = config
+        self._calibration = calibration
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
@@ -132,7 +141,8 @@ class Initializer:
         if since_ns is None or stamp_ns - since_ns < needed_ns:
             return f"a still period of {start.static_window_s:g} s"
         samples = imu.between(since_ns, stamp_ns)
-        return start_from(state_at_rest(samples, stamp_ns, start.prior), self._config)
+        state = state_at_rest(samples, stamp_ns, start.prior)
+        return start_from(state, self._config, self._calibration)
 
     def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | str:
         start = self._config.initialization
@@ -167,10 +177,20 @@ class Initializer:
         except np.linalg.LinAlgError:
             return "motion that shows gravity and scale"
         last = len(window.frames) - 1
-        keep = [L(j) for j in features.tolist()] + list(imu_state_keys(last))
-        policy = self._algorithm.marginalization
-        prior = marginalize(posterior, cost.state, keep, policy.first_estimates)
-        start = Window(last, window.stamps_ns[-1], cost.state, prior, features=features)
+        keep = [L(j) for j in features.tolist()]
+        keep += [*self._calibration.keys, *imu_state_keys(last)]
+        points: LinearizationPoints = "current"
+        if self._algorithm.marginalization.first_estimates:
+            points = "first"
+        prior = marginalize(posterior, cost.state, keep, points)
+        start = Window(
+            last,
+            window.stamps_ns[-1],
+            cost.state,
+            prior,
+            features=features,
+            calibration=self._calibration.keys,
+        )
         covariance = prior.covariance_of(imu_state_keys(last))
         return self._doubt(normalized_cost, covariance) or start
 
@@ -186,7 +206,10 @@ class Initializer:
         wide = self._config.initialization.motion_prior
         first = fix_gauge(replace(guess[0], covariance=prior_covariance(wide)), wide)
         factors += _prior_factors(first)
-        cost = Cost(state, self._rig, self._config, SquareRootInformation.empty(), factors)
+        known = self._calibration.enter(state, SquareRootInformation.empty())
+        for k, (stamp_ns, frame) in enumerate(zip(window.stamps_ns, window.frames, strict=True)):
+            self._calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, imu)
+        cost = Cost(state, self._rig, self._config, known, factors)
         tracks = window.tracks()
         ids, lengths = tracks.lengths()
         long = lengths >= 3
@@ -196,10 +219,14 @@ class Initializer:
 
     def _triangulated(self, cost: Cost, tracks: TrackWindow, ids: IntArray) -> NewFeatures:
         obs = tracks.observations(ids)
-        poses = stacked_poses(cost.state.estimate, obs.frames)
-        result = triangulate(obs, self._rig, *poses, self._config.triangulation)
+        result = self._points(cost, obs)
         fresh = NewFeatures(obs, result.points, np.zeros(len(ids), np.bool_))
         return fresh.subset(result.good)
+
+    def _points(self, cost: Cost, obs: Observations) -> Triangulation:
+        rig = self._rig.at(cost.state)
+        poses = rig.poses(cost.state.estimate, obs.frames)
+        return triangulate(rig.renormalized(obs), rig, *poses, self._config.triangulation)
 
     def _without_outliers(self, cost: Cost) -> bool:
         """Triangulate anew and drop what does not fit; whether enough is left."""
@@ -207,8 +234,7 @@ class Initializer:
         obs = cost.fresh.obs
         if len(obs.ids) == 0:
             return False
-        poses = stacked_poses(cost.state.estimate, obs.frames)
-        result = triangulate(obs, self._rig, *poses, self._config.triangulation)
+        result = self._points(cost, obs)
         fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
         good = result.good & fits
         cost.fresh = NewFeatures(obs, result.points, cost.fresh.in_state).subset(good)

@@ -10,20 +10,25 @@ without forming the information matrix (see `SquareRootInformation.marginal`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from slam_graph.backend.archive import FeatureArchive
 from slam_graph.backend.construction import ConstructedCost
-from slam_graph.backend.gauss_newton import linearized
+from slam_graph.backend.gauss_newton import Minimum, linearized
 from slam_graph.backend.policies import MarginalizationPolicy
 from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.state import State
+from slam_graph.backend.unseen import relinearized
 from slam_graph.backend.window import Window
+
+LinearizationPoints = Literal["first", "current", "corrected"]
+"""Where variables of the prior are linearised (see `marginalize`)."""
 
 
 def marginalize_step(
     window: Window,
     constructed: ConstructedCost,
-    posterior: SquareRootInformation,
+    minimum: Minimum,
     policy: MarginalizationPolicy,
 ) -> None:
     """Let go of what does not stay after a step.
@@ -31,9 +36,10 @@ def marginalize_step(
     Args:
         window: loses the variables and observations that leave, and gets the new prior.
         constructed: the cost of the step, at its minimum, and what stays.
-        posterior: of the whole cost, over an increment of the current estimates.
+        minimum: what the steps have come to.
         policy: which residuals become part of the prior.
     """
+    posterior = minimum.posterior
     keep = window.keys(constructed.past, constructed.moving, constructed.features)
     if policy.absorb == "all":
         window.factors = []
@@ -45,7 +51,10 @@ def marginalize_step(
         window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
     _keep_landmarks(window, constructed)
     archive = window.archive if constructed.keep_lost_features else None
-    window.prior = marginalize(posterior, window.state, keep, policy.first_estimates, archive)
+    points: LinearizationPoints = "first" if policy.first_estimates else "current"
+    if policy.first_estimates and minimum.repeated:
+        points = "corrected"
+    window.prior = marginalize(posterior, window.state, keep, points, archive)
     window.past, window.moving = list(constructed.past), list(constructed.moving)
     window.features = constructed.features
     window.tracks.retain([*constructed.past, window.frame])
@@ -67,7 +76,7 @@ def marginalize(
     posterior: SquareRootInformation,
     state: State,
     keep: Sequence[int],
-    first_estimates: bool,
+    points: LinearizationPoints,
     archive: FeatureArchive | None = None,
 ) -> SquareRootInformation:
     """Eliminate all variables but `keep` and make the rest the prior of the next step.
@@ -75,12 +84,12 @@ def marginalize(
     Args:
         posterior: over an increment of the current estimates; of the residuals that are to become
             part of the prior.
-        state: the variables that leave are removed from it; those that stay keep the linearisation
-            points that the prior was made with (first-estimates Jacobians), or, without that, are
-            linearised anew at their estimates.
+        state: the variables that leave are removed from it.
         keep: keys that stay, in the order of the new prior's columns; those that the posterior does
             not contain stay free of it.
-        first_estimates: whether first-estimates Jacobians are used.
+        points: where the variables that stay are linearised from now on: where the prior was made
+            (first-estimates Jacobians), at their estimates, or there without the prior gaining
+            information about what no measurement sees.
         archive: gets what the variables that leave are, given those that stay.
 
     Returns:
@@ -91,9 +100,11 @@ def marginalize(
     if archive is not None:
         archive.put(conditional, state)
     state.remove([key for key in state.variables() if key not in staying])
-    if not first_estimates:
-        if archive is not None:
-            archive.follow(state)
+    if points != "first" and archive is not None:
+        archive.follow(state)
+    if points == "current":
         state.rebase()
+    elif points == "corrected":
+        prior = relinearized(prior, state)
     state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
     return prior.shifted(-state.offset(prior.layout))

@@ -35,8 +35,8 @@ class CostPolicy(Settings):
     """How many features are held in the state while they are tracked; null for no bound."""
     state_feature_frames: int = Field(10, ge=2)
     """How many frames must have seen a feature before it may be held in the state."""
-    state_feature_parallax_rad: float = Field(0.01, ge=0)
-    """… and the largest angle between its first ray and any other must be this."""
+    state_feature_depth_error: float = Field(0.1, gt=0)
+    """… and the standard deviation of its depth, relative to it, must be less than this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
     gate: Literal["prediction", "residual"] = "prediction"
@@ -45,8 +45,8 @@ class CostPolicy(Settings):
     the residual of each observation; one that fails is never used again."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
-    keyframe_motion: float = Field(0.05, ge=0)
-    """… or when these have moved by more than this in the image (median, focal lengths)."""
+    keyframe_parallax_rad: float = Field(0.05, ge=0)
+    """… or when it sees these from elsewhere: under a median angle of more than this."""
 
 
 class GaussNewtonPolicy(Settings):

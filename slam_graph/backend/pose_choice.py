@@ -9,18 +9,18 @@ from collections.abc import Callable
 import numpy as np
 
 from slam_graph.backend.policies import CostPolicy
-from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.window import Window
 
-PoseChoice = Callable[[Window, CostPolicy], list[int]]
+PoseChoice = Callable[[Window, CostPolicy, RigProjection], list[int]]
 
 
-def most_recent(window: Window, policy: CostPolicy) -> list[int]:
+def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
     """The latest poses."""
     return window.past[-policy.max_past_poses :]
 
 
-def evenly_spaced(window: Window, policy: CostPolicy) -> list[int]:
+def evenly_spaced(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
     """Poses thinned evenly in time once there are too many, the oldest kept.
 
     Every third pose leaves, starting from the second oldest (Mourikis & Roumeliotis 2007, sec.
@@ -33,7 +33,7 @@ def evenly_spaced(window: Window, policy: CostPolicy) -> list[int]:
     return [frame for frame in frames if frame not in leaving]
 
 
-def keyframes(window: Window, policy: CostPolicy) -> list[int]:
+def keyframes(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
     """Keyframes, and the most recent frames (Leutenegger et al. 2015, sec. 3.4).
 
     A frame that is no longer recent stays if it is a keyframe, that is, if it sees enough that the
@@ -44,19 +44,24 @@ def keyframes(window: Window, policy: CostPolicy) -> list[int]:
     older, recent = window.past[:count], window.past[count:]
     kept: list[int] = []
     for frame in older:
-        if not kept or frame in window.keyframes or _is_new(window.tracks, kept[-1], frame, policy):
+        if not kept or frame in window.keyframes or _is_new(window, kept[-1], frame, policy, rig):
             kept.append(frame)
     kept = kept[-policy.max_past_poses :]
     window.keyframes_before, window.keyframes = window.keyframes, set(kept)
     return kept + recent
 
 
-def _is_new(tracks: TrackWindow, keyframe: int, frame: int, policy: CostPolicy) -> bool:
+def _is_new(
+    window: Window, keyframe: int, frame: int, policy: CostPolicy, rig: RigProjection
+) -> bool:
     """Whether a frame sees what the last keyframe did not see, or sees it from elsewhere."""
-    motions = tracks.motion(keyframe, frame)
-    if len(motions) < policy.keyframe_overlap * len(tracks.ids_in(frame)):
+    body_R_camera = rig.body_R_camera[0]
+    (before, after), _ = rig.poses(window.state.estimate, [keyframe, frame])
+    turn = (after @ body_R_camera).T @ before @ body_R_camera
+    angles = window.tracks.parallax(keyframe, frame, turn)
+    if len(angles) < policy.keyframe_overlap * len(window.tracks.ids_in(frame)):
         return True
-    return bool(np.median(motions) > policy.keyframe_motion) if len(motions) else False
+    return bool(np.median(angles) > policy.keyframe_parallax_rad) if len(angles) else False
 
 
 POSE_CHOICES: dict[str, PoseChoice] = {

@@ -10,11 +10,15 @@ GTSAM's `GenericProjectionFactor`, but come for all observations in one pass.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
+from slam_graph.backend.state import State, stacked_poses
 from slam_graph.backend.tracks import Observations
 from slam_graph.sensors.rig import Rig
 
@@ -45,13 +49,42 @@ class RigProjection:
     Attributes:
         body_R_camera: (C, 3, 3).
         body_p_camera: (C, 3).
+        calibration_keys: of the parameters of the rig that are variables.
     """
+
+    calibration_keys: tuple[int, ...] = ()
 
     def __init__(self, rig: Rig) -> None:
         self.cameras = [mounted.camera for mounted in rig.cameras]
         matrices = np.array([mounted.body_T_camera.matrix() for mounted in rig.cameras])
         self.body_R_camera = matrices[:, :3, :3]
         self.body_p_camera = matrices[:, :3, 3]
+
+    # --- what an estimated calibration changes (see calibrated_projection.py) ---------------------
+
+    def at(self, state: State) -> RigProjection:
+        """The projection with the calibration of a state."""
+        return self
+
+    def keys_of(self, obs: Observations) -> list[int]:
+        """Keys of all variables beside the features that observations depend on."""
+        return [*(X(i) for i in obs.frames), *self.calibration_keys]
+
+    def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
+        """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""
+        return stacked_poses(values, frames)
+
+    def renormalized(self, obs: Observations) -> Observations:
+        """The observations with normalised coordinates by the calibration."""
+        return obs
+
+    def all_jacobians(
+        self, obs: Observations, at: Geometry
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and calibration (N, 2, C)."""
+        return (*self.jacobians(obs, at), np.zeros((len(obs), 2, 0)))
+
+    # --- geometry ---------------------------------------------------------------------------------
 
     def in_body(self, obs: Observations, at: Geometry) -> FloatArray:
         """The observed features (N, 3) in the body frame of the observing pose."""
@@ -90,13 +123,7 @@ class RigProjection:
             by_point: (N, 2, 3).
         """
         in_body = self.in_body(obs, at)
-        in_camera = self.in_camera(obs, in_body)
-        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
-        _, slope = self.pixels(obs, in_camera)
-        by_camera_point = np.empty((len(obs), 2, 3))
-        by_camera_point[:, :, :2] = slope / depth[:, None, None]
-        ratio = in_camera[:, :2] / depth[:, None] ** 2
-        by_camera_point[:, :, 2] = -np.einsum("nij,nj->ni", slope, ratio)
+        by_camera_point = self.by_camera_point(obs, self.in_camera(obs, in_body))
         camera_R_body = np.ascontiguousarray(self.body_R_camera.transpose(0, 2, 1))
         by_body_point = by_camera_point @ camera_R_body[obs.camera]
         by_pose = np.empty((len(obs), 2, 6))
@@ -106,3 +133,13 @@ class RigProjection:
         body_R_world = np.ascontiguousarray(at.rotations.transpose(0, 2, 1))
         by_point = by_body_point @ body_R_world[obs.frame]
         return by_pose, by_point
+
+    def by_camera_point(self, obs: Observations, in_camera: FloatArray) -> FloatArray:
+        """Derivatives (N, 2, 3) of the pixels of points (N, 3) by these, in the camera frame."""
+        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
+        _, slope = self.pixels(obs, in_camera)
+        derivative = np.empty((len(obs), 2, 3))
+        derivative[:, :, :2] = slope / depth[:, None, None]
+        ratio = in_camera[:, :2] / depth[:, None] ** 2
+        derivative[:, :, 2] = -np.einsum("nij,nj->ni", slope, ratio)
+        return derivative

@@ -35,13 +35,13 @@ REGULARISATION = 1e-15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CondensedFeatures:
-    """J features over the poses of F frames, their sum for the poses formed.
+    """J features over the poses of F frames and C columns of the calibration, summed up.
 
     Attributes:
         R_f: (J, 3, 3) upper triangular.
-        T: (J, 3, 6 F).
+        T: (J, 3, 6 F + C).
         r_1: (J, 3).
-        rows: (K, 6 F + 1) rows [N r₂] that say of the poses what all features say together.
+        rows: (K, 6 F + C + 1) rows [N r₂] that say of them what all features say together.
     """
 
     R_f: FloatArray
@@ -50,12 +50,12 @@ class CondensedFeatures:
     rows: FloatArray
 
     def null_space_rows(self) -> FloatArray:
-        """The rows [N r₂] of all features together, (K, 6 F + 1), K not above 6 F + 1."""
+        """The rows [N r₂] of all features together, (K, 6 F + C + 1), K at most that."""
         return self.rows
 
-    def point_increments(self, delta_poses: FloatArray) -> FloatArray:
-        """The δf (J, 3) that go with an increment of the poses (6 F,)."""
-        rest = self.r_1 - self.T @ delta_poses
+    def point_increments(self, delta: FloatArray) -> FloatArray:
+        """The δf (J, 3) that go with an increment of poses and calibration (6 F + C,)."""
+        rest = self.r_1 - self.T @ delta
         increments = np.linalg.solve(self.R_f, rest[:, :, None])[:, :, 0]
         return np.asarray(increments, dtype=np.float64)
 
@@ -101,13 +101,14 @@ def _tables(obs: Observations, linear: WhitenedObservations) -> tuple[FloatArray
 
     Returns:
         by_point: (J, F m, 3).
-        by_view: (J, F, m, 6 + 1) derivatives by the pose of the frame, and residuals.
+        by_view: (J, F, m, 6 + C + 1) derivatives by the pose of the frame and the calibration, and
+            residuals.
     """
     J, F, C = len(obs.ids), len(obs.frames), int(obs.camera.max()) + 1
     by_point = np.zeros((J, F, C, 2, 3))
     by_point[obs.feature, obs.frame, obs.camera] = linear.by_point
-    by_view = np.zeros((J, F, C, 2, POSE_DIM + 1))
-    rows = np.concatenate([linear.by_pose, linear.r[:, :, None]], axis=2)
+    rows = np.concatenate([linear.by_pose, linear.by_calibration, linear.r[:, :, None]], axis=2)
+    by_view = np.zeros((J, F, C, 2, rows.shape[2]))
     by_view[obs.feature, obs.frame, obs.camera] = rows
     return by_point.reshape(J, -1, 3), by_view.reshape(J, F, 2 * C, -1)
 
@@ -125,7 +126,7 @@ def _orthonormal(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _along(Q: FloatArray, by_view: FloatArray) -> FloatArray:
-    """Qᵀ [H_x r] of each feature, (J, 3, 6 F + 1)."""
+    """Qᵀ [H_x r] of each feature, (J, 3, 6 F + C + 1)."""
     J, F, m, _ = by_view.shape
     views = Q.reshape(J, F, m, 3).transpose(0, 1, 3, 2) @ by_view
     poses = views[:, :, :, :POSE_DIM].transpose(0, 2, 1, 3).reshape(J, 3, POSE_DIM * F)
@@ -133,7 +134,7 @@ def _along(Q: FloatArray, by_view: FloatArray) -> FloatArray:
 
 
 def _view_information(by_view: FloatArray) -> FloatArray:
-    """Σ [H_x r]ᵀ [H_x r], (6 F + 1, 6 F + 1): a block for each pose, and the residuals."""
+    """Σ [H_x r]ᵀ [H_x r], (6 F + C + 1)²: a block for each pose, and all else."""
     _, F, _, width = by_view.shape
     size = POSE_DIM * F
     information = np.zeros((size + width - POSE_DIM, size + width - POSE_DIM))

@@ -26,6 +26,7 @@ from slam_graph.backend.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.tracks import TrackWindow
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig
@@ -48,6 +49,11 @@ class SmootherEstimator(Estimator):
         config: BackendConfig | None = None,
         diagnostics: Diagnostics | None = None,
     ) -> None:
+        if config is not None and config.calibration.anything:
+            raise ConfigError(
+                f"backend.calibration is not for '{algorithm.name}': GTSAM's smoothers take the "
+                "calibration as it is; use msckf, swf, okvis, ekf or iekf"
+            )
         super().__init__(rig, algorithm, config, diagnostics)
         self._policy = algorithm.smoother
         self._projection = RigProjection(rig)
@@ -102,7 +108,9 @@ class SmootherEstimator(Estimator):
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)
         assert predicted.covariance is not None
-        return self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        new = self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+        self.innovations = self._features.innovations
+        return new
 
     # --- the smoother ----------------------------------------------------------------------------
 

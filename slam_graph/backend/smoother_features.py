@@ -16,7 +16,7 @@ from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 
 from slam_graph.backend.config import BackendConfig
-from slam_graph.backend.gating import squared_mahalanobis, threshold
+from slam_graph.backend.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.native_factors import ProjectionFactors, pixel_noise
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.reprojection import Geometry, RigProjection
@@ -55,12 +55,15 @@ class SmootherFeatures:
 
     Attributes:
         active: ids (N,) of the features that are variables, ascending.
+        innovations: how far the last observations of these were from what was predicted, by a
+            covariance that lacks that of the features.
     """
 
     def __init__(
         self, rig: Rig, policy: SmootherPolicy, config: BackendConfig, diagnostics: Diagnostics
     ) -> None:
         self.active = np.zeros(0, np.int64)
+        self.innovations = Innovations()
         self._policy = policy
         self._config = config
         self._diagnostics = diagnostics
@@ -110,6 +113,7 @@ class SmootherFeatures:
         self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray
     ) -> NDArray[np.bool_]:
         """Which observations (N,) are where the predicted pose lets them be."""
+        self.innovations = Innovations()
         if len(obs) == 0:
             return np.zeros(0, np.bool_)
         at = Geometry(
@@ -119,9 +123,11 @@ class SmootherFeatures:
         by_pose, _ = self._rig.jacobians(obs, at)
         sigma = self._config.noise.pixel_sigma
         distances = squared_mahalanobis(residuals / sigma, by_pose / sigma, covariance)
-        largest = GATE_SCALE * threshold(np.array([2]), self._config.gating.confidence)[0]
+        dof = np.full(len(obs), 2)
+        largest = GATE_SCALE * threshold(dof, self._config.gating.confidence)
         good = (distances < largest) & (depths > 0.0)
-        self._diagnostics.counts["feature_rejected_by_gate"] += int(np.sum(~good))
+        self.innovations = Innovations.of(distances, dof, largest, good)
+        self._diagnostics.counts["feature_rejected_by_gate"] += self.innovations.rejected
         return np.asarray(good)
 
     def _entering(

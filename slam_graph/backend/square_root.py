@@ -128,6 +128,11 @@ class SquareRootInformation:
         """(n,) right-hand side."""
         return self.Rd[:-1, -1]
 
+    @property
+    def residual(self) -> float:
+        """The part of the cost that no δ can remove."""
+        return float(self.Rd[-1, -1] ** 2)
+
     def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
         """The same Gaussian with further variables of which nothing is known."""
         if not dims:

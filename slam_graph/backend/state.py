@@ -4,8 +4,9 @@
 
 Keys follow GTSAM's symbols with one frame index i everywhere: `X(i)` the pose world_T_body of frame
 i, `V(i)` its velocity in the world, `B(i)` its IMU bias, `L(j)` the position of feature j in the
-world. Tangents are GTSAM's (rotation before translation, both in the body frame; accelerometer bias
-before gyroscope bias).
+world; `E(c)`, `K(c)`, `D(c)` and `T(0)` are parameters of the rig (see calibration.py). Tangents
+are GTSAM's (rotation before translation, both in the body frame; accelerometer bias before
+gyroscope bias).
 
 First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
 marginal prior, all Jacobians with respect to it are evaluated at the value it had then, its *first
@@ -16,6 +17,7 @@ information about directions that no measurement can see (global position and ya
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -29,16 +31,31 @@ FloatArray = NDArray[np.float64]
 
 POSE_DIM, VELOCITY_DIM, BIAS_DIM, POINT_DIM = 6, 3, 6, 3
 IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
+CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "d": 4, "t": 1}
+DIMS = IMU_STATE_DIMS | CALIBRATION_DIMS
 
 
 def dim(key: int) -> int:
     """Tangent dimension of the variable of a key."""
-    return IMU_STATE_DIMS[chr(gtsam.Symbol(key).chr())]
+    return DIMS[chr(gtsam.Symbol(key).chr())]
 
 
 def imu_state_keys(frame: int) -> tuple[int, int, int]:
     """Keys of the pose, velocity and bias of a frame."""
     return X(frame), V(frame), B(frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMotion:
+    """How the body moved when a frame was taken, for the time offset of the cameras.
+
+    Attributes:
+        rate: (6,) angular rate (rad/s) and velocity (m/s), both in the body frame.
+        time_offset_s: the time offset under which the pose of the frame is the pose at its time.
+    """
+
+    rate: FloatArray
+    time_offset_s: float
 
 
 class State:
@@ -49,6 +66,7 @@ class State:
         offsets: tangent (dim,) of every variable at its linearisation point.
         estimate: current values, first ⊕ offsets.
         frozen: keys whose linearisation point no longer moves.
+        motions: of each frame with a pose, where a time offset is estimated.
     """
 
     def __init__(self) -> None:
@@ -56,6 +74,7 @@ class State:
         self.estimate = gtsam.Values()
         self.offsets: dict[int, FloatArray] = {}
         self.frozen: set[int] = set()
+        self.motions: dict[int, FrameMotion] = {}
 
     def copy(self) -> State:
         """An independent copy."""
@@ -68,6 +87,7 @@ class State:
         self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
         self.offsets = {key: offset.copy() for key, offset in other.offsets.items()}
         self.frozen = set(other.frozen)
+        self.motions = dict(other.motions)
 
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
@@ -85,6 +105,13 @@ class State:
         self.first.insert(L(feature), point)
         self.offsets[L(feature)] = np.zeros(POINT_DIM)
 
+    def insert_calibration(self, values: gtsam.Values) -> None:
+        """Add parameters of the rig."""
+        self.estimate.insert(values)
+        self.first.insert(values)
+        for key in values.keys():  # noqa: SIM118
+            self.offsets[key] = np.zeros(dim(key))
+
     def variables(self) -> list[int]:
         """Keys of all variables."""
         return list(self.offsets)
@@ -96,6 +123,8 @@ class State:
             self.first.erase(key)
             del self.offsets[key]
             self.frozen.discard(key)
+        if self.motions:
+            self.motions = {i: motion for i, motion in self.motions.items() if X(i) in self.offsets}
 
     def relinearize(self) -> None:
         """Move the linearisation points of all variables that are not frozen to their estimates."""
@@ -146,7 +175,7 @@ class State:
 def _copy(source: gtsam.Values, target: gtsam.Values, key: int) -> None:
     """Insert the value of `key` in `source` into `target`."""
     kind = chr(gtsam.Symbol(key).chr())
-    if kind == "x":
+    if kind in "xe":
         target.insert(key, source.atPose3(key))
     elif kind == "b":
         target.insert(key, source.atConstantBias(key))

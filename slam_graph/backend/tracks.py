@@ -164,8 +164,14 @@ class TrackWindow:
         """The features that any camera saw in one frame, ascending."""
         return sorted_unique(self._ids[self._frames == index])
 
-    def motion(self, before: int, after: int) -> FloatArray:
-        """How far (N,) features moved in the first camera between two frames, normalised."""
+    def parallax(self, before: int, after: int, turn: FloatArray) -> FloatArray:
+        """Angles (N,) in rad between the rays of the first camera to features in two frames.
+
+        Args:
+            before: a frame.
+            after: another.
+            turn: (3, 3) rotation from the camera at the first frame to that at the second.
+        """
         i, j = (
             np.flatnonzero((self._frames == index) & (self._cameras == 0))
             for index in (before, after)
@@ -173,8 +179,10 @@ class TrackWindow:
         _, a, b = np.intersect1d(
             self._ids[i], self._ids[j], assume_unique=True, return_indices=True
         )
-        moved = self._normalized[j[b]] - self._normalized[i[a]]
-        return np.asarray(np.linalg.norm(moved, axis=1), dtype=np.float64)
+        rays = (np.insert(self._normalized[rows], 2, 1.0, axis=1) for rows in (i[a], j[b]))
+        x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+        sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
+        return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
 
     def lengths(self) -> tuple[IntArray, IntArray]:
         """All features with unused observations (J,), and the number of frames that see each."""

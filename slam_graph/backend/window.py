@@ -50,6 +50,7 @@ class Window:
         landmarks: ids (N,) and world positions (N, 3) of the features that are in the cost without
             being in the state.
         used: the same of all features that the last step estimated outside the state.
+        calibration: keys of the parameters of the rig that are in the state.
     """
 
     frame: int
@@ -66,9 +67,10 @@ class Window:
     archive: FeatureArchive = field(default_factory=FeatureArchive)
     landmarks: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
     used: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
+    calibration: tuple[int, ...] = ()
 
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
-        """Keys of some features, past poses and past IMU states, and of the current IMU state.
+        """Keys of some features, the calibration, past poses and past and current IMU states.
 
         They are in this order, and features that are no longer tracked come first, the others after
         them as they were: what no new measurement touches stands to the left, where an update need
@@ -79,6 +81,7 @@ class Window:
         keys = [key for key in self.prior.layout.dims if key in lost]
         keys += [key for key in self.prior.layout.dims if key in live]
         keys += sorted(live.difference(self.prior.layout.dims))
+        keys += self.calibration
         keys += [X(i) for i in past if i not in moving]
         for i in (*moving, self.frame):
             keys += imu_state_keys(i)

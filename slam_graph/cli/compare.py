@@ -33,6 +33,13 @@ def compare(
     algorithms: Annotated[
         str, typer.Option("--algorithms", help="Names or YAML files, with commas between.")
     ] = "msckf,swf,okvis,ekf,iekf",
+    without_fej: Annotated[
+        bool,
+        typer.Option(
+            "--without-fej",
+            help="Run each algorithm also without first-estimates Jacobians, as NAME_no_fej.",
+        ),
+    ] = False,
     seeds: Annotated[
         int, typer.Option("--seeds", min=1, help="How many seeds to run everything with.")
     ] = 1,
@@ -78,7 +85,7 @@ def compare(
     """
     from slam_graph.config import load_config
     from slam_graph.experiment.comparison import compare as run_comparison
-    from slam_graph.experiment.comparison import load_configs
+    from slam_graph.experiment.comparison import load_configs, with_variants
     from slam_graph.experiment.report import write_report
     from slam_graph.experiment.sources import find_sources
 
@@ -87,6 +94,8 @@ def compare(
     configs = load_configs(
         names, lambda name: load_config(config, set_ or (), algorithm=name, **said)
     )
+    if without_fej:
+        configs = with_variants(configs)
     sources = find_sources(data, duration, sim_set or (), _truths(groundtruth or []))
     executor = _executor(workers, scheduler)
     try:
@@ -138,11 +147,22 @@ def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Pat
     """Print the table, and where the files are."""
     from slam_graph.experiment.report import COLUMNS, cells
 
-    echo_table([("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)])
+    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)]
+    echo_table(_telling(table))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
     typer.echo("  " + " ".join(file.name for file in files))
+
+
+def _telling(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A table without the columns in which nothing is known, and with one data set without it."""
+    columns = [
+        values
+        for values in zip(*table, strict=True)
+        if set(values[1:]) != {"-"} and (values[0] != "data" or len(set(values[1:])) > 1)
+    ]
+    return list(zip(*columns, strict=True))
 
 
 def _leave(comparison: Comparison) -> None:

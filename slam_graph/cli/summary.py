@@ -28,6 +28,12 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
+    if metrics["nis"]:
+        typer.echo("")
+        echo_table(_innovations(metrics["nis"]))
+    if metrics["calibration"]:
+        typer.echo("")
+        echo_table(_calibration(metrics["calibration"]))
     typer.echo("")
     typer.echo(f"{folder}/")
     typer.echo("  " + " ".join(path.name for path in files))
@@ -83,3 +89,18 @@ def _consistency(nees: Table) -> Iterator[tuple[str, ...]]:
     for name in ("orientation", "position", "pose"):
         row = nees[name]
         yield name, number(row["mean"], 2), str(row["ideal_mean"]), f"{row['inside_bounds']:.0%}"
+
+
+def _innovations(nis: Table) -> Iterator[tuple[str, ...]]:
+    """NIS over its degrees of freedom, beside what a right covariance leaves behind the gate."""
+    yield "NIS / dof", "mean", "expected", "inside 95% bounds", "rejected"
+    shares = (f"{nis['inside_bounds']:.0%}", f"{nis['rejected']:.1%}")
+    yield "images", number(nis["mean"], 2), number(nis["expected_mean"], 2), *shares
+
+
+def _calibration(parameters: Table) -> Iterator[tuple[str, ...]]:
+    """Estimated parameters of the rig beside what they were at first."""
+    yield "calibration", "start", "estimate", "1 sigma"
+    for name, row in parameters.items():
+        values = (f"{row[column]:.6g}" for column in ("start", "value"))
+        yield name, *values, f"{row['sigma']:.2g}"

@@ -53,6 +53,7 @@ def packetize(
     blocks: Iterator[ImuData],
     diagnostics: Diagnostics,
     history_ns: int | None = None,
+    ahead_ns: int = 0,
 ) -> Iterator[Packet]:
     """Join frames with the IMU samples that lead up to them.
 
@@ -64,23 +65,22 @@ def packetize(
         blocks: of the IMU stream, with strictly increasing stamps.
         diagnostics: where faults are counted.
         history_ns: how much of the IMU before the first frame its packet carries; None for all.
+        ahead_ns: how far the clock of the IMU is ahead of that of the frames.
     """
     feed = ImuFeed(blocks)
     previous_ns: int | None = None
     with closing(frames):
         for frame in frames:
-            held_ns = feed.latest_ns
-            imu = feed.up_to(frame.stamp_ns)
+            held_ns, now_ns = feed.latest_ns, frame.stamp_ns + ahead_ns
+            imu = feed.up_to(now_ns)
             if previous_ns is None and history_ns is not None:
-                imu = imu[int(np.searchsorted(imu.stamps_ns, frame.stamp_ns - history_ns)) :]
+                imu = imu[int(np.searchsorted(imu.stamps_ns, now_ns - history_ns)) :]
             held = (
-                held_ns is not None
-                and previous_ns is not None
-                and previous_ns < held_ns <= frame.stamp_ns
+                held_ns is not None and previous_ns is not None and previous_ns < held_ns <= now_ns
             )
-            if not held and not (len(imu) and imu.stamps_ns[0] <= frame.stamp_ns):
+            if not held and not (len(imu) and imu.stamps_ns[0] <= now_ns):
                 diagnostics.warn(
                     "frame_without_imu", f"frame at {frame.stamp_ns} has no IMU samples"
                 )
-            previous_ns = frame.stamp_ns
+            previous_ns = now_ns
             yield Packet(imu, frame)

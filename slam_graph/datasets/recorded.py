@@ -112,6 +112,9 @@ class RecordedSequence(ABC):
     def packets(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Packet]:
         """Frames in the order of time, each with the IMU samples that lead up to it.
 
+        Where the clock of the IMU is ahead by the rig's time offset, they lead up to the time of
+        the frame on that clock.
+
         Args:
             start_ns: first frame time to deliver; the first packet then carries the IMU samples of
                 up to one second before it. Without it, it carries all samples from the start.
@@ -123,6 +126,7 @@ class RecordedSequence(ABC):
             self.imu_blocks(after_ns),
             self.diagnostics,
             None if start_ns is None else HISTORY_NS,
+            max(0, round(self.rig.cameras[0].time_offset_s * 1e9)),
         )
 
     def imu(self) -> ImuData:

@@ -1,11 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Is an estimator as sure as it should be? Normalised estimation error squared (NEES).
+"""Is an estimator as sure as it should be? Normalised errors (NEES) and innovations (NIS) squared.
 
 The NEES of an error e with covariance P is eᵀ P⁻¹ e. If P is right it follows a χ² distribution
 with as many degrees of freedom as e has, so its mean over independent runs is that number: 3 for
 an orientation or a position, 6 for a pose. More means too sure, less too careful. Over the frames
 of one run the values are correlated, so that their mean scatters more than `mean_bounds` says.
+
+The NIS asks the same of an innovation, what is measured less what was predicted of it, with its own
+covariance: it needs no truth, and the innovations of a consistent filter are independent in time.
 
 Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navigation", sec. 5.4.
 """
@@ -93,12 +96,52 @@ def nees(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class AverageNees:
+    """NEES over R independent runs, at T times.
+
+    Attributes:
+        average: (T,) mean over the runs: R times it is χ² distributed, with R times the degrees
+            of freedom.
+        bounds: between what each average lies with 95 % probability.
+        inside: share of the times at which it does.
+        mean: over all runs and times.
+    """
+
+    average: FloatArray
+    bounds: tuple[float, float]
+    inside: float
+    mean: float
+
+
+def average_nees(runs: FloatArray, dof: int) -> AverageNees:
+    """Average the NEES (R, T) of Monte Carlo runs, each drawn with its own noise and start."""
+    average = runs.mean(axis=0)
+    low, high = mean_bounds(dof, len(runs))
+    inside = np.mean((average >= low) & (average <= high))
+    return AverageNees(average, (low, high), float(inside), float(average.mean()))
+
+
 def mean_bounds(dof: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Between what the mean of `count` independent NEES values lies with a given probability."""
+    low, high = dof * ratio_bounds(np.array(float(dof * count)), confidence)
+    return float(low), float(high)
+
+
+def ratio_bounds(dof: FloatArray, confidence: float = CONFIDENCE) -> FloatArray:
+    """Between what χ² over its degrees of freedom lies with a given probability.
+
+    Args:
+        dof: any shape.
+        confidence: the probability.
+
+    Returns:
+        (2, …) the lower and the upper bound.
+    """
     tail = (1.0 - confidence) / 2.0
     # the quantile function of χ² with k degrees of freedom is 2 γ⁻¹(k/2, ·)
-    low, high = 2.0 * gammaincinv(dof * count / 2.0, [tail, 1.0 - tail]) / count
-    return float(low), float(high)
+    quantiles = [2.0 * gammaincinv(dof / 2.0, p) for p in (tail, 1.0 - tail)]
+    return np.asarray(quantiles) / dof
 
 
 def _normalized_square(errors: FloatArray, covariances: FloatArray) -> FloatArray:

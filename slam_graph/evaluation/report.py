@@ -4,17 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ErrorSeries, ape
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
-from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees
+from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.rpe import rpe
 from slam_graph.geometry.alignment import AlignmentMode, Similarity, align_first_pose, align_yaw
 from slam_graph.geometry.history import StateHistory
@@ -72,6 +73,44 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
             "inside_bounds": float(np.mean((values >= low) & (values <= high))),
         }
     return table
+
+
+def innovation_report(columns: Mapping[str, NDArray[np.float64]]) -> Table | None:
+    """NIS over its degrees of freedom, which should be 1, or None if nothing was predicted.
+
+    Args:
+        columns: for N frames the numbers of measurements that were `tested` and `rejected` by the
+            gate; squared Mahalanobis distances and degrees of freedom of all, `distance` and `dof`,
+            and of those that passed, `passed_distance` and `passed_dof`; and the mean that a right
+            covariance lets one expect of these behind the gate, `expected`.
+
+    Returns:
+        `mean` is of what entered the update, `expected_mean` what the gate leaves of the ideal 1,
+        `chi2_bounds` those of a frame with the median number of degrees of freedom, and
+        `inside_bounds` the share of the frames whose NIS, divided by what is expected of it, is
+        inside its own; `mean_before_gate` is of all that was tested.
+    """
+    entered = columns["passed_dof"] > 0
+    if not entered.any():
+        return None
+    distance, dof, expected = (
+        columns[name][entered] for name in ("passed_distance", "passed_dof", "expected")
+    )
+    low, high = ratio_bounds(dof)
+    inside = (distance / expected >= low) & (distance / expected <= high)
+    return {
+        "frames": int(np.sum(entered)),
+        "mean": float(distance.sum() / dof.sum()),
+        "ideal_mean": 1.0,
+        "expected_mean": float(expected.sum() / dof.sum()),
+        "mean_bounds": ratio_bounds(dof.sum(keepdims=True))[:, 0].tolist(),
+        "chi2_bounds": ratio_bounds(np.median(dof, keepdims=True))[:, 0].tolist(),
+        "confidence": CONFIDENCE,
+        "inside_bounds": float(inside.mean()),
+        "mean_before_gate": float(columns["distance"].sum() / columns["dof"].sum()),
+        "dof_per_frame": float(dof.mean()),
+        "rejected": float(columns["rejected"].sum() / columns["tested"].sum()),
+    }
 
 
 def truth_from_estimate(

@@ -15,6 +15,9 @@ from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import RecordTask, RunTask, Task
 
+WITHOUT_FEJ = "_no_fej"
+"""What the name of an algorithm without first-estimates Jacobians ends in."""
+
 Told = Callable[[Task, str | None, int, int], None]
 """Is told of each task that has ended, why it failed if it did, and how many of how many have."""
 
@@ -60,6 +63,23 @@ def load_configs(
     return configs
 
 
+def with_variants(configs: Mapping[str, RunConfig]) -> dict[str, RunConfig]:
+    """The settings, each followed by the same without first-estimates Jacobians.
+
+    GTSAM's smoothers have no such Jacobians, and so no variant.
+    """
+    both: dict[str, RunConfig] = {}
+    for name, config in configs.items():
+        both[name] = config
+        algorithm = config.algorithm
+        if algorithm.engine == "square_root" and algorithm.marginalization.first_estimates:
+            policy = algorithm.marginalization.model_copy(update={"first_estimates": False})
+            changed = {"name": f"{name}{WITHOUT_FEJ}", "marginalization": policy}
+            variant = config.model_copy(update={"algorithm": algorithm.model_copy(update=changed)})
+            both[variant.algorithm.name] = variant
+    return both
+
+
 def compare(
     sources: Sequence[Source],
     configs: Mapping[str, RunConfig],
@@ -103,13 +123,26 @@ def plan(
                     data=source.name,
                     algorithm=name,
                     seed=seed,
-                    config=config.model_copy(update={**replay, "seed": seed}),
+                    config=_adapted(config, source).model_copy(update={**replay, "seed": seed}),
                     tracks=record.folder,
                     result=folder / "runs" / f"{source.name}_seed{seed}" / f"{name}.json",
                 )
                 for name, config in configs.items()
             ]
     return recordings, runs
+
+
+def _adapted(config: RunConfig, source: Source) -> RunConfig:
+    """The settings for a source: a start with an error of its covariance keeps that covariance.
+
+    To take its position and yaw as the definition of the world would call the part of its error in
+    these zero, and every NEES would be too large by it.
+    """
+    if source.simulation is None or not source.simulation.known_start.error:
+        return config
+    start = config.backend.initialization.model_copy(update={"fix_gauge": False})
+    backend = config.backend.model_copy(update={"initialization": start})
+    return config.model_copy(update={"backend": backend})
 
 
 def _do(comparison: Comparison, tasks: Sequence[Task], executor: Executor, told: Told) -> None:

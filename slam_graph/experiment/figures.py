@@ -28,6 +28,8 @@ TIME = ("time_s", "time [s]")
 DISTANCE = ("distance_m", "distance [m]")
 PARTS = (("translation_m", "translation error [m]"), ("rotation_deg", "rotation error [deg]"))
 
+NEES_DOF = {"orientation": 3, "position": 3, "pose": 6}
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -58,25 +60,32 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         ]
         file = folder / f"{data}_errors_{mode}.png"
         yield from _drawn(file, f"{data}: errors, alignment {mode}{mean}", panels)
-    bounds = mean_bounds(3, max(seeds, 1))
-    panels = [
-        Panel(
-            TIME[1],
-            f"NEES of the {part}",
-            _curves(runs, "nees_time_s", f"nees_{part}"),
-            bounds,
-            "95 % of χ²",
-        )
-        for part in ("orientation", "position")
-    ]
+    panels = _consistency_panels(runs, max(seeds, 1))
     yield from _drawn(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
         Panel(TIME[1], "ms a frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
         Panel(TIME[1], "steps a frame", _curves(runs, "step_time_s", "steps")),
         Panel(TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
         Panel(TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
     ]
     yield from _drawn(folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels)
+
+
+def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel]:
+    """NEES with the bounds of a mean over the seeds, and NIS."""
+    panels = [
+        Panel(
+            TIME[1],
+            f"NEES of the {part}",
+            _curves(runs, "nees_time_s", f"nees_{part}"),
+            mean_bounds(dof, seeds),
+            "95 % of χ²",
+        )
+        for part, dof in NEES_DOF.items()
+    ]
+    label = "NIS over what is expected of it"
+    return [*panels, Panel(TIME[1], label, _curves(runs, "nis_time_s", "nis_ratio"))]
 
 
 def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:
@@ -126,7 +135,8 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
                 edges,
             )
             filled = np.isfinite(means)
-            curves.append(Curve(name, centres[filled], means[filled]))
+            if filled.any():
+                curves.append(Curve(name, centres[filled], means[filled]))
     return curves
 
 

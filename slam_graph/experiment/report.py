@@ -22,6 +22,9 @@ COLUMNS = (
     "orientation [deg]",
     "NEES orientation",
     "NEES position",
+    "NEES pose",
+    "NIS / expected",
+    "gated",
     "steps",
     "ms a frame",
     "first → last third",
@@ -33,7 +36,9 @@ EXPLANATION = (
     "All algorithms were given the same recorded feature tracks and IMU samples. "
     "ATE is the root mean square of the position error of the causal estimate after no alignment, "
     "after alignment of yaw and position, and of the whole pose; orientation is after alignment "
-    "of yaw and position. A NEES should be 3. Numbers are means over the seeds whose runs ended "
+    "of yaw and position. A NEES should be 3, that of the whole pose 6. NIS / expected, of the "
+    "innovations of the images that passed the gate, should be 1; gated is the share that did not. "
+    "Numbers are means over the seeds whose runs ended "
     "well; peak memory is the largest. Steps are those of Gauss-Newton a frame, without those that "
     "damping took back. Milliseconds are those of the back end, and the arrow goes "
     "from the median of the first third of the frames to that of the last: a growing cost shows "
@@ -76,6 +81,9 @@ def cells(row: Table) -> tuple[str, ...]:
         _number(row["orientation_deg"]["yaw"], 3),
         _number(row["nees"]["orientation"], 2),
         _number(row["nees"]["position"], 2),
+        _number(row["nees"]["pose"], 2),
+        _number(_ratio(row["nis"]["mean"], row["nis"]["expected_mean"]), 2),
+        _number(row["nis"]["rejected"], 3),
         _number(row["steps"], 2),
         _number(row["ms_per_frame"], 2),
         ends,
@@ -128,6 +136,10 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
 
 def _html_line(tag: str, values: tuple[str, ...]) -> str:
     return "<tr>" + "".join(f"<{tag}>{escape(value)}</{tag}>" for value in values) + "</tr>"
+
+
+def _ratio(value: float | None, unit: float | None) -> float | None:
+    return None if value is None or unit is None else value / unit
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -7,9 +7,11 @@ covariance too, or all F that were read:
 
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
 - `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
-- `nees_time_s`, `nees_orientation`, `nees_position` (K,);
-- `step_time_s`, `steps`, `cost_before`, `cost_after` (S,): Gauss-Newton steps of the S frames that
-  took some;
+- `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
+- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (S,): Gauss-Newton steps of the S
+  frames that took some, and the dimension of the state in them;
+- `nis_time_s`, `nis_ratio`, and `nis_COLUMN` (I,): innovations of the I frames of which something
+  was predicted (`slam_graph.backend.gating.Innovations`), and NIS over what is expected of it;
 - `frame_time_s`, `ms_STAGE` (F,): milliseconds of each stage; NaN where it did not run.
 """
 
@@ -32,7 +34,7 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.output.files import appearing, write_text
 from slam_graph.output.run_result import RunResult
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3")
 
@@ -88,6 +90,8 @@ def series_of(result: RunResult) -> Series:
     series["step_time_s"] = (result.steps.stamps_ns - result.start_ns) * 1e-9
     series["steps"] = result.steps.steps
     series["cost_before"], series["cost_after"] = result.steps.costs.T
+    series["columns"] = result.steps.columns
+    series |= _innovation_series(result)
     truth = result.truth_of_run()
     if truth is not None and len(result.history) > 0:
         series |= _error_series(truth, result)
@@ -139,4 +143,17 @@ def _nees_series(truth: Trajectory, result: RunResult) -> Series:
         "nees_time_s": (values.stamps_ns - result.start_ns) * 1e-9,
         "nees_orientation": values.orientation,
         "nees_position": values.position,
+        "nees_pose": values.pose,
+    }
+
+
+def _innovation_series(result: RunResult) -> Series:
+    columns = result.innovations.columns()
+    expected = columns["expected"]
+    ratio = np.full(len(expected), np.nan)
+    np.divide(columns["passed_distance"], expected, out=ratio, where=expected > 0)
+    return {
+        "nis_time_s": (result.innovations.stamps_ns - result.start_ns) * 1e-9,
+        "nis_ratio": ratio,
+        **{f"nis_{name}": values for name, values in columns.items()},
     }

@@ -45,7 +45,11 @@ def _row(data: str, algorithm: str, tasks: list[RunTask]) -> Table:
         "orientation_deg": {mode: _mean(good, _ate(mode, "rotation_deg")) for mode in ALIGNMENTS},
         "nees": {
             part: _mean(good, lambda m, part=part: m["nees"][part]["mean"])  # type: ignore[misc]
-            for part in ("orientation", "position")
+            for part in ("orientation", "position", "pose")
+        },
+        "nis": {
+            part: _mean(good, lambda m, part=part: m["nis"][part])  # type: ignore[misc]
+            for part in ("mean", "expected_mean", "mean_before_gate", "inside_bounds", "rejected")
         },
         "steps": _average(r["mean_steps"] for r in results if r["mean_steps"] is not None),
         "ms_per_frame": _mean(good, lambda m: m["timing"]["stages"][STAGE]["mean_ms"]),

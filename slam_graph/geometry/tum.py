@@ -20,5 +20,5 @@ def seconds_text(stamp_ns: int) -> str:
 def tum_lines(trajectory: Trajectory) -> Iterator[str]:
     """The lines of a TUM file."""
     rows = np.hstack([trajectory.positions, trajectory.quaternions])
-    for stamp, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
-        yield f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n"
+    for stamp, row in zip(trajectory.stamps_ns, rows, strict=True):
+        yield f"{seconds_text(int(stamp))} {' '.join(f'{value:.9f}' for value in row.tolist())}\n"

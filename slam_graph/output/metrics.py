@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.report import accuracy_report, consistency_report
+from slam_graph.evaluation.report import accuracy_report, consistency_report, innovation_report
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ def metrics_table(result: RunResult) -> Table:
             "extent": _extent(result),
             "accuracy": _accuracy(result),
             "nees": _nees(result),
+            "nis": innovation_report(result.innovations.columns()),
+            "calibration": result.calibration.table(),
             "timing": _timing(result),
             "features_per_frame": _per_frame(result),
             "map_points": len(result.points),

@@ -15,22 +15,41 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+RECENT = 10_000
+"""How many features are held where they can be replaced at once, before they are packed."""
+
+
 class PointMap:
-    """The last estimate of every feature."""
+    """The last estimate of every feature; 32 bytes for each but the recent ones."""
 
     def __init__(self) -> None:
-        self._points: dict[int, tuple[float, float, float]] = {}
+        self._recent: dict[int, tuple[float, float, float]] = {}
+        self._ids = np.zeros(0, np.int64)
+        self._points = np.zeros((0, 3))
 
     def __len__(self) -> int:
-        return len(self._points)
+        self._pack()
+        return len(self._ids)
 
     def update(self, ids: IntArray, points: FloatArray) -> None:
         """Take over the positions (N, 3) in the world of features (N,)."""
-        self._points.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
+        self._recent.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
+        if len(self._recent) > RECENT:
+            self._pack()
 
     def points(self) -> FloatArray:
         """(N, 3) in the world, in metres."""
-        return np.array(list(self._points.values()), dtype=np.float64).reshape(-1, 3)
+        self._pack()
+        return self._points
+
+    def _pack(self) -> None:
+        """Move what is recent into the arrays, in the place of what was known of it before."""
+        ids = np.array(list(self._recent), dtype=np.int64)
+        points = np.array(list(self._recent.values()), dtype=np.float64).reshape(-1, 3)
+        kept = ~np.isin(self._ids, ids)
+        self._ids = np.concatenate([self._ids[kept], ids])
+        self._points = np.concatenate([self._points[kept], points])
+        self._recent = {}
 
 
 def write_ply(path: Path, points: FloatArray) -> None:

@@ -19,6 +19,8 @@ from slam_graph.errors import EstimationError
 from slam_graph.evaluation.association import select
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.output.calibration_log import CalibrationLog
+from slam_graph.output.innovations import InnovationLog
 from slam_graph.output.point_map import PointMap
 from slam_graph.output.steps import StepLog
 from slam_graph.output.timing import TimingLog
@@ -47,6 +49,8 @@ class RunResult:
         points: the map.
         timing: milliseconds of every stage of every frame.
         steps: Gauss-Newton steps of every frame, and the cost before and after.
+        innovations: how far the images of every frame were from what was predicted.
+        calibration: estimated parameters of the rig at every frame, where any are estimated.
         frames: number of frames that were read.
         features: sums over all frames of what the front end counts, by name.
         wall_s: time that the run took.
@@ -68,6 +72,8 @@ class RunResult:
     points: PointMap = field(default_factory=PointMap)
     timing: TimingLog = field(default_factory=TimingLog)
     steps: StepLog = field(default_factory=StepLog)
+    innovations: InnovationLog = field(default_factory=InnovationLog)
+    calibration: CalibrationLog = field(default_factory=CalibrationLog)
     frames: int = 0
     features: Counter[str] = field(default_factory=Counter)
     wall_s: float = 0.0

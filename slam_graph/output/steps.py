@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How many Gauss-Newton steps each frame took, and what they did to the cost."""
+"""The size of each frame's problem, how many steps it took, and what they did to the cost."""
 
 from __future__ import annotations
 
@@ -17,18 +17,21 @@ class StepLog:
     def __init__(self) -> None:
         self._stamps_ns = array("q")
         self._steps = array("l")
+        self._columns = array("l")
         self._costs = array("d")
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
-    def append(self, stamp_ns: int, costs: Sequence[float]) -> None:
+    def append(self, stamp_ns: int, costs: Sequence[float], columns: int) -> None:
         """Add a frame.
 
         Args:
             stamp_ns: its time.
             costs: before the first step and after each; at least one.
+            columns: dimension of the state.
         """
+        self._columns.append(columns)
         self._stamps_ns.append(stamp_ns)
         self._steps.append(len(costs) - 1)
         self._costs.extend((costs[0], costs[-1]))
@@ -42,6 +45,11 @@ class StepLog:
     def steps(self) -> NDArray[np.int64]:
         """(N,) numbers of steps that were taken."""
         return np.array(self._steps, dtype=np.int64)
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        """(N,) dimensions of the state while the steps were taken."""
+        return np.array(self._columns, dtype=np.int64)
 
     @property
     def costs(self) -> NDArray[np.float64]:

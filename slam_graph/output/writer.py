@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,6 +61,10 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
     metrics = folder / "metrics.json"
     write_text(metrics, [json.dumps(result.metrics, indent=2, allow_nan=False), "\n"])
     files += [map_file, timing, config, calibration, metrics]
+    if result.calibration.latest is not None:
+        files += [folder / "calibration_estimated.yaml", folder / "calibration.csv"]
+        write_kalibr(result.calibration.latest.rig, files[-2])
+        write_text(files[-1], result.calibration.csv_lines())
     if truth is not None and write_picture(result, truth, folder / "trajectory.png"):
         files.append(folder / "trajectory.png")
     return files
@@ -91,6 +96,7 @@ def state_lines(history: StateHistory) -> Iterator[str]:
     trajectory = history.trajectory()
     parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
     rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
-    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
-        cells = ("" if np.isnan(value) else f"{value:.9g}" for value in row)
+    # row by row: lists of all of them would take several times the memory of the arrays
+    for stamp_ns, row in zip(trajectory.stamps_ns, rows, strict=True):
+        cells = ("" if math.isnan(value) else f"{value:.9g}" for value in row.tolist())
         yield ",".join([str(stamp_ns), *cells]) + "\n"

@@ -69,6 +69,11 @@ class Camera:
         """The (3, 3) calibration matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(fx, fy, cx, cy) in pixels."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
     def distort(self, normalized: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels of normalised points, and the derivative.
 
@@ -92,17 +97,46 @@ class Camera:
         """Pixels (N, 2) of points (N, 3) in the camera frame; the points must have z > 0."""
         return self.distort(points[:, :2] / points[:, 2:3])[0]
 
-    def undistort(self, pixels: FloatArray) -> FloatArray:
-        """Normalised coordinates (N, 2) of pixels (N, 2): the inverse of `distort`."""
+    def by_intrinsics(self, normalized: FloatArray) -> FloatArray:
+        """Derivatives (N, 2, 4) of the pixels of normalised points by (fx, fy, cx, cy)."""
+        bent = (self.distort(normalized)[0] - (self.cx, self.cy)) / (self.fx, self.fy)
+        derivative = np.zeros((len(normalized), 2, 4))
+        derivative[:, 0, 0], derivative[:, 1, 1] = bent[:, 0], bent[:, 1]
+        derivative[:, 0, 2] = derivative[:, 1, 3] = 1.0
+        return derivative
+
+    def by_coefficients(self, normalized: FloatArray) -> FloatArray:
+        """Derivatives (N, 2, n) of the pixels of normalised points by the distortion's."""
+        x, y = normalized[:, 0], normalized[:, 1]
+        r = np.hypot(x, y)
+        if self.distortion == "radtan":
+            r2, xy = r * r, 2.0 * x * y
+            columns_x = [x * r2, x * r2 * r2, xy, r2 + 2.0 * x * x]
+            columns_y = [y * r2, y * r2 * r2, r2 + 2.0 * y * y, xy]
+            bent = np.stack([np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)], axis=1)
+        elif self.distortion == "equidistant":
+            powers = np.arctan(r)[:, None] ** np.array([3, 5, 7, 9]) / np.maximum(r, 1e-9)[:, None]
+            bent = normalized[:, :, None] * powers[:, None, :]
+        else:
+            bent = np.zeros((len(normalized), 2, 0))
+        return np.asarray(bent * np.array([[self.fx], [self.fy]]), dtype=np.float64)
+
+    def undistort(self, pixels: FloatArray, near: FloatArray | None = None) -> FloatArray:
+        """Normalised coordinates (N, 2) of pixels (N, 2): the inverse of `distort`.
+
+        Args:
+            pixels: (N, 2).
+            near: (N, 2) a guess of the result, where there is one; it saves time.
+        """
         if len(pixels) == 0:
             return np.zeros((0, 2))
         plain = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.distortion == "none":
             return plain
-        return self._invert_distortion(plain)
+        return self._newton(plain, self._fixed_point(plain) if near is None else near)
 
-    def _invert_distortion(self, bent: FloatArray) -> FloatArray:
-        """Newton's method on `distort`, started from OpenCV's fixed-point solution."""
+    def _fixed_point(self, bent: FloatArray) -> FloatArray:
+        """OpenCV's solution, from which Newton's method converges."""
         source = np.ascontiguousarray(bent[:, None, :])
         coefficients = np.array(self.coefficients)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-9)
@@ -111,7 +145,11 @@ class Camera:
             start = cv2.undistortPointsIter(source, eye, coefficients, eye, eye, criteria)
         else:
             start = cv2.fisheye.undistortPoints(source, np.eye(3), coefficients, criteria=criteria)
-        m = np.asarray(start, dtype=np.float64)[:, 0, :]
+        return np.asarray(start, dtype=np.float64)[:, 0, :]
+
+    def _newton(self, bent: FloatArray, m: FloatArray) -> FloatArray:
+        """Newton's method on `distort` from a start m (N, 2)."""
+        coefficients = np.array(self.coefficients)
         forward = _radtan if self.distortion == "radtan" else None
         for _ in range(3):
             if forward is not None:

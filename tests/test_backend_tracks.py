@@ -1,0 +1,35 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tracks of the window: under which angles two frames see the same features."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam_graph.backend.tracks import TrackWindow
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
+
+POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))
+
+
+def seen(turn: NDArray[np.float64], place: NDArray[np.float64], ids: slice) -> FeatureFrame:
+    """What a camera at a place, turned by `turn`, sees of some points."""
+    local = (POINTS - place)[ids] @ turn
+    normalized = local[:, :2] / local[:, 2:]
+    numbers = np.arange(len(POINTS), dtype=np.int64)[ids]
+    observed = FeatureObservations(numbers, normalized.astype(np.float32), normalized)
+    return FeatureFrame(0, (observed,))
+
+
+def test_parallax_is_of_the_place_and_not_of_the_direction() -> None:
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    here, there = np.zeros(3), np.array([0.4, -0.1, 0.2])
+    tracks = TrackWindow()
+    tracks.add(0, seen(np.eye(3), here, slice(0, 40)))
+    tracks.add(1, seen(turn, here, slice(0, 40)))
+    tracks.add(2, seen(turn, there, slice(10, 50)))
+    np.testing.assert_allclose(tracks.parallax(0, 1, turn.T), 0.0, atol=1e-12)
+    both = POINTS[10:40]
+    cosine = np.sum(both * (both - there), axis=1)
+    cosine /= np.linalg.norm(both, axis=1) * np.linalg.norm(both - there, axis=1)
+    np.testing.assert_allclose(tracks.parallax(0, 2, turn.T), np.arccos(cosine), atol=1e-9)
