@@ -107,7 +107,8 @@ def test_toro_without_information_has_the_identity(gtsam_data: Path) -> None:
         (V2 + E2.replace("0 1 1", "0 1.5 1"), "graph.g2o:3: "),
         (V2 + "EDGE_SE2 0 0 1 0 0 1 0 0 1 0 1\n", "no edges between two poses"),
         (V2 + V3 + E3, "2D and 3D"),
-        (V3 + E3.replace("0 0 0 1 1", "0 0 0 0 1"), "graph.g2o:3: the quaternion is zero"),
+        (V3 + E3.replace("0 0 0 1 1", "0 0 0 0 1"), "graph.g2o:3: the quaternion is not of"),
+        (V3.replace("0 1\n", "0 1e300\n") + E3, "graph.g2o:1: the quaternion is not of"),
     ],
 )
 def test_bad_files_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:

@@ -39,6 +39,9 @@ RELATIVE_GAP = 1e-6
 GAP_PER_EDGE = 1e-9
 """… and this for each edge, which is what counts if all edges agree exactly."""
 
+ROUNDING = 1e-12
+"""Where F promises to fall by no more than this part of it, it is a minimum."""
+
 MAX_NEWTON_STEPS = 50
 MAX_DAMPING = 1e6
 
@@ -124,16 +127,18 @@ def refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
         gradient, hessian = _derivatives(B, poses, free)
         scale = hessian.diagonal().mean()
         while True:
-            lu = factorized(hessian + damping * scale * identity(len(free), format="csc"))
-            moved = _retracted(poses, -lu.solve(gradient), free)
-            lower = chordal_cost(graph, moved) if _is_positive(lu) else np.inf
-            if lower < cost or damping > MAX_DAMPING:
-                break
-            if damping == 0.0 and _is_positive(lu):
-                return poses, step  # a full step finds nothing lower: this is the minimum
+            lu = _positive_factors(hessian + damping * scale * identity(len(free), format="csc"))
+            if lu is not None:
+                way = lu.solve(gradient)
+                moved = _retracted(poses, -way, free)
+                lower = chordal_cost(graph, moved)
+                if lower < cost:
+                    break
+                if gradient @ way <= ROUNDING * cost:
+                    return poses, step
+            if damping > MAX_DAMPING:
+                return poses, step
             damping = max(10.0 * damping, 1e-6)
-        if not lower < cost:
-            return poses, step
         poses, cost, damping = moved, lower, damping / 100.0 if damping > 1e-5 else 0.0
     return poses, MAX_NEWTON_STEPS
 
@@ -172,8 +177,8 @@ def smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
     rotations = np.flatnonzero(kept >= n)
     shift = 1e-9 * float(np.abs(S.diagonal()).max())
     for _ in range(20):
-        lu = factorized(grounded + shift * on_rotations)
-        if _is_positive(lu):
+        lu = _positive_factors(grounded + shift * on_rotations)
+        if lu is not None:
             break
         shift *= 10.0
     else:
@@ -191,9 +196,18 @@ def smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
     return float(1.0 / largest[0] - shift)
 
 
-def _is_positive(lu: SuperLU) -> bool:
-    """Whether a symmetric matrix, factorised with pivots on its diagonal, is positive definite."""
-    return bool(np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all())
+def _positive_factors(matrix: csc_matrix) -> SuperLU | None:
+    """The factors of a symmetric matrix, or None if it is not positive definite.
+
+    With pivots on the diagonal their signs are those of the eigenvalues (Sylvester's law of
+    inertia).
+    """
+    try:
+        lu = factorized(matrix)
+    except RuntimeError:  # singular
+        return None
+    positive = np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()
+    return lu if positive else None
 
 
 def _free_tangents(graph: PoseGraph) -> IntArray:

@@ -88,6 +88,10 @@ LINES = {
 }
 
 
+QUATERNION_TOLERANCE = 0.1
+"""How far the length of a quaternion may be from 1: files have few digits."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """All lines of a file that begin with one word.
@@ -204,9 +208,10 @@ def _poses(rows: Rows, numbers: FloatArray, line: Line) -> Poses:
         return Poses(np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2), translations)
     if line.rotation == "rpy":
         return Poses(Rotation.from_euler("xyz", angles).as_matrix(), translations)
-    zero = np.flatnonzero(np.linalg.norm(angles, axis=1) < 1e-6)
-    if len(zero):
-        raise DataError(f"{rows.where(zero[0])}: the quaternion is zero")
+    length = np.linalg.norm(np.clip(angles, -2.0, 2.0), axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(bad):
+        raise DataError(f"{rows.where(int(bad[0]))}: the quaternion is not of unit length")
     return Poses(Rotation.from_quat(angles).as_matrix(), translations)
 
 

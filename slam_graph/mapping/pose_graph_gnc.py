@@ -13,6 +13,9 @@ lead into wrong minima.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -116,12 +119,26 @@ def _step(
     anchors: list[gtsam.NonlinearFactor],
     values: gtsam.Values,
 ) -> gtsam.Values:
-    """One Gauss-Newton step on the edges that have a weight."""
+    """One step on the edges that have a weight."""
     rows = np.flatnonzero(weights > 0)
     weighted = graph.keep_edges(rows).weighted(weights[rows])
-    parameters = gtsam.GaussNewtonParams()
-    parameters.setOrderingType("COLAMD")
     factors = factor_graph([*edge_factors(weighted, range(len(rows))), *anchors])
-    optimizer = gtsam.GaussNewtonOptimizer(factors, values, parameters)
+    try:
+        return _iterated(gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams(), factors, values)
+    except RuntimeError:  # too poorly conditioned without damping
+        return _iterated(
+            gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), factors, values
+        )
+
+
+def _iterated(
+    optimizer_of: Callable[..., Any],
+    parameters: Any,
+    factors: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+) -> gtsam.Values:
+    """One step of one of GTSAM's optimizers."""
+    parameters.setOrderingType("COLAMD")
+    optimizer = optimizer_of(factors, values, parameters)
     optimizer.iterate()
     return gtsam.Values(optimizer.values())

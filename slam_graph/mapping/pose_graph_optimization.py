@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import EstimationError
 from slam_graph.mapping.pose_graph import FloatArray, PoseGraph, Poses
 from slam_graph.mapping.pose_graph_cost import PoseGraphCost, construct, loss_weights
 from slam_graph.mapping.pose_graph_gnc import graduated_nonconvexity
@@ -56,7 +57,11 @@ def first_estimates(
 ) -> tuple[Poses, FloatArray]:
     """Where the steps begin, and weights (M,) of the edges: 0 for what `gnc` has rejected."""
     if policy.robust == "gnc":
-        return graduated_nonconvexity(graph, policy, diagnostics)
+        try:
+            return graduated_nonconvexity(graph, policy, diagnostics)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split(".")[0].split())
+            raise EstimationError(f"{graph.name}: gnc failed: {reason}") from error
     how = policy.initialization
     if how == "auto":
         how = "chordal" if policy.robust == "none" else "odometry"

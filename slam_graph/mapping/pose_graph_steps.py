@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import gtsam
+import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -41,6 +42,8 @@ def minimize(
     except RuntimeError as error:
         reason = " ".join(str(error).split(".")[0].split())
         raise EstimationError(f"{cost.graph.name}: {policy.method} failed: {reason}") from error
+    if not np.isfinite(minimum.cost):
+        raise EstimationError(f"{cost.graph.name}: {policy.method} failed: the cost is not finite")
     if not minimum.converged:
         diagnostics.warn(
             "pose_graph_not_converged",
