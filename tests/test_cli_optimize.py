@@ -68,7 +68,9 @@ def test_everything_that_is_asked_for_is_written(tmp_path: Path, graph: Path) ->
     assert estimates is not None
     np.testing.assert_allclose(tum[:, 1:4], estimates.translations, atol=1e-9)
     assert tum[:, 0].tolist() == list(range(60))
-    again = run(tmp_path, graph, "--config", folder / "config.yaml", "--json", "--output", "more")
+    settings, more = str(folder / "config.yaml"), str(tmp_path / "more")
+    arguments = ["optimize", str(graph), "--config", settings, "--output", more, "--json"]
+    again = CliRunner().invoke(app, arguments)
     assert json.loads(again.stdout)["chi2"]["after"] == metrics["chi2"]["after"]
 
 
@@ -99,6 +101,7 @@ def test_a_cut_file_is_one_line_on_stderr(tmp_path: Path, graph: Path) -> None:
     [
         (["none.g2o"], 1, "cannot be read"),
         (["laps.g2o", "--set", "cost.robst=gnc"], 2, "did you mean 'robust'"),
+        (["laps.g2o", "--save", "nowhere/best.g2o"], 1, "cannot be written"),
         (["laps.g2o", "--init", "lago"], 1, "lago is for 2D"),
     ],
 )

@@ -76,6 +76,8 @@ def optimize(
 
     if save is not None and save.exists() and not force:
         raise DataError(f"{save}: is there already; say --force to replace it")
+    if save is not None and (save.is_dir() or not save.parent.is_dir()):
+        raise DataError(f"{save}: cannot be written; name a file in a folder that is there")
     said = {"method": method, "initialization": initialization, "robust": robust}
     policy, diagnostics = _policy(config, set_ or [], said), Diagnostics()
     seconds: dict[str, float] = {}
