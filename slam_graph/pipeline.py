@@ -122,6 +122,11 @@ def _open(sequence: Sequence, config: RunConfig) -> RunResult:
     info = sequence.info()
     if info.frames == 0:
         raise DataError(f"{info.name}: holds no camera frames; there is nothing to run on")
+    if info.imu_samples == 0:
+        raise DataError(
+            f"{info.name}: format '{info.format}' gives no IMU (gyroscope and accelerometer); "
+            "every back end needs one, only the front end can be run on its frames"
+        )
     start_ns = info.start_ns + round(config.start_s * 1e9)
     if start_ns > info.end_ns:
         length_s = (info.end_ns - info.start_ns) * 1e-9

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from recordings import edit_text, write_euroc
 
+from slam_graph.datasets.registry import open_dataset
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration import read_euroc_rig
 from slam_graph.sensors.camera import Camera
@@ -61,17 +62,18 @@ def chain(tmp_path: Path) -> Path:
 
 
 def random_rig(rng: np.random.Generator) -> Rig:
-    """Three cameras, one of each distortion model, at random poses."""
+    """Cameras, one of each distortion model, at random poses."""
 
     def mounted(distortion: str, count: int) -> RigCamera:
         fx, fy, cx, cy = rng.uniform(100, 900, 4).tolist()
-        coefficients = tuple((rng.normal(size=count) * 10.0 ** rng.integers(-9, 0)).tolist())
+        coefficients = tuple((rng.uniform(size=count) * 10.0 ** rng.integers(-9, 1)).tolist())
         camera = Camera(fx, fy, cx, cy, distortion, coefficients, 640, 480)  # type: ignore[arg-type]
         pose = gtsam.Pose3.Expmap(rng.normal(size=6))
         return RigCamera(camera, pose, float(rng.normal() * 1e-3), f"camera {distortion}")
 
-    cameras = (mounted("none", 0), mounted("radtan", 4), mounted("equidistant", 4))
-    return Rig(cameras, ImuNoise(*rng.uniform(1e-6, 1e-2, 4).tolist(), 123.5))
+    cameras = [mounted("none", 0), mounted("radtan", 4), mounted("equidistant", 4)]
+    cameras += [mounted("mei", 5), mounted("double_sphere", 2)]
+    return Rig(tuple(cameras), ImuNoise(*rng.uniform(1e-6, 1e-2, 4).tolist(), 123.5))
 
 
 def same(a: Rig, b: Rig, tolerance: float = 1e-12) -> bool:
@@ -97,12 +99,37 @@ def test_what_is_written_is_kalibrs_format(tmp_path: Path) -> None:
     rig = random_rig(np.random.default_rng(8))
     write_kalibr(rig, tmp_path / "calibration.yaml")
     content = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
-    assert list(content) == ["cam0", "cam1", "cam2", "imu0"]
+    assert list(content) == ["cam0", "cam1", "cam2", "cam3", "cam4", "imu0"]
     camera_T_body = np.array(content["cam1"]["T_cam_imu"])
     expected = np.linalg.inv(rig.cameras[1].body_T_camera.matrix())
     np.testing.assert_allclose(camera_T_body, expected, atol=1e-12)
     assert content["cam1"]["distortion_model"] == "radtan"
     assert content["imu0"]["update_rate"] == 123.5
+
+
+def test_omnidirectional_cameras_of_kalibr(chain: Path) -> None:
+    old = """  camera_model: pinhole
+  distortion_coeffs: [-0.01, 0.02, -0.03, 0.004]
+  distortion_model: equidistant
+  intrinsics: [380.5, 380.25, 510.0, 514.0]
+"""
+    omni = (
+        old.replace("pinhole", "omni").replace("equidistant", "radtan").replace("[380", "[2, 380")
+    )
+    edit_text(chain, old, omni)
+    camera = read_kalibr(chain).cameras[0].camera
+    assert (camera.distortion, camera.fx) == ("mei", 380.5)
+    assert camera.coefficients == (2.0, -0.01, 0.02, -0.03, 0.004)
+    spheres = omni.replace("omni", "ds").replace("[2,", "[-0.2, 0.6,")
+    edit_text(chain, omni, spheres)
+    with pytest.raises(DataError, match=r"yaml:10: .*'radtan' does not go with .*'ds'"):
+        read_kalibr(chain)
+    edit_text(chain, "distortion_model: radtan", "distortion_model: none")
+    camera = read_kalibr(chain).cameras[0].camera
+    assert (camera.distortion, camera.coefficients) == ("double_sphere", (-0.2, 0.6))
+    edit_text(chain, "-0.2, 0.6", "-0.2, 1.6")
+    with pytest.raises(DataError, match="alpha of a double sphere"):
+        read_kalibr(chain)
 
 
 def test_kalibr_chain(chain: Path) -> None:
@@ -152,7 +179,7 @@ def test_euroc_rig_with_an_offset_imu(tmp_path: Path) -> None:
     ("old", "new", "line", "what"),
     [
         ("distortion_model: equidistant", "distortion_model: fov", 10, "distortion model 'fov'"),
-        ("camera_model: pinhole", "camera_model: omni", 8, "unknown camera model 'omni'"),
+        ("camera_model: pinhole", "camera_model: eucm", 8, "unknown camera model 'eucm'"),
         ("- [0.0, 1.0, 0.0, 0.5]", "- [0.0, 1.1, 0.0, 0.5]", 3, "not a rotation"),
         ("- [0.0, 1.0, 0.0, 0.5]", "- [0.0, -1.0, 0.0, 0.5]", 3, "not a rotation"),
         ("  - [0.0, 1.0, 0.0, 0.5]\n", "", 3, "expected a 4x4 matrix"),
@@ -199,3 +226,30 @@ def test_real_calibration(data_dir: Path, tmp_path: Path) -> None:
     assert abs(np.linalg.norm(baseline) - 0.11) < 1e-3
     write_kalibr(rig, tmp_path / "calibration.yaml")
     assert same(read_kalibr(tmp_path / "calibration.yaml"), rig)
+
+
+@pytest.mark.parametrize(
+    ("line", "rolling"),
+    [
+        ("rolling_shutter: true", True),
+        ("shutter: rolling", True),
+        ("shutter_type: Rolling Shutter", True),
+        ("line_delay: 3.0e-05", True),
+        ("readout_time: 0.016", True),
+        ("rolling_shutter: false", False),
+        ("shutter: global", False),
+        ("line_delay: 0.0", False),
+        ("timeshift_cam_imu: 0.0", False),
+    ],
+)
+def test_a_rolling_shutter_is_recognised_and_warned_of(
+    tmp_path: Path, line: str, rolling: bool
+) -> None:
+    path = write_euroc(tmp_path / "flight", cameras=1)
+    edit_text(path / "mav0" / "cam0" / "sensor.yaml", "rate_hz: 20", f"rate_hz: 20\n{line}")
+    sequence = open_dataset(path)
+    assert sequence.rig.cameras[0].rolling_shutter is rolling
+    assert sequence.diagnostics.counts == ({"rolling_shutter": 1} if rolling else {})
+    write_kalibr(sequence.rig, tmp_path / "chain.yaml")
+    again = open_dataset(path, calibration=tmp_path / "chain.yaml")
+    assert again.rig.cameras[0].rolling_shutter is rolling

@@ -2,12 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the camera models: inverses, derivatives, agreement with GTSAM's calibrations."""
 
+from dataclasses import replace
+
+import cv2
 import gtsam
 import numpy as np
 import pytest
 
-from slam_graph.errors import DataError
+from slam_graph.backend.native_factors import calibration
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.tracker import KltTracker
+from slam_graph.sensors.camera import WIDE as WIDE_MODELS
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.measurements import CameraFrame
+from slam_graph.sensors.rig import Rig, RigCamera
 
 PINHOLE = Camera(458.654, 457.296, 367.215, 248.375, "none", (), 752, 480)
 RADTAN = Camera(
@@ -26,16 +36,26 @@ EQUIDISTANT = Camera(
 WIDE = Camera(
     190.98, 190.97, 254.93, 256.90, "equidistant", (0.0034, 0.00072, -0.00205, 0.0002), 512, 512
 )
-ALL = [PINHOLE, RADTAN, EQUIDISTANT, WIDE]
-each_camera = pytest.mark.parametrize("camera", ALL, ids=["none", "radtan", "equidistant", "wide"])
+MEI = Camera(
+    1335.6, 1334.2, 716.9, 705.7, "mei", (2.213, 0.0166, 1.6548, 4.2e-4, 4.2e-4), 1400, 1400
+)
+SPHERES = Camera(157.3, 157.2, 255.1, 256.8, "double_sphere", (-0.179, 0.5916), 512, 512)
+NARROW = Camera(313.2, 313.2, 638.7, 514.4, "double_sphere", (-0.1834, 0.5931), 1280, 1024)
+ALL = [PINHOLE, RADTAN, EQUIDISTANT, WIDE, MEI, SPHERES, NARROW]
+NAMES = ["none", "radtan", "equidistant", "wide", "mei", "double_sphere", "narrow"]
+each_camera = pytest.mark.parametrize("camera", ALL, ids=NAMES)
+
+
+def image_grid(camera: Camera) -> np.ndarray:
+    """Pixels all over the image."""
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 41), np.linspace(0, camera.height - 1, 31))
+    return np.column_stack([u.ravel(), v.ravel()])
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
-    """Pixels all over the image; of a fisheye those that are less than 75° off its axis."""
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 41), np.linspace(0, camera.height - 1, 31))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    angle = np.hypot(*((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T)
-    return pixels[angle < np.deg2rad(75)] if camera is WIDE else pixels
+    """Pixels all over the image; of a wide lens those that are less than 80° off its axis."""
+    pixels = image_grid(camera)
+    return pixels[camera.visible(pixels)[1]] if camera.distortion in WIDE_MODELS else pixels
 
 
 @each_camera
@@ -64,6 +84,22 @@ def test_jacobian_matches_numerical_derivative(camera: Camera) -> None:
 
 
 @each_camera
+def test_derivatives_by_the_parameters_match_numerical_ones(camera: Camera) -> None:
+    m = np.concatenate([camera.undistort(pixel_grid(camera)), np.zeros((1, 2))])
+    values = np.array([*camera.intrinsics, *camera.coefficients])
+    analytical = np.concatenate([camera.by_intrinsics(m), camera.by_coefficients(m)], axis=2)
+    assert analytical.shape == (len(m), 2, len(values))
+    for k, h in enumerate([1e-3] * 4 + [1e-6] * len(camera.coefficients)):
+        ends = []
+        for sign in (1.0, -1.0):
+            fx, fy, cx, cy, *coefficients = values + sign * h * np.eye(len(values))[k]
+            changed = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(coefficients))
+            ends.append(changed.distort(m)[0])
+        numerical = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(analytical[:, :, k], numerical, rtol=1e-5, atol=1e-4)
+
+
+@each_camera
 def test_projection_depends_on_the_ray_only(camera: Camera) -> None:
     m = camera.undistort(pixel_grid(camera))
     rays = np.column_stack([m, np.ones(len(m))])
@@ -85,6 +121,58 @@ def test_equidistant_agrees_with_gtsam(camera: Camera) -> None:
     )
     m = camera.undistort(pixel_grid(camera))
     np.testing.assert_allclose(camera.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-8)
+
+
+def test_mei_agrees_with_gtsam() -> None:
+    oracle, _ = calibration(MEI)
+    m = MEI.undistort(pixel_grid(MEI))
+    assert len(m) > 500
+    np.testing.assert_allclose(MEI.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-8)
+
+
+def test_what_gtsam_does_not_know_is_refused_for_its_smoothers() -> None:
+    with pytest.raises(ConfigError, match="distortion 'double_sphere'"):
+        calibration(SPHERES)
+
+
+@pytest.mark.parametrize("camera", [SPHERES, NARROW], ids=["wide", "narrow"])
+def test_double_sphere_is_what_its_paper_says(camera: Camera) -> None:
+    xi, alpha = camera.coefficients
+    points = np.random.default_rng(0).uniform([-3, -3, 0.6], [3, 3, 5], (200, 3))
+    x, y, z = points.T
+    d1 = np.sqrt(x**2 + y**2 + z**2)
+    d2 = np.sqrt(x**2 + y**2 + (xi * d1 + z) ** 2)
+    depth = alpha * d2 + (1 - alpha) * (xi * d1 + z)
+    expected = np.stack([camera.fx * x, camera.fy * y], axis=1) / depth[:, None]
+    expected += np.array([camera.cx, camera.cy])
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
+
+
+@each_camera
+def test_every_pixel_is_a_point_or_said_not_to_be(camera: Camera) -> None:
+    """Over the whole image: what is seen less than 80° off the axis is found again."""
+    pixels = image_grid(camera)
+    plane, visible = camera.visible(pixels)
+    assert np.all(np.isfinite(plane))
+    np.testing.assert_allclose(camera.distort(plane[visible])[0], pixels[visible], atol=1e-7)
+    radius = np.linalg.norm(pixels - (camera.cx, camera.cy), axis=1)
+    edge = camera.project(np.array([[np.tan(np.deg2rad(80)), 0.0, 1.0]]))[0, 0] - camera.cx
+    if camera.distortion in WIDE_MODELS:
+        assert np.all(visible[radius < 0.98 * edge])
+        assert not np.any(visible[radius > 1.02 * edge])
+    else:
+        assert np.all(visible)
+
+
+def test_a_front_end_leaves_out_what_a_fisheye_sees_sideways() -> None:
+    rng = np.random.default_rng(3)
+    image = cv2.resize(rng.integers(0, 255, (128, 128), dtype=np.uint8), (512, 512))
+    rig = Rig((RigCamera(WIDE, gtsam.Pose3()),))
+    tracker = KltTracker(rig, FrontendConfig(features=400), 0, Diagnostics())
+    features = tracker.track(CameraFrame(0, (np.asarray(image, np.uint8),))).cameras[0]
+    length = np.linalg.norm(features.normalized, axis=1)
+    assert len(features) > 100
+    assert 2.0 < np.max(length) < np.tan(np.deg2rad(70.1))
 
 
 def test_calibration_matrix_projects_undistorted_points() -> None:

@@ -45,7 +45,7 @@ def test_unknown_path_names_all_formats(tmp_path: Path, name: str) -> None:
 def test_missing_path_and_unknown_format(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file or folder"):
         open_dataset(tmp_path / "nothing")
-    with pytest.raises(DataError, match="unknown data set format 'kitty'; known: euroc"):
+    with pytest.raises(DataError, match=r"unknown data set format 'kitty'; known: .*euroc"):
         open_dataset(tmp_path, format="kitty")
     with pytest.raises(DataError, match=r"tracks\.csv|calib\.yaml"):
         open_dataset(tmp_path, format="openvins_sim")

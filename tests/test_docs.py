@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from slam_graph.config import algorithm_names, load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.registry import DATASETS, open_dataset
 from slam_graph.pipeline import run
 
 ROOT = Path(__file__).parent.parent
@@ -75,6 +75,12 @@ def test_every_kind_of_warning_is_explained() -> None:
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"^\| `([a-z_]+)` \|", page, re.MULTILINE))
     assert not kinds - explained
+
+
+def test_every_format_is_in_the_documents() -> None:
+    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
+    table = page[page.index("## Formats") : page.index("###")]
+    assert re.findall(r"^\| `([a-z_]+)` \|", table, re.MULTILINE) == list(DATASETS)
 
 
 def test_the_algorithm_of_the_documents_runs(tmp_path: Path) -> None:

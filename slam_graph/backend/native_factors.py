@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from slam_graph.backend.config import GatingConfig
 from slam_graph.backend.square_root import SquareRootInformation
 from slam_graph.backend.tracks import Observations
+from slam_graph.errors import ConfigError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 
@@ -29,6 +30,15 @@ def calibration(camera: Camera) -> tuple[Any, Any]:
     if camera.distortion == "radtan":
         radtan = gtsam.Cal3DS2(*intrinsics, *camera.coefficients)
         return radtan, gtsam.GenericProjectionFactorCal3DS2
+    if camera.distortion == "mei":
+        xi, k1, k2, p1, p2 = camera.coefficients
+        unified = gtsam.Cal3Unified(*intrinsics, k1, k2, p1, p2, xi)
+        return unified, gtsam.GenericProjectionFactorCal3Unified
+    if camera.distortion != "none":
+        raise ConfigError(
+            f"GTSAM's smoothers have no camera with distortion '{camera.distortion}'; "
+            "choose another algorithm"
+        )
     return gtsam.Cal3_S2(*intrinsics), gtsam.GenericProjectionFactorCal3_S2
 
 

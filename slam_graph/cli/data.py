@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph data`: what a recording holds, and what is wrong with it."""
+"""`slam-graph data`: what a recording holds, what is wrong with it, and its EuRoC form."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,9 +15,10 @@ from slam_graph.cli.output import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.datasets.base import Sequence
+    from slam_graph.datasets.recorded import RecordedSequence
 
 app = typer.Typer(
-    help="Look at recordings and check them.", no_args_is_help=True, rich_markup_mode=None
+    help="Look at recordings, check and convert them.", no_args_is_help=True, rich_markup_mode=None
 )
 
 Data = Annotated[
@@ -34,6 +36,17 @@ Calibration = Annotated[
 Groundtruth = Annotated[
     Path | None, typer.Option("--groundtruth", help="True trajectory to use instead of the data's.")
 ]
+Sources = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        "--source",
+        metavar="SENSOR=WHERE",
+        help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
+        "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
+        "rate=30 instead of stamps.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -43,12 +56,11 @@ def info(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     as_json: Json = False,
 ) -> None:
     """Show what a recording holds, without reading it whole."""
-    from slam_graph.datasets.registry import open_dataset
-
-    sequence = open_dataset(data, format=format_, calibration=calibration, groundtruth=groundtruth)
+    sequence = _open(data, format_, calibration, groundtruth, sources)
     table = _describe(sequence)
     if as_json:
         echo_json(table)
@@ -65,14 +77,14 @@ def check(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     images: Annotated[bool, typer.Option("--images", help="Read every image too.")] = False,
     as_json: Json = False,
 ) -> None:
     """Read a recording and report what is wrong with it; the exit code is 1 if it is unusable."""
     from slam_graph.datasets.checks import check_sequence
-    from slam_graph.datasets.registry import open_dataset
 
-    sequence = open_dataset(data, format=format_, calibration=calibration, groundtruth=groundtruth)
+    sequence = _open(data, format_, calibration, groundtruth, sources)
     findings = check_sequence(sequence, read_images=images)
     errors = sum(finding.severity == "error" for finding in findings)
     if as_json:
@@ -82,6 +94,64 @@ def check(
         typer.echo(f"{sequence.info().name}: {'unusable' if errors else 'ok'}")
     if errors:
         raise typer.Exit(1)
+
+
+@app.command()
+def convert(
+    data: Data,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="New folder to write.")],
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    sources: Sources = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace OUTPUT if it is an EuRoC folder.")
+    ] = False,
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
+    ] = True,
+) -> None:
+    """Write a recording of images as an EuRoC folder, whole or not at all."""
+    from slam_graph.cli.progress import ProgressBar
+    from slam_graph.datasets.convert import convert_to_euroc
+    from slam_graph.datasets.euroc_writer import refuse_existing
+
+    refuse_existing(output, force)
+    sequence = _open(data, format_, calibration, groundtruth, sources)
+    info = sequence.info()
+    with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
+        told = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
+        convert_to_euroc(sequence, output, force, told)
+    for kind, count in sequence.diagnostics.counts.items():
+        typer.echo(f"warning: {kind} {count}", err=True)
+    typer.echo(str(output))
+
+
+def sources_from(texts: list[str] | None) -> dict[str, str]:
+    """Where each sensor is, from texts ``sensor=where``."""
+    pairs = [text.partition("=") for text in texts or []]
+    for text, (sensor, _, where) in zip(texts or [], pairs, strict=True):
+        if not sensor or not where:
+            raise typer.BadParameter(f"'{text}' is not of the form SENSOR=WHERE")
+    return {sensor: where for sensor, _, where in pairs}
+
+
+def _open(
+    data: str,
+    format_: str | None,
+    calibration: Path | None,
+    groundtruth: Path | None,
+    sources: list[str] | None,
+) -> RecordedSequence:
+    from slam_graph.datasets.registry import open_dataset
+
+    return open_dataset(
+        data,
+        format=format_,
+        calibration=calibration,
+        groundtruth=groundtruth,
+        sources=sources_from(sources),
+    )
 
 
 def _describe(sequence: Sequence) -> dict[str, Any]:
@@ -98,6 +168,7 @@ def _describe(sequence: Sequence) -> dict[str, Any]:
             "fy": mounted.camera.fy,
             "distortion": mounted.camera.distortion,
             "time_offset_s": mounted.time_offset_s,
+            "shutter": "rolling" if mounted.rolling_shutter else "global",
         }
         for index, mounted in enumerate(sequence.rig.cameras)
     ]

@@ -43,6 +43,7 @@ def collected_log() -> Iterator[list[str]]:
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Take away the folder of a run that wrote nothing."""
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    """Take away the folder of a run that wrote nothing, and that of its data set if it is empty."""
+    for empty in (folder, folder.parent):
+        if empty.is_dir() and not any(empty.iterdir()):
+            empty.rmdir()

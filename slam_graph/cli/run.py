@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
-from slam_graph.cli.data import Calibration, Data, Format, Groundtruth, Json
+from slam_graph.cli.data import (
+    Calibration,
+    Data,
+    Format,
+    Groundtruth,
+    Json,
+    Sources,
+    sources_from,
+)
 from slam_graph.cli.logs import collected_log, remove_if_empty
 from slam_graph.cli.output import echo_json
 from slam_graph.cli.progress import ProgressBar
@@ -56,6 +64,7 @@ def run(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     as_json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording and write the results.
@@ -74,6 +83,7 @@ def run(
             cameras=settings.cameras,
             calibration=calibration,
             groundtruth=groundtruth,
+            sources=sources_from(sources),
         )
         result, folder, files = _execute(sequence, settings, output, rerun, progress, log)
     if as_json:

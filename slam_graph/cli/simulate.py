@@ -74,8 +74,9 @@ def simulate(
 
     OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
     """
+    from slam_graph.datasets.euroc_writer import refuse_existing
     from slam_graph.simulation.simulator import simulate as make
-    from slam_graph.simulation.writers import refuse_existing, write
+    from slam_graph.simulation.writers import write
 
     tracks = {
         "features": features,

@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.images import FileImages
+from slam_graph.datasets.imu_stream import ImuFile, parse_imu_rows
+from slam_graph.datasets.ordering import in_order
 from slam_graph.datasets.rows import read_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -24,12 +27,20 @@ from slam_graph.sensors.yaml_source import read_yaml
 def find_mav0(path: Path) -> Path:
     """The folder of sensors that a path stands for."""
     for folder in (path / "mav0", path):
-        if (folder / "imu0").is_dir():
+        if (folder / "imu0").is_dir() or (folder / "cam0").is_dir():
             return folder.resolve()
     if not path.is_dir():
         raise DataError(f"{path}: no such folder")
     folder = path / "mav0" if (path / "mav0").is_dir() else path
-    raise DataError(f"{folder}: no folder 'imu0' here; an EuRoC recording has mav0/imu0, mav0/cam0")
+    raise DataError(
+        f"{folder}: no folder 'imu0' or 'cam0' here; an EuRoC recording has mav0/imu0, mav0/cam0"
+    )
+
+
+def imu_file(mav0: Path) -> ImuFile | None:
+    """The samples of the IMU; None where there is no IMU."""
+    folder = mav0 / "imu0"
+    return ImuFile(folder / "data.csv", parse_imu_rows) if folder.is_dir() else None
 
 
 def name_of(mav0: Path) -> str:
@@ -54,9 +65,10 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
             folders = folders[:count]
         rig = read_euroc_rig(mav0, [folder.name for folder in folders])
     else:
-        imu = mav0 / "imu0" / "sensor.yaml"
-        noise = read_imu_noise(read_yaml(imu)) if imu.is_file() else None
-        rig = read_kalibr(calibration, fallback=noise)
+        beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
+        imu = next((file for file in beside if file.is_file()), None)
+        noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
+        rig = read_kalibr(calibration, fallback=noise, needs_imu=imu_file(mav0) is not None)
         if len(rig.cameras) > len(folders):
             raise DataError(
                 f"{calibration}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "
@@ -66,26 +78,48 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
     return rig, folders[: len(rig.cameras)]
 
 
-def list_images(folder: Path, diagnostics: Diagnostics) -> tuple[NDArray[np.int64], list[str]]:
-    """Stamps and file names of a camera; none if its folder holds no images at all."""
+def list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
+    """The images of a camera; none if its folder holds no images at all."""
     index = folder / "data.csv"
     if not index.is_file():
         if (folder / "data").exists():
             raise DataError(f"{index}: missing, but there are images beside it")
-        return np.zeros(0, np.int64), []
-    stamps: list[int] = []
-    names: list[str] = []
-    for rows in read_rows(index):
-        for k, line in enumerate(rows.lines):
-            stamp, name = _parse_image_row(line, partial(rows.where, k))
-            if stamps and stamp <= stamps[-1]:
-                diagnostics.warn("camera_out_of_order", f"{rows.where(k)}: image dropped")
-                continue
-            stamps.append(stamp)
-            names.append(name)
-    if not stamps:
+        return FileImages(folder.name, np.zeros(0, np.int64), [])
+    listed = [
+        _parse_image_row(line, partial(rows.where, k))
+        for rows in read_rows(index)
+        for k, line in enumerate(rows.lines)
+    ]
+    if not listed:
         raise DataError(f"{index}: no images listed in this file")
-    return np.array(stamps, np.int64), names
+    stamps = np.array([stamp for stamp, _ in listed], np.int64)
+    paths = [folder / "data" / name for _, name in listed]
+    return ordered_images(folder.name, stamps, paths, index, diagnostics)
+
+
+def ordered_images(
+    name: str,
+    stamps_ns: NDArray[np.int64],
+    paths: Sequence[Path],
+    index: Path,
+    diagnostics: Diagnostics,
+) -> FileImages:
+    """The images of a camera without those that break the order of time.
+
+    Args:
+        name: of the camera.
+        stamps_ns: (N,) in any order.
+        paths: N files.
+        index: file that lists them, for messages.
+        diagnostics: counts `camera_out_of_order`.
+    """
+
+    def dropped(k: int, _: int) -> None:
+        what = f"{index}: {paths[k].name} at {stamps_ns[k]} dropped, not in the order of time"
+        diagnostics.warn("camera_out_of_order", what)
+
+    kept = in_order(stamps_ns, dropped)
+    return FileImages(name, stamps_ns[kept], [paths[k] for k in kept])
 
 
 def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.base import Sequence
-from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.image_sequence import GroupedSequence
 from slam_graph.datasets.imu_checks import ImuSurvey
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import Trajectory
@@ -68,8 +68,9 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
     Returns:
         findings, the errors first.
     """
-    if isinstance(sequence, EurocSequence) and not read_images:
+    if isinstance(sequence, GroupedSequence) and not read_images:
         sequence = sequence.without_images()
+    opened = dict(sequence.diagnostics.counts)
     with _collecting(sequence) as faults:
         survey, stamps = _go_through(sequence)
         truth = sequence.groundtruth()
@@ -77,6 +78,10 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
     findings = [
         Finding("warning", f"{kind}: {count} times, first: {faults.messages[kind]}", name)
         for kind, count in faults.counts.items()
+    ]
+    findings += [
+        Finding("warning", f"{kind}: {count} times, counted before the check", name)
+        for kind, count in opened.items()
     ]
     findings += [Finding(*found, "imu") for found in survey.findings(sequence.rig.imu)]
     findings += _check_frames(stamps, name)
@@ -104,7 +109,7 @@ def _go_through(sequence: Sequence) -> tuple[ImuSurvey, NDArray[np.int64]]:
     for packet in sequence.packets():
         stamps.append(packet.frame.stamp_ns)
         survey.add(packet.imu)
-    if not stamps and isinstance(sequence, EurocSequence):
+    if not stamps and isinstance(sequence, GroupedSequence):
         for block in sequence.imu_blocks():
             survey.add(block)
     return survey, np.array(stamps, np.int64)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 T = TypeVar("T")
+
+Image = NDArray[np.uint8]
+"""(height, width), grey."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -33,31 +36,64 @@ class Fault:
     message: str
 
 
-def read_grey(path: Path, width: int, height: int) -> NDArray[np.uint8] | Fault:
-    """Read an image of a known size as 8 bit grey.
+@dataclass(eq=False)
+class FileImages:
+    """The images of one camera, each in a file of its own.
+
+    Attributes:
+        name: of the camera.
+        stamps_ns: (N,) int64, strictly increasing.
+        paths: N files.
+        process: what is done to each image once it is decoded, e.g. rectification.
+    """
+
+    name: str
+    stamps_ns: NDArray[np.int64]
+    paths: Sequence[Path]
+    process: Callable[[Image], Image] | None = None
+
+    def read(self, index: int) -> Image | Fault:
+        """One image as 8 bit grey."""
+        path = self.paths[index]
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            return Fault("image_unreadable", f"{path}: {error.strerror}")
+        image = decode_grey(data, str(path))
+        return image if self.process is None or isinstance(image, Fault) else self.process(image)
+
+    def missing(self, index: int) -> Fault | None:
+        """Whether the file is there."""
+        path = self.paths[index]
+        return None if path.is_file() else Fault("image_unreadable", f"{path}: no such file")
+
+    def where(self, index: int) -> str:
+        """The file."""
+        return str(self.paths[index])
+
+
+def decode_grey(data: bytes, where: str) -> Image | Fault:
+    """Decode an image file as 8 bit grey; of 16 bits the upper 8 are kept.
 
     A damaged file is found before it is decoded: decoders fill the rows that they cannot read with
     anything, and complain on stderr.
 
+    Args:
+        data: bytes of the file.
+        where: it comes from, for the message.
+
     Returns:
-        (height, width) uint8, or a fault of kind `image_unreadable` or `image_wrong_size`.
+        (height, width) uint8, or a fault of kind `image_unreadable`.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        return Fault("image_unreadable", f"{path}: {error.strerror}")
     damage = find_damage(data)
     if damage is not None:
-        return Fault("image_unreadable", f"{path}: {damage}")
+        return Fault("image_unreadable", f"{where}: {damage}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error as error:
-        return Fault("image_unreadable", f"{path}: {error.err}")
+        return Fault("image_unreadable", f"{where}: {error.err}")
     if image is None:
-        return Fault("image_unreadable", f"{path}: not an image that OpenCV can read")
-    if image.shape != (height, width):
-        got = f"{image.shape[1]}x{image.shape[0]}"
-        return Fault("image_wrong_size", f"{path}: {got}, the calibration says {width}x{height}")
+        return Fault("image_unreadable", f"{where}: not an image that OpenCV can read")
     return image.astype(np.uint8, copy=False)
 
 

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.rows import Rows, parse
+from slam_graph.datasets.ordering import in_order
+from slam_graph.datasets.rows import Rows, count_rows, parse, read_rows, require_rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import ImuData
 
@@ -65,26 +66,15 @@ class ImuCleaner:
         candidates: NDArray[np.intp],
         where: Callable[[int], str],
     ) -> NDArray[np.intp]:
-        """The candidates without those that break the order of time.
-
-        Of two samples in the wrong order the second goes, unless it continues the samples before
-        them: then the first one had a stamp from the future, which must not block all that follow.
-        """
-        latest = np.iinfo(np.int64).min if self.latest_ns is None else self.latest_ns
+        """The candidates without those that break the order of time."""
         stamps = stamps_ns[candidates]
-        if np.all(stamps[1:] > stamps[:-1]) and not np.any(stamps[:1] <= latest):
-            return candidates
-        kept = []
-        times = stamps.tolist()
-        for k, (stamp, following) in enumerate(pairwise([*times, times[-1] + 1])):
-            if stamp <= latest or latest < following < stamp:
-                kind = "imu_duplicate" if stamp == latest else "imu_out_of_order"
-                sample = f"{where(int(candidates[k]))}: sample at {stamp}"
-                self.diagnostics.warn(kind, f"{sample} dropped, the one before it is at {latest}")
-                continue
-            latest = stamp
-            kept.append(k)
-        return candidates[kept]
+
+        def dropped(k: int, latest: int) -> None:
+            kind = "imu_duplicate" if stamps[k] == latest else "imu_out_of_order"
+            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]}"
+            self.diagnostics.warn(kind, f"{sample} dropped, not in the order of time")
+
+        return candidates[in_order(stamps, dropped, self.latest_ns)]
 
     def _report_gaps(self, stamps: NDArray[np.int64], where: Callable[[int], str]) -> None:
         if len(stamps) == 0:
@@ -110,6 +100,38 @@ def clean_blocks(
         cleaned = cleaner.clean(data, rows.where)
         if len(cleaned):
             yield cleaned
+
+
+@dataclass(frozen=True)
+class ImuFile:
+    """The samples of an IMU in a CSV file.
+
+    Attributes:
+        path: of the file.
+        parse: turns its rows into samples.
+    """
+
+    path: Path
+    parse: Callable[[Rows], ImuData]
+
+    def require(self) -> None:
+        """Refuse a file that cannot be read or has no samples."""
+        require_rows(self.path)
+
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned samples from `after_ns` on."""
+        blocks = ((rows, self.parse(rows)) for rows in read_rows(self.path))
+        return clean_blocks(blocks, diagnostics, after_ns)
+
+    def count(self) -> int:
+        """How many samples there are, before faulty ones are dropped."""
+        return count_rows(self.path)[0]
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        _, first, last = count_rows(self.path)
+        begin, end = self.parse(Rows(self.path, [first, last], [1, 1])).stamps_ns.tolist()
+        return begin, end
 
 
 def parse_imu_rows(rows: Rows) -> ImuData:

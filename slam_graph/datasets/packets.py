@@ -84,3 +84,10 @@ def packetize(
                 )
             previous_ns = now_ns
             yield Packet(imu, frame)
+
+
+def packetize_alone(frames: FrameStream) -> Iterator[Packet]:
+    """Packets of a recording without an IMU; the frames are closed at the end."""
+    with closing(frames):
+        for frame in frames:
+            yield Packet(ImuData.empty(), frame)

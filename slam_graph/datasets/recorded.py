@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from slam_graph.datasets.groundtruth import (
     read_groundtruth,
     resolve_groundtruth,
 )
-from slam_graph.datasets.packets import HISTORY_NS, FrameStream, packetize
+from slam_graph.datasets.packets import HISTORY_NS, FrameStream, packetize, packetize_alone
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import ImuData, Packet
@@ -49,12 +49,16 @@ class RecordedSequence(ABC):
     Attributes:
         name: of the recording.
         rig: its calibrated sensors.
+        has_imu: whether it has gyroscope and accelerometer; without them packets hold frames only.
         groundtruth_path: file or folder with the ground truth, or None.
+        own_groundtruth: gives the one of formats that keep it among their data, where there is no
+            file with it; None for all others.
         diagnostics: where faults are counted.
     """
 
     format: ClassVar[str]
     content: ClassVar[Literal["images", "tracks"]]
+    has_imu: bool = True
     rig: Rig
     diagnostics: Diagnostics
 
@@ -68,7 +72,12 @@ class RecordedSequence(ABC):
         self.name = name
         self.rig = rig
         self.groundtruth_path: Path | None = None
+        self.own_groundtruth: Callable[[], Trajectory] | None = None
         self.diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        rolling = [mounted.name for mounted in rig.cameras if mounted.rolling_shutter]
+        if rolling:
+            what = f"{name}: {', '.join(rolling)}: rows are taken as exposed at one time"
+            self.diagnostics.warn("rolling_shutter", f"{what}; expect errors in fast motion")
         if groundtruth_path is not None:
             self.groundtruth_path = resolve_groundtruth(groundtruth_path)
             check_groundtruth(self.groundtruth_path)
@@ -92,7 +101,7 @@ class RecordedSequence(ABC):
     @property
     def has_groundtruth(self) -> bool:
         """Whether `groundtruth()` gives one."""
-        return self.groundtruth_path is not None
+        return self.groundtruth_path is not None or self.own_groundtruth is not None
 
     def info(self) -> SequenceInfo:
         """What the sequence holds; without any frames the times are those of the IMU."""
@@ -120,6 +129,8 @@ class RecordedSequence(ABC):
                 up to one second before it. Without it, it carries all samples from the start.
             end_ns: last frame time to deliver.
         """
+        if not self.has_imu:
+            return packetize_alone(self.frames(start_ns, end_ns))
         after_ns = None if start_ns is None else start_ns - HISTORY_NS
         return packetize(
             self.frames(start_ns, end_ns),
@@ -135,9 +146,9 @@ class RecordedSequence(ABC):
 
     def groundtruth(self) -> Trajectory | None:
         """The true trajectory of the body, where the recording has one."""
-        if self.groundtruth_path is None:
-            return None
-        return read_groundtruth(self.groundtruth_path, self.diagnostics)
+        if self.groundtruth_path is not None:
+            return read_groundtruth(self.groundtruth_path, self.diagnostics)
+        return None if self.own_groundtruth is None else self.own_groundtruth()
 
     def initial_state(self) -> NavState | None:
         """The state at the start that comes with the data; None unless a format has one."""

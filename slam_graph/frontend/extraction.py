@@ -13,12 +13,17 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
+from slam_graph.sensors.camera import WIDE, Camera
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
 
 REST_FRAMES = 3
 """A cell that could not be filled is left alone for so many frames: it would hardly be now."""
+
+REACH = 2.75
+"""Features of wide lenses lie less than 70° off the axis. On the plane z = 1, where matches are
+tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, 33 at 80°."""
 
 MARGIN_PX = 4
 """Cells are cut out with this margin, so that scores at their edge see the pixels beyond."""
@@ -163,6 +168,29 @@ class CornerExtractor:
             if len(chosen) == count:
                 break
         return np.array(chosen, np.float32).reshape(-1, 2)
+
+
+def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | None:
+    """Where features of a camera may lie: as told, and where a wide lens can be used.
+
+    Args:
+        camera: its model.
+        path: image that is zero where no features are wanted, or None.
+        window_px: side of the window that is tracked. It stays inside what can be used: where a
+            lens shows nothing beyond, the rim is an edge that moves with the camera.
+
+    Returns:
+        (height, width), zero where no features may lie; None for no such place.
+
+    Raises:
+        ConfigError: if the image is not there, or does not fit the camera.
+    """
+    mask = None if path is None else read_mask(path, camera.width, camera.height)
+    if camera.distortion not in WIDE:
+        return mask
+    visible = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
+    inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)
+    return inside if mask is None else np.minimum(mask, inside)
 
 
 def read_mask(path: Path, width: int, height: int) -> Image:

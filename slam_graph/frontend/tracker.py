@@ -17,7 +17,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.association import LucasKanade
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.extraction import CornerExtractor, read_mask
+from slam_graph.frontend.extraction import CornerExtractor, camera_mask
 from slam_graph.frontend.outliers import fundamental_inliers
 from slam_graph.frontend.stereo import StereoMatcher
 from slam_graph.frontend.tracks import Image, Mask, Tracks
@@ -211,7 +211,7 @@ class KltTracker:
 
 
 def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
-    """One extractor per camera, with its mask."""
+    """One extractor per camera, with its mask: what is told, and what a wide lens cannot use."""
     if len(config.masks) > len(rig.cameras):
         raise ConfigError(
             f"frontend.masks lists {len(config.masks)} masks, "
@@ -221,7 +221,7 @@ def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
     extractors = []
     for rig_camera, path in zip(rig.cameras, masks, strict=True):
         width, height = rig_camera.camera.width, rig_camera.camera.height
-        mask = None if path is None else read_mask(path, width, height)
+        mask = camera_mask(rig_camera.camera, path, config.window_px)
         extractors.append(CornerExtractor(config, width, height, mask))
     return extractors
 

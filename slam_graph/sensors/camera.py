@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: pinhole projection with radial-tangential or equidistant distortion.
+"""Camera models: a pinhole with radial-tangential or fisheye distortion, and omnidirectional ones.
 
 A camera maps a point p = (x, y, z) of its frame (z forward) to a pixel in two steps: the
 normalised point m = (x/z, y/z), and the pixel u = K d(m) with the distortion d. All functions take
@@ -17,12 +17,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
+from slam_graph.sensors.omnidirectional import (
+    double_sphere,
+    double_sphere_by_parameters,
+    double_sphere_inverse,
+    unified,
+    unified_by_parameters,
+    unified_inverse,
+)
 
 FloatArray = NDArray[np.float64]
-Distortion = Literal["none", "radtan", "equidistant"]
+Distortion = Literal["none", "radtan", "equidistant", "mei", "double_sphere"]
 
-COEFFICIENTS: dict[Distortion, int] = {"none": 0, "radtan": 4, "equidistant": 4}
-"""How many coefficients each distortion model has: (k1, k2, p1, p2) and (k1, k2, k3, k4)."""
+COEFFICIENTS: dict[Distortion, int] = {
+    "none": 0,
+    "radtan": 4,
+    "equidistant": 4,
+    "mei": 5,
+    "double_sphere": 2,
+}
+"""How many coefficients each distortion model has: (k1, k2, p1, p2), (k1, k2, k3, k4),
+(ξ, k1, k2, p1, p2) and (ξ, α)."""
+
+WIDE: tuple[Distortion, ...] = ("equidistant", "mei", "double_sphere")
+"""Models of lenses that may see sideways and backwards."""
+
+WIDEST = 6.0
+"""Longest normalised point: 80° off the axis. What a lens sees beyond is left out, because it has
+no place on the plane z = 1 (or one too far away to calculate with)."""
+
+SEEN_TOLERANCE_PX = 1e-3
 
 UNDISTORT_ITERATIONS = 20
 UNDISTORT_EPSILON = 1e-10
@@ -37,7 +61,9 @@ class Camera:
         cx, cy: principal point in pixels; pixel (0, 0) is the centre of the top left pixel.
         distortion: name of the distortion model. `radtan` is Brown's radial-tangential model
             (OpenCV's, with k1, k2, p1, p2); `equidistant` is Kannala and Brandt's (OpenCV's
-            fisheye, with k1..k4).
+            fisheye, with k1..k4); `mei` is the unified model of Mei and Rives with
+            radial-tangential distortion (Kalibr's omni); `double_sphere` that of Usenko et al.
+            (Kalibr's ds). For the last two fx and fy are the generalised focal lengths.
         coefficients: of the distortion model.
         width, height: size of the image in pixels.
     """
@@ -88,6 +114,12 @@ class Camera:
             bent, jacobian = _radtan(normalized, *self.coefficients)
         elif self.distortion == "equidistant":
             bent, jacobian = _equidistant(normalized, np.array(self.coefficients))
+        elif self.distortion == "mei":
+            on_plane, lifted = unified(normalized, self.coefficients[0])
+            bent, bend = _radtan(on_plane, *self.coefficients[1:])
+            jacobian = bend @ lifted
+        elif self.distortion == "double_sphere":
+            bent, jacobian = double_sphere(normalized, *self.coefficients)
         else:
             bent, jacobian = normalized, np.broadcast_to(np.eye(2), (len(normalized), 2, 2))
         focal = np.array([self.fx, self.fy])
@@ -107,22 +139,27 @@ class Camera:
 
     def by_coefficients(self, normalized: FloatArray) -> FloatArray:
         """Derivatives (N, 2, n) of the pixels of normalised points by the distortion's."""
-        x, y = normalized[:, 0], normalized[:, 1]
-        r = np.hypot(x, y)
         if self.distortion == "radtan":
-            r2, xy = r * r, 2.0 * x * y
-            columns_x = [x * r2, x * r2 * r2, xy, r2 + 2.0 * x * x]
-            columns_y = [y * r2, y * r2 * r2, r2 + 2.0 * y * y, xy]
-            bent = np.stack([np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)], axis=1)
+            bent = _radtan_by_coefficients(normalized)
         elif self.distortion == "equidistant":
+            r = np.hypot(normalized[:, 0], normalized[:, 1])
             powers = np.arctan(r)[:, None] ** np.array([3, 5, 7, 9]) / np.maximum(r, 1e-9)[:, None]
             bent = normalized[:, :, None] * powers[:, None, :]
+        elif self.distortion == "mei":
+            on_plane, _ = unified(normalized, self.coefficients[0])
+            bend = _radtan(on_plane, *self.coefficients[1:])[1]
+            first = bend @ unified_by_parameters(normalized, self.coefficients[0])
+            bent = np.concatenate([first, _radtan_by_coefficients(on_plane)], axis=2)
+        elif self.distortion == "double_sphere":
+            bent = double_sphere_by_parameters(normalized, *self.coefficients)
         else:
             bent = np.zeros((len(normalized), 2, 0))
         return np.asarray(bent * np.array([[self.fx], [self.fy]]), dtype=np.float64)
 
     def undistort(self, pixels: FloatArray, near: FloatArray | None = None) -> FloatArray:
         """Normalised coordinates (N, 2) of pixels (N, 2): the inverse of `distort`.
+
+        Pixels that see nothing in front of the camera get NaN or any other point; see `visible`.
 
         Args:
             pixels: (N, 2).
@@ -133,7 +170,38 @@ class Camera:
         plain = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.distortion == "none":
             return plain
+        if self.distortion == "mei":
+            bend = Camera(1.0, 1.0, 0.0, 0.0, "radtan", self.coefficients[1:], 1, 1)
+            return unified_inverse(bend.undistort(plain), self.coefficients[0])
+        if self.distortion == "double_sphere":
+            return double_sphere_inverse(plain, *self.coefficients)
         return self._newton(plain, self._fixed_point(plain) if near is None else near)
+
+    def visible(
+        self, pixels: FloatArray, reach: float = WIDEST
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Normalised coordinates of pixels (N, 2), and which of them have any.
+
+        Args:
+            pixels: (N, 2).
+            reach: longest normalised point that counts, the tangent of the angle to the axis.
+
+        Returns:
+            normalized: (N, 2); zero where there is none.
+            usable: (N,) whether the pixel sees points so near to the axis.
+        """
+        with np.errstate(all="ignore"):
+            plane = self.undistort(pixels)
+            usable = np.linalg.norm(plane, axis=1) < reach
+            plane = np.where(usable[:, None], plane, 0.0)
+            error_px = np.linalg.norm(self.distort(plane)[0] - pixels, axis=1)
+        return plane, usable & (error_px < SEEN_TOLERANCE_PX)
+
+    def visible_mask(self, reach: float = WIDEST) -> NDArray[np.bool_]:
+        """Which pixels (height, width) see points with normalised coordinates up to `reach`."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+        return self.visible(pixels, reach)[1].reshape(self.height, self.width)
 
     def _fixed_point(self, bent: FloatArray) -> FloatArray:
         """OpenCV's solution, from which Newton's method converges."""
@@ -188,6 +256,15 @@ def _radtan(
     jacobian[:, 1, 0] = jacobian[:, 0, 1]
     jacobian[:, 1, 1] = radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x
     return bent, jacobian
+
+
+def _radtan_by_coefficients(m: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, 4) of Brown's model by k1, k2, p1, p2."""
+    x, y = m[:, 0], m[:, 1]
+    r2, xy = x * x + y * y, 2.0 * x * y
+    columns_x = [x * r2, x * r2 * r2, xy, r2 + 2.0 * x * x]
+    columns_y = [y * r2, y * r2 * r2, r2 + 2.0 * y * y, xy]
+    return np.stack([np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)], axis=1)
 
 
 def _equidistant(m: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,14 +19,24 @@ import gtsam
 import yaml
 
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration import read_camera, read_imu_noise
+from slam_graph.sensors.calibration import (
+    camera_entry,
+    has_rolling_shutter,
+    read_camera,
+    read_imu_noise,
+)
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 from slam_graph.sensors.yaml_source import YamlValue, read_yaml
 
 IMU_KEY = "imu0"
 
 
-def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | None = None) -> Rig:
+def read_kalibr(
+    path: Path,
+    imu_path: Path | None = None,
+    fallback: ImuNoise | None = None,
+    needs_imu: bool = True,
+) -> Rig:
     """Read a rig from a Kalibr camera chain.
 
     Args:
@@ -34,6 +44,8 @@ def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | N
         imu_path: Kalibr's ``imu.yaml``. Without it the noise is taken from the key ``imu0`` of the
             camera chain, else from a file ``imu.yaml`` beside it, else from `fallback`.
         fallback: noise to take if no file has any; default that of EuRoC's IMU.
+        needs_imu: whether the cameras must be calibrated to the IMU; otherwise a chain that does
+            not say where it is has the body frame of its first camera.
 
     Raises:
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
@@ -50,12 +62,12 @@ def read_kalibr(path: Path, imu_path: Path | None = None, fallback: ImuNoise | N
         )
     cameras: list[RigCamera] = []
     for index in sorted(entries):
-        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None))
+        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None, needs_imu))
     return Rig(tuple(cameras), _read_imu(path, chain, imu_path, fallback))
 
 
-def _read_camera(entry: YamlValue, previous: RigCamera | None) -> RigCamera:
-    body_T_camera = _body_T_camera(entry, previous)
+def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
+    body_T_camera = _body_T_camera(entry, previous, needs_imu)
     shift = entry.get("timeshift_cam_imu")
     name = entry.get("name")
     return RigCamera(
@@ -63,15 +75,18 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None) -> RigCamera:
         body_T_camera,
         0.0 if shift is None else shift.number(),
         entry.key if name is None else name.text(),
+        has_rolling_shutter(entry),
     )
 
 
-def _body_T_camera(entry: YamlValue, previous: RigCamera | None) -> gtsam.Pose3:
+def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
     direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
     if direct is not None:
         return direct.pose().inverse()
     if link is not None and previous is not None:
         return previous.body_T_camera.compose(link.pose().inverse())
+    if previous is None and not needs_imu:
+        return gtsam.Pose3()
     raise DataError(
         f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
         "from calibrating cameras and IMU together"
@@ -113,12 +128,14 @@ def write_kalibr(rig: Rig, path: Path) -> None:
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
     camera = mounted.camera
-    return {
+    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
+    return shutter | {
         "name": mounted.name,
-        "camera_model": "pinhole",
-        "intrinsics": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)],
-        "distortion_model": camera.distortion,
-        "distortion_coeffs": [float(value) for value in camera.coefficients],
+        "camera_model": model,
+        "intrinsics": intrinsics,
+        "distortion_model": distortion,
+        "distortion_coeffs": coefficients,
         "resolution": [int(camera.width), int(camera.height)],
         "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist(),
         "timeshift_cam_imu": float(mounted.time_offset_s),

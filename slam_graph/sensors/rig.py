@@ -48,12 +48,14 @@ class RigCamera:
         body_T_camera: pose of the camera in the body (IMU) frame.
         time_offset_s: t_imu = t_camera + time_offset_s (Kalibr's `timeshift_cam_imu`).
         name: of the camera in its data set, e.g. ``cam0``.
+        rolling_shutter: whether its rows are exposed one after the other; they are taken as one.
     """
 
     camera: Camera
     body_T_camera: gtsam.Pose3
     time_offset_s: float = 0.0
     name: str = ""
+    rolling_shutter: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam_graph.simulation.config import LandmarkConfig
 from slam_graph.simulation.motion import FloatArray, IntArray, Motion
-from slam_graph.simulation.views import View, normalized
+from slam_graph.simulation.views import View
 from slam_graph.simulation.world import World
 
 LOOK_PERIOD_S = 0.5
@@ -124,7 +124,7 @@ def _scatter(
 ) -> FloatArray:
     """Points (at most count, 3) in sight of a camera."""
     size = np.array([view.camera.width - 1, view.camera.height - 1])
-    plane, usable = normalized(view.camera, rng.uniform(0.0, 1.0, (count, 2)) * size)
+    plane, usable = view.camera.visible(rng.uniform(0.0, 1.0, (count, 2)) * size)
     rays, count = plane[usable], int(np.sum(usable))
     depth = rng.uniform(*config.ahead_depth_m, (count, 1))
     R, eye = view.pose(world_R_body, position)

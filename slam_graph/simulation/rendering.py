@@ -16,7 +16,6 @@ from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.config import ImageConfig, random_stream
 from slam_graph.simulation.motion import FloatArray, Motion
 from slam_graph.simulation.textures import Atlas, Grey
-from slam_graph.simulation.views import normalized
 from slam_graph.simulation.world import Panel, World
 
 NEAREST_M = 1e-3
@@ -114,7 +113,7 @@ class _RayCamera:
         self.width, self.height = camera.width, camera.height
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-        plane, self.lit = normalized(camera, pixels)
+        plane, self.lit = camera.visible(pixels)
         rays = np.column_stack([plane, np.ones(len(plane))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         self.rays = rays.astype(np.float32)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera import WIDEST, Camera
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.config import TrackConfig
 from slam_graph.simulation.motion import FloatArray
@@ -20,21 +20,6 @@ BoolArray = NDArray[np.bool_]
 
 OVERLAP_DEPTH_M = 4.0
 """At this depth it is looked whether two cameras see the same."""
-
-
-WIDEST = 6.0
-"""Longest normalised point: 80° off the axis. What a fisheye sees beyond is left out, because it
-has no place on the plane z = 1 (or one too far away to calculate with)."""
-
-
-def normalized(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised coordinates (N, 2) of pixels (N, 2), and which of them have any."""
-    with np.errstate(all="ignore"):
-        plane = camera.undistort(pixels)
-        usable = np.linalg.norm(plane, axis=1) < WIDEST
-        plane = np.where(usable[:, None], plane, 0.0)
-        usable &= np.linalg.norm(camera.distort(plane)[0] - pixels, axis=1) < 1e-3
-    return plane, usable
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +45,7 @@ class View:
     def of(mounted: RigCamera, config: TrackConfig) -> View:
         """The view of a camera of a rig."""
         camera, pose = mounted.camera, mounted.body_T_camera
-        plane, valid = normalized(camera, _border(camera))
+        plane, valid = camera.visible(_border(camera))
         reach = float(np.max(np.linalg.norm(plane[valid], axis=1), initial=0.0))
         reach = reach if valid.all() else WIDEST
         R, p = pose.rotation().matrix(), np.asarray(pose.translation())
@@ -143,7 +128,7 @@ def _points_before(view: View) -> FloatArray:
     u, v = np.meshgrid(
         np.linspace(20, camera.width - 21, 9), np.linspace(20, camera.height - 21, 7)
     )
-    plane, usable = normalized(camera, np.column_stack([u.ravel(), v.ravel()]))
+    plane, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
     rays = plane[usable]
     depth = min(OVERLAP_DEPTH_M, 0.9 * view.config.max_depth_m)
     in_camera = np.column_stack([rays, np.ones(len(rays))]) * depth
