@@ -5,9 +5,9 @@
     F(t, R) = Σ κ ‖R_j - R_i R_ij‖² + τ ‖t_j - t_i - R_i t_ij‖²  =  tr(X M Xᵀ),   X = [t | R]
 
 with X of shape d × (n + dn): the n translations, then the n rotations side by side. κ and τ are the
-isotropic noise that fits an information matrix best (Rosen, Carlone, Bandeira and Leonard 2019,
-"SE-Sync", equations 8 to 17 and appendix). Taken as the information of g2o, where the rotation in
-3D is that of the vector part of the quaternion.
+isotropic noise that fits an information matrix best, as SE-Sync reads g2o files (Rosen, Carlone,
+Bandeira and Leonard 2019). With isotropic information F is about χ² in 3D; in 2D its rotations
+count twice.
 """
 
 from __future__ import annotations

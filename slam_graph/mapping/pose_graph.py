@@ -134,7 +134,7 @@ class PoseGraph:
 
         Each (M,), as SE-Sync has them (`chordal_objective.py`).
         """
-        d, information = self.dimension, self.information
+        d, information = self.dimension, self.angle_information
         τ = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)
         if d == 2:
             return information[:, 2, 2], τ

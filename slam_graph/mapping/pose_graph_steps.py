@@ -61,7 +61,7 @@ def _gauss_newton(
     )
     nothing = NOTHING_PER_EDGE * len(cost.edges)
     for step in range(1, policy.max_steps + 1):
-        values, error = gtsam.Values(optimizer.values()), optimizer.error()  # its own do not last
+        values, error = gtsam.Values(optimizer.values()), optimizer.error()  # a view otherwise
         lower = _iterated(optimizer)
         if lower <= nothing or -ROUNDING * error <= error - lower <= policy.tolerance * error:
             return Minimum(poses_of(optimizer.values(), start.dimension), lower, step, True)
