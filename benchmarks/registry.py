@@ -14,6 +14,7 @@ from benchmarks import (
     mh01,
     monte_carlo,
     openvins_sim,
+    posegraphs,
     real_imu,
     speed,
     wheel,
@@ -30,4 +31,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **memory.BENCHMARKS,
     **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
+    **posegraphs.BENCHMARKS,
 }
