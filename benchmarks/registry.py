@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from benchmarks import (
     cost_over_time,
+    final_ba,
+    frontend,
     memory,
     mh01,
     monte_carlo,
     openvins_sim,
+    posegraphs,
     real_imu,
     speed,
     wheel,
@@ -25,7 +28,10 @@ BENCHMARKS: dict[str, Benchmark] = {
     **openvins_sim.BENCHMARKS,
     **monte_carlo.BENCHMARKS,
     **real_imu.BENCHMARKS,
+    **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,
+    **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
+    **posegraphs.BENCHMARKS,
 }

@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slam_graph.config import load_config
+from slam_graph.datasets.base import Sequence
 from slam_graph.datasets.registry import open_dataset
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import select
@@ -64,6 +65,8 @@ class Errors:
 class Run:
     """A run of the pipeline over a recording, as it ships and with its own progress counted.
 
+    The bundle adjustment at its end is left out unless it is asked for.
+
     Attributes:
         result: what it found out.
         truth: ground truth; every recording of a benchmark has one.
@@ -72,7 +75,7 @@ class Run:
 
     def __init__(
         self,
-        recording: Path | str,
+        recording: Path | str | Sequence,
         algorithm: str,
         cameras: int | None = None,
         groundtruth: Path | None = None,
@@ -84,7 +87,11 @@ class Run:
         config = load_config(
             None, overrides, algorithm=algorithm, cameras=cameras, duration_s=duration_s
         )
-        sequence = open_dataset(recording, cameras=cameras, groundtruth=groundtruth)
+        sequence = (
+            open_dataset(recording, cameras=cameras, groundtruth=groundtruth)
+            if isinstance(recording, Path | str)
+            else recording
+        )
         counter = _StateCounter()
         with threadpool_limits(limits=1, user_api="blas"):
             self.result = run(sequence, config, viewer=counter)

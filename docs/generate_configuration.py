@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.config import RunConfig, load_config
+from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
 
@@ -39,6 +40,16 @@ table itself. An unknown key, a value of the wrong type or outside its range is 
 schema, for editors that check YAML.
 """
 
+POSE_GRAPHS = """\
+## Pose graphs
+
+`slam-graph optimize` has settings of its own, for its `--config` and `--set`:
+
+```sh
+slam-graph optimize graph.g2o --set cost.robust=gnc --set gauss_newton.tolerance=1e-9
+```
+"""
+
 BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -47,6 +58,9 @@ def page() -> str:
     schema = RunConfig.model_json_schema()
     defaults = load_config().model_dump(mode="json")
     sections = [INTRODUCTION, *_sections(schema, schema["$defs"], defaults, "")]
+    schema = PoseGraphPolicy.model_json_schema()
+    defaults = PoseGraphPolicy().model_dump(mode="json")
+    sections += [POSE_GRAPHS, *_sections(schema, schema["$defs"], defaults, "")]
     return "\n".join(sections)
 
 

@@ -23,11 +23,16 @@ if TYPE_CHECKING:
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
+    from slam_graph.mapping.pose_graph_certificate import certify
+    from slam_graph.mapping.pose_graph_file import read_pose_graph
+    from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
+    from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
     from slam_graph.pipeline import RunResult, run
 
 __all__ = [
     "Estimator",
     "NavState",
+    "PoseGraphPolicy",
     "RunConfig",
     "RunResult",
     "SlamGraphError",
@@ -35,9 +40,12 @@ __all__ = [
     "__version__",
     "ape",
     "build_estimator",
+    "certify",
     "load_config",
     "open_dataset",
+    "optimize_pose_graph",
     "read_groundtruth",
+    "read_pose_graph",
     "rpe",
     "run",
 ]
@@ -45,15 +53,19 @@ __all__ = [
 _HOME = {
     "Estimator": "slam_graph.backend.estimator",
     "NavState": "slam_graph.geometry.trajectory",
+    "PoseGraphPolicy": "slam_graph.mapping.pose_graph_policy",
     "RunConfig": "slam_graph.config",
     "RunResult": "slam_graph.pipeline",
     "SlamGraphError": "slam_graph.errors",
     "Trajectory": "slam_graph.geometry.trajectory",
     "ape": "slam_graph.evaluation.ape",
     "build_estimator": "slam_graph.backend.build",
+    "certify": "slam_graph.mapping.pose_graph_certificate",
     "load_config": "slam_graph.config",
     "open_dataset": "slam_graph.datasets.registry",
+    "optimize_pose_graph": "slam_graph.mapping.pose_graph_optimization",
     "read_groundtruth": "slam_graph.datasets.groundtruth",
+    "read_pose_graph": "slam_graph.mapping.pose_graph_file",
     "rpe": "slam_graph.evaluation.rpe",
     "run": "slam_graph.pipeline",
 }

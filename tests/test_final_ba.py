@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -69,9 +70,7 @@ class Kept:
         self, causal: Trajectory, config: FinalBaConfig = DEFAULT, report: Any = None
     ) -> FinalBa:
         told = report or (lambda *_: None)
-        return adjust_recording(
-            self.log, causal, self.sequence.rig, BackendConfig(), config, told
-        )
+        return adjust_recording(self.log, causal, self.sequence.rig, BackendConfig(), config, told)
 
 
 Keep = Callable[[SimulatedSequence], Kept]
@@ -147,7 +146,7 @@ def test_pieces_cover_all_keyframes_and_overlap(keyframes: int) -> None:
     assert ranges[0][0] == 0
     assert ranges[-1][1] == keyframes
     assert all(stop - first <= 20 for first, stop in ranges)
-    assert all(a[1] - b[0] >= 6 for a, b in zip(ranges, ranges[1:], strict=False))
+    assert all(a[1] - b[0] >= 6 for a, b in pairwise(ranges))
 
 
 def test_outliers_and_frames_without_features_are_survived(keep: Keep) -> None:

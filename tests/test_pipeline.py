@@ -63,6 +63,9 @@ class Watcher:
     def advance(self, stamp_ns: int, initialized: bool) -> None:
         self.stamps.append(stamp_ns)
 
+    def adjusting(self, done: int, keyframes: int, steps: int) -> None:
+        assert 0 <= done < keyframes
+
 
 def test_the_same_seed_gives_the_same_trajectory_and_all_are_told() -> None:
     watcher = Watcher()

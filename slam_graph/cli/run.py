@@ -4,10 +4,7 @@
 
 from __future__ import annotations
 
-import logging
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,6 +20,7 @@ from slam_graph.cli.data import (
     Sources,
     sources_from,
 )
+from slam_graph.cli.logs import collected_log, remove_if_empty
 from slam_graph.cli.output import echo_json
 from slam_graph.cli.progress import ProgressBar
 from slam_graph.cli.summary import echo_summary
@@ -93,7 +91,7 @@ def run(
     if final_ba is not None:
         said["final_ba"] = {"enabled": final_ba}
     settings = load_config(config, set_ or (), **said, seed=seed)
-    with _collected_log() as log:
+    with collected_log() as log:
         sequence = open_dataset(
             data,
             format=format_,
@@ -135,7 +133,7 @@ def _execute(
         write_text(files[-1], log)
         link_latest(folder)
     except BaseException:
-        _remove_if_empty(folder)
+        remove_if_empty(folder)
         raise
     return result, folder, files
 
@@ -161,44 +159,6 @@ def _progress(
     if settings.duration_s is not None:
         end_ns = min(end_ns, start_ns + round(settings.duration_s * 1e9))
     return ProgressBar(start_ns, end_ns)
-
-
-class _ListHandler(logging.Handler):
-    """Keeps formatted lines."""
-
-    def __init__(self, lines: list[str]) -> None:
-        super().__init__(logging.INFO)
-        self.lines = lines
-        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(self.format(record) + "\n")
-
-
-@contextmanager
-def _collected_log() -> Iterator[list[str]]:
-    """Collect what the package logs, and show its warnings on stderr."""
-    lines: list[str] = []
-    shown = logging.StreamHandler(sys.stderr)
-    shown.addFilter(lambda record: record.levelno == logging.WARNING)
-    shown.setFormatter(logging.Formatter("warning: %(message)s"))
-    logger = logging.getLogger("slam_graph")
-    logger.setLevel(logging.INFO)
-    handlers = (shown, _ListHandler(lines))
-    for handler in handlers:
-        logger.addHandler(handler)
-    try:
-        yield lines
-    finally:
-        for handler in handlers:
-            logger.removeHandler(handler)
-
-
-def _remove_if_empty(folder: Path) -> None:
-    """Take away the folder of a run that wrote nothing, and that of its data set if it is empty."""
-    for empty in (folder, folder.parent):
-        if empty.is_dir() and not any(empty.iterdir()):
-            empty.rmdir()
 
 
 def _leave(result: RunResult) -> None:

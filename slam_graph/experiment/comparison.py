@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from slam_graph.config import RunConfig
-from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import RecordTask, RunTask, Task
+from slam_graph.mapping.final_ba_config import FinalBaConfig
 
 WITHOUT_FEJ = "_no_fej"
 """What the name of an algorithm without first-estimates Jacobians ends in."""

@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pose-graph optimisation: known optima, laws of the cost and the gauge, awkward graphs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pose_graphs import distance, laps, turns, with_false_loops
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.mapping.chordal_objective import chordal_cost
+from slam_graph.mapping.pose_graph import Poses
+from slam_graph.mapping.pose_graph_cost import chi2_table
+from slam_graph.mapping.pose_graph_covariance import marginal_covariances
+from slam_graph.mapping.pose_graph_file import read_pose_graph
+from slam_graph.mapping.pose_graph_initialization import along_tree, initialize
+from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
+from slam_graph.mapping.pose_graph_policy import (
+    PoseGraphCostPolicy,
+    PoseGraphPolicy,
+    PoseGraphStepsPolicy,
+)
+
+METHODS = ("gauss_newton", "levenberg_marquardt", "dogleg", "isam2")
+
+GTSAM_OPTIMA = {
+    "sphere2500": 675.70096,
+    "parking-garage": 0.6341924,
+    "M3500": 68.957439,
+    "intel": 22.502117,
+    "MIT": 20.603474,
+}
+
+
+def by(method: str = "gauss_newton", **cost: object) -> PoseGraphPolicy:
+    return PoseGraphPolicy(
+        cost=PoseGraphCostPolicy(**cost), gauss_newton=PoseGraphStepsPolicy(method=method)
+    )
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", GTSAM_OPTIMA)
+def test_known_optima_are_reached_from_own_estimates(data_dir: Path, name: str) -> None:
+    graph = read_pose_graph(data_dir / "posegraphs" / f"{name}.g2o")
+    solution = optimize_pose_graph(replace(graph, estimates=None))
+    table = chi2_table(graph, solution.poses)
+    assert table["gtsam_error"] == pytest.approx(GTSAM_OPTIMA[name], rel=1e-6)
+    assert solution.minimum.converged
+
+
+@pytest.mark.data
+def test_chi2_in_the_convention_of_g2o(data_dir: Path) -> None:
+    path = data_dir / "posegraphs" / "sphere2500.g2o"
+    angle = optimize_pose_graph(read_pose_graph(path))
+    assert chi2_table(angle.graph, angle.poses)["gtsam_chi2"] == pytest.approx(1351.40, abs=0.01)
+    quaternion = optimize_pose_graph(read_pose_graph(path, rotation_information="quaternion"))
+    table = chi2_table(quaternion.graph, quaternion.poses)
+    assert table["g2o_chi2"] == pytest.approx(727.15, abs=0.01)
+    # Near the optimum half the angle is the vector part of the quaternion, to third order.
+    assert table["gtsam_chi2"] == pytest.approx(table["g2o_chi2"], rel=1e-3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("how", ["chordal", "odometry", "lago"])
+def test_without_noise_every_initialization_is_the_truth(dimension: int, how: str) -> None:
+    graph, truth = laps(dimension)
+    if how == "lago" and dimension == 3:
+        with pytest.raises(DataError, match="2D"):
+            initialize(graph, how, Diagnostics())
+        return
+    assert distance(initialize(graph, how, Diagnostics()), truth) < 1e-7
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("method", METHODS)
+def test_all_methods_find_the_same_minimum(dimension: int, method: str) -> None:
+    graph, _ = laps(dimension, 0.05)
+    best = chi2_table(graph, optimize_pose_graph(graph).poses)["gtsam_error"]
+    solution = optimize_pose_graph(graph, by(method, initialization="odometry"))
+    assert chi2_table(graph, solution.poses)["gtsam_error"] == pytest.approx(best, rel=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_cost_does_not_see_where_the_world_is(dimension: int) -> None:
+    graph, truth = laps(dimension, 0.1)
+    rng = np.random.default_rng(1)
+    p = graph.tangent_size - dimension
+    world = Poses(turns(rng.uniform(-2, 2, (1, p))), rng.uniform(-9, 9, (1, dimension)))
+    index = np.zeros(len(truth), int)
+    moved = world.select(index).compose(truth)
+    here, there = chi2_table(graph, truth), chi2_table(graph, moved)
+    assert here == pytest.approx(there, rel=1e-9)
+    first = optimize_pose_graph(graph).poses
+    second = optimize_pose_graph(replace(graph, estimates=moved)).poses
+    assert distance(world.select(index).compose(first), second) < 1e-4
+
+
+def test_a_noiseless_graph_costs_nothing_and_converges() -> None:
+    graph, truth = laps(3)
+    diagnostics = Diagnostics()
+    solution = optimize_pose_graph(graph, by(initialization="odometry"), diagnostics)
+    assert distance(solution.poses, truth) < 1e-7
+    assert chordal_cost(graph, solution.poses) < 1e-9
+    assert solution.minimum.converged
+    assert not diagnostics.counts
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_parts_and_lonely_poses_are_held_where_they_are(method: str) -> None:
+    graph, truth = laps(2, 0.02)
+    apart = np.r_[np.arange(30), np.arange(200, 230), 999]
+    inside = (graph.edges < 30).all(axis=1) | (graph.edges >= 30).all(axis=1)
+    lonely = Poses(
+        np.concatenate([truth.rotations, np.eye(2)[None]]),
+        np.concatenate([truth.translations, [[7.0, 7.0]]]),
+    )
+    cut = replace(graph, keys=apart, estimates=lonely).keep_edges(inside)
+    assert len(cut.anchors) == 3
+    solution = optimize_pose_graph(cut, by(method))
+    np.testing.assert_allclose(solution.poses.translations[60], [7.0, 7.0], atol=1e-12)
+    assert distance(solution.poses, lonely) < 1.0
+    covariances = marginal_covariances(solution)
+    assert np.abs(covariances[[0, 30, 60]]).max() == 0.0
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_covariance_of_odometry_is_that_of_its_edge(dimension: int) -> None:
+    graph, _ = laps(dimension, 0.05, poses=3, lap=3)
+    solution = optimize_pose_graph(graph)
+    covariances = marginal_covariances(solution)
+    np.testing.assert_allclose(covariances[1], np.linalg.inv(graph.information[0]), atol=1e-9)
+    assert np.linalg.eigvalsh(covariances[2] - covariances[1]).min() > -1e-6
+
+
+def test_an_estimate_that_the_file_lacks_is_an_error() -> None:
+    graph, _ = laps(2)
+    with pytest.raises(DataError, match="no estimates"):
+        optimize_pose_graph(replace(graph, estimates=None), by(initialization="file"))
+
+
+def test_lago_gives_way_where_a_link_is_missing() -> None:
+    graph, _ = laps(2, 0.02)
+    diagnostics = Diagnostics()
+    broken = graph.keep_edges(np.arange(len(graph.edges)) != 10)
+    poses = initialize(broken, "lago", diagnostics)
+    assert dict(diagnostics.counts) == {"pose_graph_not_initialized": 1}
+    assert distance(poses, along_tree(broken)) == 0.0
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_gnc_rejects_exactly_the_false_loops(dimension: int, share: float) -> None:
+    graph, _ = laps(dimension, 0.02, poses=200)
+    clean = optimize_pose_graph(graph, by(robust="gnc"))
+    loops = np.count_nonzero(~graph.is_odometry)
+    false = with_false_loops(graph, round(share / (1 - share) * loops))
+    diagnostics = Diagnostics()
+    solution = optimize_pose_graph(false, by(robust="gnc"), diagnostics)
+    expected = np.arange(len(false.edges)) < len(graph.edges)
+    # A true edge may be beyond its 99 % quantile; one in a hundred is.
+    assert not solution.weights[~expected].any()
+    assert np.mean(solution.weights[expected] == 1.0) > 0.98
+    assert np.array_equal(solution.weights[expected], clean.weights)
+    assert distance(solution.poses, clean.poses) < 1e-4
+    assert diagnostics.counts["pose_graph_edge_rejected"] == np.sum(solution.weights < 0.5)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman_mcclure", "dcs", "truncated"])
+def test_a_robust_loss_holds_false_loops_back(loss: str) -> None:
+    graph, _ = laps(2, 0.02)
+    clean = optimize_pose_graph(graph).poses
+    false = with_false_loops(graph, 3)
+    plain = optimize_pose_graph(false).poses
+    solution = optimize_pose_graph(false, by(robust=loss))
+    assert distance(solution.poses, clean) < 0.3 * distance(plain, clean)
+    assert solution.weights[-3:].max() < 0.5 < np.median(solution.weights[:-3])
+
+
+def test_gnc_keeps_a_graph_without_loops_as_it_is() -> None:
+    graph, _ = laps(3, 0.02)
+    odometry = graph.keep_edges(graph.is_odometry)
+    solution = optimize_pose_graph(odometry, by(robust="gnc"))
+    assert distance(solution.poses, along_tree(odometry)) < 1e-6
+    assert solution.weights.all()
+
+
+def test_gnc_keeps_suspected_odometry_connected() -> None:
+    graph, _ = laps(2, 0.02)
+    shifted = graph.measured.translations.copy()
+    shifted[10] += 5.0
+    broken = replace(graph, measured=Poses(graph.measured.rotations, shifted))
+    clean = optimize_pose_graph(graph).poses
+    solution = optimize_pose_graph(broken, by(robust="gnc", trust_odometry=False))
+    assert solution.weights[10] < 0.5
+    assert distance(solution.poses, clean) < 0.1
