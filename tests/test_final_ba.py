@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The bundle adjustment over a whole recording: exact, complete, in one world, and never in the way."""
+"""The bundle adjustment over a whole recording: exact, complete, never in the way."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -166,7 +166,7 @@ def test_frames_belong_to_the_keyframe_next_to_them() -> None:
 
 @pytest.fixture(scope="module")
 def demo() -> RunResult:
-    return run(open_dataset("demo"), load_config(overrides=["duration_s=15"]))
+    return run(open_dataset("demo"), load_config(overrides=["duration_s=9"]))
 
 
 @pytest.mark.data
@@ -188,7 +188,7 @@ def test_files_and_metrics_hold_it_and_the_causal_estimate_is_as_without(
     demo: RunResult, tmp_path: Path
 ) -> None:
     off = run(
-        open_dataset("demo"), load_config(overrides=["duration_s=15", "final_ba.enabled=false"])
+        open_dataset("demo"), load_config(overrides=["duration_s=9", "final_ba.enabled=false"])
     )
     for result, folder in ((demo, tmp_path / "on"), (off, tmp_path / "off")):
         result.save(folder)
