@@ -48,6 +48,9 @@ MIN_KEYFRAMES = 3
 """A feature must be seen in so many of them."""
 MAX_START_ERROR_PX = 30.0
 """Features with a larger root mean square reprojection error do not begin, in units of σ."""
+RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+LEAST_SIGMA = 0.1
+"""Learned noise of the tracks is not less than this part of what the settings say, nor more."""
 MAX_LAMBDA = 1e5
 """Damping beyond which there is no step that lowers the cost."""
 
@@ -69,6 +72,7 @@ class Adjustment:
         cost_after: without outliers, at the minimum.
         imu_residual: root mean square of the whitened residuals of the IMU.
         pixel_residual: of the observations.
+        pixel_sigma: standard deviation of these that was assumed at the end.
     """
 
     states: list[NavState]
@@ -80,6 +84,7 @@ class Adjustment:
     cost_after: float
     imu_residual: float
     pixel_residual: float
+    pixel_sigma: float
 
 
 class BundleAdjustment:
@@ -117,6 +122,7 @@ class BundleAdjustment:
         self._candidates = seen.subset(chosen)
         self._everything = piece.seen.subset(chosen)
         self._iterations = 0
+        self._sigma_px = backend.noise.pixel_sigma
         self._values = gtsam.Values()
         for k, state in enumerate(states):
             self._values.insert(X(k), state.world_T_body)
@@ -135,6 +141,8 @@ class BundleAdjustment:
         before, *_ = self._minimize(obs, points[good], np.ones(len(obs)))
         points, good = self._triangulated(self._candidates)
         points, good = self._known(self._candidates, points, good)
+        if self._config.learn_pixel_sigma:
+            self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances)
         dynamics = 15 * max(len(self._piece.keyframes) - 1, 1)
@@ -148,6 +156,7 @@ class BundleAdjustment:
             cost,
             float(np.sqrt(2.0 * imu_cost / dynamics)),
             float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
+            self._sigma_px,
         )
 
     # --- features --------------------------------------------------------------------------------
@@ -167,6 +176,23 @@ class BundleAdjustment:
         points[known] = stacked_points(self._values, obs.ids[known].tolist())
         return points, good | known
 
+    def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
+        """The noise of the tracks from the median of what the minimum leaves of them.
+
+        A few outliers do not change a median. The length of a residual of standard deviation σ on
+        both axes has the median 1.1774 σ (Rayleigh); the minimum has taken away as many degrees of
+        freedom as there are unknowns.
+        """
+        at = Geometry(*stacked_poses(self._values, obs.frames), points)
+        lengths = np.linalg.norm(self._projection.residuals(obs, at)[0], axis=1)
+        unknowns = 3 * len(obs.ids) + 6 * len(self._piece.keyframes)
+        freedom = 2 * len(obs) - unknowns
+        if freedom <= unknowns:
+            return
+        sigma_px = float(np.median(lengths)) / RAYLEIGH_MEDIAN * math.sqrt(2 * len(obs) / freedom)
+        said_px = self._backend.noise.pixel_sigma
+        self._sigma_px = float(np.clip(sigma_px, LEAST_SIGMA * said_px, said_px))
+
     def _without_outliers(
         self, good: BoolArray, points: FloatArray
     ) -> tuple[Observations, FloatArray, FloatArray]:
@@ -180,7 +206,7 @@ class BundleAdjustment:
         if not self._config.average_frames:
             seen = obs
         own = Geometry(*stacked_poses(self._values, obs.frames), points)
-        limit_px = self._config.outlier_width * self._backend.noise.pixel_sigma
+        limit_px = self._config.outlier_width * self._sigma_px
         if self._config.average_frames:
             matrices = np.array([s.world_T_body.matrix() for s in self._states()])
             theirs = Geometry(matrices[:, :3, :3], matrices[:, :3, 3], points)
@@ -240,7 +266,7 @@ class BundleAdjustment:
         gating = self._backend.gating.model_copy(update=robust)
         factors: list[gtsam.NonlinearFactor] = []
         for variance in np.unique(variances).tolist():  # one for each size of a group
-            noise = pixel_noise(self._backend.noise.pixel_sigma * math.sqrt(variance), gating)
+            noise = pixel_noise(self._sigma_px * math.sqrt(variance), gating)
             factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return factors
 

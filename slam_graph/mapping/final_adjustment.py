@@ -58,6 +58,7 @@ class FinalBaSummary:
         cost_after: without outliers, at the minimum.
         imu_residual: root mean square of the whitened residuals of the IMU.
         pixel_residual: of the observations.
+        pixel_sigma: standard deviation of these that was assumed at the end.
         seconds: wall time.
         cpu_seconds: time of this process on its processors.
     """
@@ -72,6 +73,7 @@ class FinalBaSummary:
     cost_after: float
     imu_residual: float
     pixel_residual: float
+    pixel_sigma: float
     seconds: float
     cpu_seconds: float
 
@@ -262,6 +264,7 @@ def _summary(solved: list[Adjustment], frames: int, began: tuple[float, float]) 
         sum(part.cost_after for part in solved),
         rms("imu_residual", "keyframes"),
         rms("pixel_residual", "observations"),
+        rms("pixel_sigma", "observations"),
         time.perf_counter() - began[0],
         time.process_time() - began[1],
     )

@@ -24,6 +24,8 @@ class FinalBaConfig(Settings):
     """How many features each keyframe is given at least, if it has as many: the longest tracks."""
     average_frames: bool = True
     """Whether the frames between keyframes add what they saw to the observations of these."""
+    learn_pixel_sigma: bool = True
+    """Whether the noise of the tracks may be less than noise.pixel_sigma, if residuals say so."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
     """Loss that weighs down large reprojection residuals."""
     robust_width: float = Field(2.45, gt=0)
