@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flight import FISHEYE, rig
 
 from slam_graph.backend.config import BackendConfig
 from slam_graph.config import load_config
@@ -24,6 +25,8 @@ from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.output.run_result import RunResult
 from slam_graph.pipeline import run
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.kalibr import write_kalibr
 from slam_graph.simulation.config import (
     FlightConfig,
     LandmarkConfig,
@@ -35,6 +38,7 @@ from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
 
 LENGTH_S = 8.0
+DOUBLE_SPHERE = Camera(160.0, 160.0, 254.0, 256.0, "double_sphere", (-0.2, 0.55), 512, 512)
 DEFAULT = FinalBaConfig()
 
 
@@ -115,6 +119,14 @@ def test_without_noise_every_frame_is_exact(keep: Keep, cameras: int) -> None:
     assert worst_m(kept.truth, result.trajectory) < 1e-3
     assert ape(kept.truth, result.trajectory, "angle_deg").statistics.max < 0.02
     assert result.summary.cost_after < 1e-3 * result.summary.cost_before
+
+
+@pytest.mark.parametrize("camera", [FISHEYE, DOUBLE_SPHERE], ids=lambda c: c.distortion)
+def test_wide_lenses_are_solved(keep: Keep, camera: Camera, tmp_path: Path) -> None:
+    write_kalibr(rig(2, camera), tmp_path / "wide.yaml")
+    kept = keep(flight(2, calibration=tmp_path / "wide.yaml"))
+    result = kept.adjusted(disturbed(kept.truth))
+    assert worst_m(kept.truth, result.trajectory) < 2e-3
 
 
 def test_the_time_before_the_start_is_covered(keep: Keep) -> None:

@@ -33,7 +33,7 @@ from slam_graph.geometry.trajectory import NavState
 from slam_graph.mapping.averaged_observations import averaged, nearest_keyframe
 from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.keyframe_states import fill_in
-from slam_graph.mapping.keyframes import Piece, longest_tracks, views
+from slam_graph.mapping.keyframes import Piece, longest_tracks, views, with_native_cameras
 from slam_graph.sensors.rig import Rig
 
 FloatArray = NDArray[np.float64]
@@ -112,8 +112,8 @@ class BundleAdjustment:
     ) -> None:
         self._piece = piece
         self._anchor = anchor
-        self._rig = rig
-        self._projection = RigProjection(rig)
+        self._rig = with_native_cameras(rig)
+        self._projection = RigProjection(self._rig)
         self._backend = backend
         self._config = config
         self._report = report

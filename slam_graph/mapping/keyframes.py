@@ -15,7 +15,7 @@ from slam_graph.backend.tracks import Observations
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors.rig import Rig, RigCamera
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
@@ -113,12 +113,34 @@ def _over_the_flight(noise: FloatArray, still: BoolArray) -> FloatArray:
     return noise
 
 
+def with_native_cameras(rig: Rig) -> Rig:
+    """The rig with a pinhole in place of each camera that GTSAM has no model of.
+
+    Its focal lengths are those of the camera near its axis.
+    """
+    return replace(rig, cameras=tuple(_native(mounted) for mounted in rig.cameras))
+
+
+def _native(mounted: RigCamera) -> RigCamera:
+    camera = mounted.camera
+    if camera.distortion != "double_sphere":
+        return mounted
+    middle, slope = (values[0] for values in camera.distort(np.zeros((1, 2))))
+    fx, fy, cx, cy = slope[0, 0], slope[1, 1], middle[0], middle[1]
+    pinhole = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion="none", coefficients=())
+    return replace(mounted, camera=pinhole)
+
+
 def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig) -> FloatArray:
-    """Pixels and normalised coordinates (N, 4), the latter by the calibration of a rig."""
-    if rig is not log.rig:
-        for c, mounted in enumerate(rig.cameras):
-            rows = cameras == c
+    """Pixels of native cameras, and normalised coordinates by the calibration of a rig (N, 4)."""
+    for c, (mounted, native) in enumerate(
+        zip(rig.cameras, with_native_cameras(rig).cameras, strict=True)
+    ):
+        rows = cameras == c
+        if rig is not log.rig:
             points[rows, 2:] = mounted.camera.undistort(points[rows, :2])
+        if native is not mounted:
+            points[rows, :2] = native.camera.distort(points[rows, 2:])[0]
     return points
 
 
