@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
-from slam_graph.mapping.final_adjustment import Report, adjust_recording
+from slam_graph.mapping.final_adjustment import Report, UndeterminedError, adjust_recording
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
@@ -83,6 +83,8 @@ class FinalStage:
             try:
                 self._recording.close()
                 self._solve(self._log, report)
+            except UndeterminedError as reason:
+                logger.info("no final bundle adjustment: %s", reason)
             except (RuntimeError, np.linalg.LinAlgError, SlamGraphError, OSError) as error:
                 self._give_up(error)
             except KeyboardInterrupt:

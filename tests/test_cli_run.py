@@ -19,7 +19,6 @@ COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 
 FILES = {
     "trajectory.tum",
-    "trajectory_smoothed.tum",
     "states.csv",
     "map.ply",
     "timing.csv",

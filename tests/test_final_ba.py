@@ -15,6 +15,7 @@ from flight import FISHEYE, rig
 from slam_graph.backend.config import BackendConfig
 from slam_graph.config import load_config
 from slam_graph.datasets.registry import open_dataset
+from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import select
 from slam_graph.geometry.trajectory import Trajectory
@@ -233,10 +234,20 @@ def test_a_failure_leaves_the_causal_estimate_and_one_warning(
     assert result.warnings["final_ba_failed"] == 1
 
 
-def test_what_the_images_do_not_confirm_is_refused() -> None:
-    """A run that ends in its first moments, with nothing to triangulate."""
-    config = load_config(overrides=["duration_s=1.1", "min_coverage=0"])
+def test_where_there_is_nothing_to_gain_the_causal_estimate_is_left_alone() -> None:
+    """The recording stands still at first, so that nothing can be triangulated."""
+    config = load_config(overrides=["duration_s=1.5", "min_coverage=0"])
     result = run(open_dataset("demo"), config)
     assert result.status == "ok"
+    assert len(result.history) > 0
     assert result.final_ba is None
-    assert result.warnings["final_ba_failed"] == 1
+    assert "final_ba_failed" not in result.warnings
+
+
+def test_what_the_images_do_not_confirm_is_refused(
+    keep: Keep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = keep(flight(2, sigma=1.0))
+    monkeypatch.setattr(final_adjustment, "MAX_PIXEL_RESIDUAL", 0.5)
+    with pytest.raises(EstimationError, match="do not fit"):
+        kept.adjusted(kept.truth)

@@ -43,6 +43,10 @@ Report = Callable[[int, int, int], None]
 """Is told after each step: keyframes that are done, all keyframes, steps so far."""
 
 
+class UndeterminedError(EstimationError):
+    """Images say too little to improve on the causal estimate: nothing moved, or nothing is seen."""
+
+
 @dataclass(frozen=True, slots=True)
 class FinalBaSummary:
     """What the bundle adjustment over a whole recording took.
@@ -111,12 +115,13 @@ def adjust_recording(
         report: is told of each step.
 
     Raises:
-        EstimationError: if the recording does not determine a trajectory.
+        UndeterminedError: if there is nothing to gain.
+        EstimationError: if the minimum does not fit the images.
     """
     began = (time.perf_counter(), time.process_time())
     keyframes = log.keyframes
     if len(keyframes) < MIN_KEYFRAMES or len(causal) == 0:
-        raise EstimationError(f"{len(keyframes)} keyframes determine nothing")
+        raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
     params = preintegration_params(rig.imu, backend.noise.gravity)
     causal = led_back(log, causal, rig, backend, config, report)
     states: list[NavState] = []
@@ -218,7 +223,7 @@ def _reaches(causal: Trajectory, stamps_ns: IntArray) -> bool:
 def _check(solved: Adjustment) -> None:
     """Refuse what the images do not confirm."""
     if solved.observations < MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
-        raise EstimationError(
+        raise UndeterminedError(
             f"{solved.observations} observations in {solved.keyframes} keyframes are too few"
         )
     if not solved.pixel_residual < MAX_PIXEL_RESIDUAL:
