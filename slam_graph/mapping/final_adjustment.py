@@ -44,7 +44,7 @@ Report = Callable[[int, int, int], None]
 
 
 class UndeterminedError(EstimationError):
-    """Images say too little to improve on the causal estimate: nothing moved, or nothing is seen."""
+    """Images say too little to improve on the causal estimate: nothing moves, or is seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,8 @@ def adjust_recording(
         raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
     params = preintegration_params(rig.imu, backend.noise.gravity)
     causal = led_back(log, causal, rig, backend, config, report)
-    states: list[NavState] = []
+    parts: list[Trajectory] = []  # final, as compact arrays
+    states: list[NavState] = []  # of the last piece, from its anchor on
     solved: list[Adjustment] = []
     for first, stop in pieces(len(keyframes), config):
         piece = read_piece(log, keyframes[first:stop], rig, backend.zero_velocity)
@@ -133,18 +134,23 @@ def adjust_recording(
             continue
         start = states_at(causal, stamps_ns, piece.imu, params)
         anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
+        begin = 0
         if states:
             anchor = min(config.overlap_keyframes // 2, len(stamps_ns) - 1)
-            states = states[: bisect_left(states, stamps_ns[anchor], key=_stamp_ns) + 1]
-            start = laid_on(start, start[anchor], states.pop())
+            begin = int(piece.keyframes[anchor])
+            joint = bisect_left(states, stamps_ns[anchor], key=_stamp_ns)
+            parts.append(_trajectory(states[:joint]))
+            start = laid_on(start, start[anchor], states[joint])
         steps = sum(part.iterations for part in solved)
         told = _told_of_all(report, first, len(keyframes), steps)
-        solved.append(BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve())
-        _check(solved[-1])
-        states += solved[-1].states[piece.keyframes[anchor] if states else 0 :]
+        adjusted = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+        _check(adjusted)
+        states = adjusted.states[begin:]
+        solved.append(replace(adjusted, states=[]))
     if not solved:
         raise EstimationError("the causal estimate reaches none of the keyframes")
-    return FinalBa(_trajectory(states), _summary(solved, len(states), began))
+    trajectory = _joined([*parts, _trajectory(states)])
+    return FinalBa(trajectory, _summary(solved, len(trajectory), began))
 
 
 def led_back(
@@ -174,7 +180,7 @@ def led_back(
         solved = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
         _check(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
-        causal = _joined(_trajectory(earlier), causal)
+        causal = _joined([_trajectory(earlier), causal])
     return causal
 
 
@@ -239,12 +245,10 @@ def _trajectory(states: list[NavState]) -> Trajectory:
     return history.trajectory()
 
 
-def _joined(before: Trajectory, after: Trajectory) -> Trajectory:
-    """Two trajectories with velocities and biases, one after the other."""
+def _joined(parts: list[Trajectory]) -> Trajectory:
+    """Trajectories with velocities and biases, one after the other."""
     names = ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases", "accel_biases")
-    return Trajectory(
-        *(np.concatenate([getattr(before, name), getattr(after, name)]) for name in names)
-    )
+    return Trajectory(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _summary(solved: list[Adjustment], frames: int, began: tuple[float, float]) -> FinalBaSummary:
