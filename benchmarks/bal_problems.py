@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.mapping.bal_cost import moved
-from slam_graph.mapping.bal_problem import CAMERA_DIM, BalEstimates, BalProblem, FloatArray
+from slam_graph.mapping.bal_problem import CAMERA_DIM, BalEstimates, BalProblem, BoolArray
 from slam_graph.mapping.bal_projection import project
 
 HALF_IMAGE_PX = (640.0, 480.0)
@@ -74,7 +74,9 @@ def _truth(cameras: int, points: int, rng: np.random.Generator) -> BalEstimates:
     inwards = np.stack([np.cross(up, outwards), up, outwards], axis=1)  # looks along -z
     rotations = Rotation.from_rotvec(rng.normal(0.0, 0.1, (cameras, 3))).as_matrix() @ inwards
     translations = -np.einsum("cij,cj->ci", rotations, centres)
-    intrinsics = np.array([FOCAL_PX, -0.05, 0.01]) + rng.normal(0, (20.0, 0.01, 0.002), (cameras, 3))
+    intrinsics = np.array([FOCAL_PX, -0.05, 0.01]) + rng.normal(
+        0, (20.0, 0.01, 0.002), (cameras, 3)
+    )
     around, radius = rng.uniform(0, 2 * np.pi, points), rng.uniform(0.8, 1.0, points)
     cloud = np.stack(
         [np.cos(around) * radius, np.sin(around) * radius, rng.uniform(-1.0, 1.0, points)], axis=1
@@ -82,8 +84,9 @@ def _truth(cameras: int, points: int, rng: np.random.Generator) -> BalEstimates:
     return BalEstimates(rotations, translations, intrinsics, POINTS_RADIUS * cloud)
 
 
-def _facing(truth: BalEstimates) -> FloatArray:
+def _facing(truth: BalEstimates) -> BoolArray:
     """(C, P) whether a camera is on the outer side of a point."""
     side = truth.points[:, :2] / np.linalg.norm(truth.points[:, :2], axis=1)[:, None]
     reach = np.sum(side * truth.points[:, :2], axis=1)
-    return np.asarray(truth.centres()[:, :2] @ side.T > reach)
+    facing: BoolArray = truth.centres()[:, :2] @ side.T > reach
+    return facing

@@ -8,6 +8,7 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 from __future__ import annotations
 
 from benchmarks import (
+    bal,
     cost_over_time,
     memory,
     mh01,
@@ -30,4 +31,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **memory.BENCHMARKS,
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
+    **bal.BENCHMARKS,
 }

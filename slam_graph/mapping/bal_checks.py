@@ -50,7 +50,7 @@ def _first_of_pair(problem: BalProblem, diagnostics: Diagnostics) -> IntArray:
             f"{problem.name}: observation {row}: point {problem.point[row]} in camera "
             f"{problem.camera[row]} again; left out",
         )
-    return first.astype(np.int64)
+    return np.asarray(first, dtype=np.int64)
 
 
 def _in_front(problem: BalProblem, diagnostics: Diagnostics) -> BoolArray:

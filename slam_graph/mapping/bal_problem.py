@@ -48,7 +48,7 @@ class BalEstimates:
 
     def centres(self) -> FloatArray:
         """(C, 3) centres of the cameras in the world."""
-        return -np.einsum("cji,cj->ci", self.rotations, self.translations)
+        return np.asarray(-np.einsum("cji,cj->ci", self.rotations, self.translations))
 
     def select(self, cameras: IntArray, points: IntArray) -> BalEstimates:
         """Only some cameras and points."""
@@ -61,14 +61,17 @@ class BalEstimates:
 
     def updated(self, cameras: IntArray, points: IntArray, new: BalEstimates) -> BalEstimates:
         """With new values of some cameras and points."""
-        merged = [a.copy() for a in (self.rotations, self.translations, self.intrinsics)]
-        for old, value in zip(
-            merged, (new.rotations, new.translations, new.intrinsics), strict=True
-        ):
-            old[cameras] = value
-        everywhere = self.points.copy()
-        everywhere[points] = new.points
-        return BalEstimates(*merged, everywhere)
+        merged = BalEstimates(
+            self.rotations.copy(),
+            self.translations.copy(),
+            self.intrinsics.copy(),
+            self.points.copy(),
+        )
+        merged.rotations[cameras] = new.rotations
+        merged.translations[cameras] = new.translations
+        merged.intrinsics[cameras] = new.intrinsics
+        merged.points[points] = new.points
+        return merged
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -88,4 +88,4 @@ def _turned(estimates: BalEstimates, camera: IntArray, point: IntArray) -> Float
     """(3, N) R X of each observation."""
     X = estimates.points[point].T
     R = estimates.rotations[camera].transpose(1, 2, 0)
-    return R[:, 0] * X[0] + R[:, 1] * X[1] + R[:, 2] * X[2]
+    return np.asarray(R[:, 0] * X[0] + R[:, 1] * X[1] + R[:, 2] * X[2])

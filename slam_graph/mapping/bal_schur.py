@@ -147,9 +147,7 @@ def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[CommonPo
         yield CommonPoints(first, second, others.astype(np.int32), bounds)
 
 
-def normal_equations(
-    cost: BalCost, estimates: BalEstimates, fixed: Structure
-) -> NormalEquations:
+def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -> NormalEquations:
     """Linearise a cost."""
     linear, part = cost.linearized(estimates), cost.part
     by_camera, by_point = linear.by_camera, linear.by_point
@@ -189,7 +187,12 @@ def damped_step(
     b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
 
     S = E.T @ _reduced(cost, fixed, equations, B) @ E
-    g = E.T @ (equations.g_c - _per_camera(cost, np.einsum("nki,nk->ni", B, b_p[problem.point]))).ravel()
+    g = (
+        E.T
+        @ (
+            equations.g_c - _per_camera(cost, np.einsum("nki,nk->ni", B, b_p[problem.point]))
+        ).ravel()
+    )
     D_c = _positive(E.T @ np.diagonal(equations.U, axis1=1, axis2=2).ravel())
     δ, along_gauge = _solved(S, g, D_c, E.T @ equations.gauge, damping)
 
@@ -204,7 +207,7 @@ def damped_step(
 def _reduced(
     cost: BalCost, fixed: Structure, equations: NormalEquations, B: FloatArray
 ) -> FloatArray:
-    """(9 C, 9 C) S; only the blocks on and above the diagonal and their mirror images differ from 0."""
+    """(9 C, 9 C) S, both triangles of it."""
     C = cost.part.problem.cameras
     S = np.zeros((C, CAMERA_DIM, C, CAMERA_DIM))
     for i, pairs in enumerate(fixed.pairs):
