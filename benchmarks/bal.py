@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import process_time
 
@@ -52,8 +53,8 @@ def beside_gtsam(data: Path) -> Outcome:
     solvers: dict[str, Callable[[], float]] = {
         "ours": lambda: adjust_bundle(problem).minimum.cost,
         **{
-            f"gtsam_{ordering}{'_priors' if priors else ''}": lambda o=ordering, p=priors: by_gtsam(
-                problem, o, p
+            f"gtsam_{ordering}{'_priors' if priors else ''}": partial(
+                by_gtsam, problem, ordering, priors
             )
             for ordering in ORDERINGS
             for priors in (False, True)
@@ -77,8 +78,8 @@ def beside_gtsam(data: Path) -> Outcome:
         [
             f"{problem.cameras} cameras, {problem.points} points, {len(problem.camera)} "
             f"observations; CPU time, the shortest of {REPETITIONS} turns each, from arrays in "
-            "memory to the optimum; GTSAM's is that of its fastest ordering, with or without priors "
-            "on the gauge"
+            "memory to the optimum; GTSAM's is that of its fastest ordering, with or without priors on "
+            "the gauge"
         ],
     )
 
@@ -90,8 +91,9 @@ def by_gtsam(problem: BalProblem, ordering: str, priors: bool) -> float:
     start = problem.estimates
     for c in range(problem.cameras):
         R, t = UPSIDE_DOWN @ start.rotations[c], UPSIDE_DOWN @ start.translations[c]
+        f, k1, k2 = start.intrinsics[c]
         world_T_camera = gtsam.Pose3(gtsam.Rot3(R), t).inverse()
-        calibration = gtsam.Cal3Bundler(*start.intrinsics[c], 0.0, 0.0)
+        calibration = gtsam.Cal3Bundler(f, k1, k2, 0.0, 0.0)
         values.insert(c, gtsam.PinholeCameraCal3Bundler(world_T_camera, calibration))
     for j, point in enumerate(start.points):
         values.insert(first + j, point)

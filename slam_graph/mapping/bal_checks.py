@@ -55,8 +55,7 @@ def _first_of_pair(problem: BalProblem, diagnostics: Diagnostics) -> IntArray:
 
 def _in_front(problem: BalProblem, diagnostics: Diagnostics) -> BoolArray:
     """(N,) whether the point of each observation is in front of its camera."""
-    with np.errstate(all="ignore"):
-        pixels, depths = project(problem.estimates, problem.camera, problem.point)
+    pixels, depths = project(problem.estimates, problem.camera, problem.point)
     good = (depths > 0) & np.isfinite(pixels).all(axis=1)
     for row in np.flatnonzero(~good):
         diagnostics.warn(

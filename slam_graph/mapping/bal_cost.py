@@ -42,8 +42,8 @@ class BalCost:
 
     def __call__(self, estimates: BalEstimates) -> float:
         """The cost; infinite where a point has no pixel."""
+        errors = reprojection_errors(self.part.problem, estimates)
         with np.errstate(all="ignore"):
-            errors = reprojection_errors(self.part.problem, estimates)
             cost = float(np.sum(robust_loss(errors, self.policy.loss)))
         return cost if np.isfinite(cost) else np.inf
 
@@ -75,9 +75,10 @@ def first_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
 
 
 def reprojection_errors(problem: BalProblem, estimates: BalEstimates) -> FloatArray:
-    """(N,) lengths of the residuals in pixels."""
+    """(N,) lengths of the residuals in pixels; not finite where a point has no pixel."""
     pixels, _ = project(estimates, problem.camera, problem.point)
-    return np.asarray(np.linalg.norm(pixels - problem.pixels, axis=1), dtype=np.float64)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.linalg.norm(pixels - problem.pixels, axis=1), dtype=np.float64)
 
 
 def moved(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) -> BalEstimates:

@@ -22,6 +22,8 @@ from slam_graph.mapping.bal_problem import CAMERA_DIM, BalEstimates, BalProblem,
 BZIP2_MAGIC = b"BZh"
 HEADER = 3
 OBSERVATION = 4
+LARGEST = 1e100
+"""Greatest magnitude of a number: squares must be finite."""
 LONGEST_HEADER = 200
 """Bytes among which the first line ends, if the file is of this format."""
 
@@ -72,9 +74,9 @@ def read_bal(path: Path | str) -> BalProblem:
             f"{_where(path, text, expected)}: {len(numbers) - expected} numbers more than the "
             "header promises"
         )
-    bad = np.flatnonzero(~np.isfinite(numbers))
+    bad = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
     if len(bad):
-        raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite")
+        raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite, or too large")
     seen, by_camera, by_point = np.split(
         numbers[HEADER:], np.cumsum([OBSERVATION * observations, CAMERA_DIM * cameras])
     )

@@ -37,15 +37,16 @@ def project(
         point: (N,) indices of points.
 
     Returns:
-        pixels: (N, 2).
+        pixels: (N, 2); not finite for a point in the plane of the camera.
         depths: (N,) along the optical axis; negative behind the camera.
     """
     P = _turned(estimates, camera, point) + estimates.translations[camera].T
     f, k1, k2 = estimates.intrinsics[camera].T
-    u, v = -P[:2] / P[2]
-    q = u * u + v * v
-    scale = f * (1.0 + q * (k1 + q * k2))
-    return np.stack([scale * u, scale * v], axis=1), -P[2]
+    with np.errstate(all="ignore"):
+        u, v = -P[:2] / P[2]
+        q = u * u + v * v
+        scale = f * (1.0 + q * (k1 + q * k2))
+        return np.stack([scale * u, scale * v], axis=1), -P[2]
 
 
 def linearize(

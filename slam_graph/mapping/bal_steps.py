@@ -64,9 +64,9 @@ def minimize(
             converged = value <= nothing or (free and predicted <= enough)
             damping, growth = damping * growth, 2.0 * growth
     if not converged:
+        still = "no step lowers the cost" if damping >= MOST_DAMPING else "the cost still falls"
         diagnostics.warn(
-            "bal_not_converged",
-            f"{cost.part.problem.name}: the cost still falls after {step} steps",
+            "bal_not_converged", f"{cost.part.problem.name}: {still} after {step} steps"
         )
     return BalMinimum(estimates, start_cost, value, step, rejected, converged)
 

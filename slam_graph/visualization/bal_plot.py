@@ -54,10 +54,10 @@ def plot_bundle(
         scene.set(xlim=(-reach, reach), ylim=(-reach, reach))
     scene.set_aspect("equal", adjustable="box")
     scene.set_title("points and cameras", fontsize="medium")
-    largest = max(1.0, *(float(errors.max()) for errors in errors_px.values()))
-    smallest = min(float(np.quantile(errors, 0.01)) for errors in errors_px.values())
-    bins = np.geomspace(min(max(smallest, SMALLEST_PX), 0.1), largest, 80)
-    for stage, errors in errors_px.items():
+    shown = {stage: errors[np.isfinite(errors)] for stage, errors in errors_px.items()}
+    bounds = np.concatenate([np.quantile(errors, (0.01, 1.0)) for errors in shown.values()])
+    bins = np.geomspace(np.clip(bounds.min(), SMALLEST_PX, 0.1), max(bounds.max(), 1.0), 80)
+    for stage, errors in shown.items():
         histogram.hist(errors, bins=bins, histtype="step", label=stage)
     histogram.set(xscale="log", xlabel="reprojection error [px]", ylabel="observations")
     histogram.legend()
