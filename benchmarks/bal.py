@@ -78,8 +78,8 @@ def beside_gtsam(data: Path) -> Outcome:
         [
             f"{problem.cameras} cameras, {problem.points} points, {len(problem.camera)} "
             f"observations; CPU time, the shortest of {REPETITIONS} turns each, from arrays in "
-            "memory to the optimum; GTSAM's is that of its fastest ordering, with or without priors on "
-            "the gauge"
+            "memory to the optimum; GTSAM's is the shortest of three orderings, with and without "
+            "priors on the gauge"
         ],
     )
 

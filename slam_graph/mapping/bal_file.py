@@ -121,9 +121,9 @@ def _numbers(path: Path, text: str) -> FloatArray:
 
 def _header(path: Path, text: str, numbers: FloatArray) -> tuple[int, int, int]:
     """Numbers of cameras, points and observations."""
-    counts = numbers[:HEADER]
+    counts, line = numbers[:HEADER], text.lstrip().split("\n", 1)[0]
     whole = np.isfinite(counts) & (counts >= 0) & (counts == np.floor(counts)) & (counts < 2**53)
-    if len(counts) < HEADER or not whole.all():
+    if len(line.split()) != HEADER or not whole.all():
         raise DataError(
             f"{_where(path, text, 0)}: expected three whole numbers: cameras points observations"
         )

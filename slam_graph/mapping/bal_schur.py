@@ -33,8 +33,8 @@ from slam_graph.mapping.bal_problem import (
 
 RowArray = NDArray[np.int32]
 
-MOST_CAMERA_VARIABLES = 20_000
-"""Beyond this the reduced system, which is dense, needs more than 3 GB."""
+MOST_CAMERAS = 1_800
+"""Beyond this the reduced system, which is dense, needs more than 2 GB, and twice that to solve."""
 MOST_PAIRS = 100_000_000
 """Beyond this the table of pairs of observations needs more than 1 GB."""
 
@@ -113,13 +113,13 @@ def structure(cost: BalCost) -> Structure:
     Raises:
         EstimationError: if the problem is too large for a dense reduced system.
     """
-    problem, n = cost.part.problem, cost.variables.shape[1]
+    problem = cost.part.problem
     views = np.bincount(problem.point)
     pairs = int(np.sum(views * (views + 1) // 2))
-    if n > MOST_CAMERA_VARIABLES or pairs > MOST_PAIRS:
+    if problem.cameras > MOST_CAMERAS or pairs > MOST_PAIRS:
         raise EstimationError(
-            f"{problem.name}: too large: {problem.cameras} cameras with {n} variables and {pairs} "
-            f"pairs of observations; the most are {MOST_CAMERA_VARIABLES} and {MOST_PAIRS}"
+            f"{problem.name}: too large: {problem.cameras} cameras and {pairs} pairs of "
+            f"observations of the same point; the most are {MOST_CAMERAS} and {MOST_PAIRS}"
         )
     N = len(problem.point)
     where = (problem.point, np.arange(N))
@@ -186,7 +186,9 @@ def damped_step(
     B = K @ equations.by_camera
     b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
 
-    S = E.T @ _reduced(cost, fixed, equations, B) @ E
+    S = _reduced(cost, fixed, equations, B)
+    if E.shape[1] < len(S):
+        S = E.T @ S @ E
     g = (
         E.T
         @ (
@@ -233,14 +235,16 @@ def _solved(
     """The increment of the variables of the cameras, and the cost of its part along the gauge.
 
     Solved in variables of unit information. The gauge's directions, made orthonormal, get an
-    information of 1 where they had none.
+    information of 1 where they had none. `S` is overwritten.
     """
     scale = 1.0 / np.sqrt(D)
     N, _ = np.linalg.qr(gauge / scale[:, None])
-    A = scale[:, None] * S * scale
-    A.flat[:: len(A) + 1] += damping
-    A += N @ N.T
-    scaled = -cho_solve(cho_factor(A, overwrite_a=True, check_finite=False), scale * g)
+    S *= scale[:, None]  # in its place: it may be large
+    S *= scale
+    S.flat[:: len(S) + 1] += damping
+    S += N @ N.T
+    factor = cho_factor(S, lower=True, overwrite_a=True, check_finite=False)
+    scaled = -cho_solve(factor, scale * g, check_finite=False)
     return scale * scaled, float(np.sum((N.T @ scaled) ** 2))
 
 
