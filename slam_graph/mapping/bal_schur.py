@@ -34,7 +34,7 @@ from slam_graph.mapping.bal_problem import (
 RowArray = NDArray[np.int32]
 
 MOST_CAMERAS = 1_800
-"""Beyond this the reduced system, which is dense, needs more than 2 GB, and twice that to solve."""
+"""Beyond this the reduced system, which is dense, needs more than 2 GB, and nearly three times that to solve."""
 MOST_PAIRS = 100_000_000
 """Beyond this the table of pairs of observations needs more than 1 GB."""
 
@@ -243,7 +243,7 @@ def _solved(
     S *= scale
     S.flat[:: len(S) + 1] += damping
     S += N @ N.T
-    factor = cho_factor(S, lower=True, overwrite_a=True, check_finite=False)
+    factor = cho_factor(S.T, lower=True, overwrite_a=True, check_finite=False)
     scaled = -cho_solve(factor, scale * g, check_finite=False)
     return scale * scaled, float(np.sum((N.T @ scaled) ** 2))
 
