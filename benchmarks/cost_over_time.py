@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
 from benchmarks.metric import TIMING_TOLERANCE, Metric, info
-from benchmarks.suite import PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
+from benchmarks.suite import GROWING, PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
 from slam_graph.experiment.comparison import Comparison
 from slam_graph.experiment.figures import draw
 from slam_graph.experiment.results import Series, read_series
@@ -33,8 +33,6 @@ CAMERAS = 2
 FLIGHT = ("rate_hz=10", "tracks.features=25", "flight.hover_s=0")
 
 FLAT_BAR = 1.2
-GROWING = (*UNBOUNDED, "isam2")
-"""Algorithms that keep every feature, or every state too: they are shown, and have no bar."""
 RECOGNISED = "tracks.keep_ids=true"
 
 

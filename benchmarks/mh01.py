@@ -18,7 +18,7 @@ RECORDING = "euroc/MH_01_easy_17s"
 
 START_BAR_S = 3.0
 ATE_BARS_M = {
-    1: {"msckf": 0.02, "swf": 0.02},
+    1: {"msckf": 0.01, "swf": 0.02},
     2: {"msckf": 0.01, "swf": 0.02, "okvis": 0.01},
 }
 """For each number of cameras; an algorithm without a bar is only shown."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.metric import Metric, info
 from benchmarks.running import Errors, Run, clipped, within
-from benchmarks.suite import PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
+from benchmarks.suite import GROWING, PEERS, RECURSIVE, Benchmark, Outcome
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.evaluation.consistency import nees
 
@@ -66,7 +66,7 @@ def measure(data: Path, cameras: int) -> Outcome:
     ours: dict[str, Quality] = {}
     theirs: Quality | None = None
     for name in (*RECURSIVE, *PEERS):
-        clip_s = CLIP_S if name in UNBOUNDED else None
+        clip_s = CLIP_S if name in GROWING else None
         given = ["backend.initialization.mode=given"]
         run = Run(folder, name, cameras, overrides=given, duration_s=clip_s)
         errors = run.errors("none")

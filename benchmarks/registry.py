@@ -10,6 +10,7 @@ from __future__ import annotations
 from benchmarks import (
     bal,
     cost_over_time,
+    frontend,
     memory,
     mh01,
     monte_carlo,
@@ -29,6 +30,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **real_imu.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,
+    **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,

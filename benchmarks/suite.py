@@ -24,7 +24,10 @@ PEERS = ("fixed_lag_isam2", "fixed_lag_batch", "isam2")
 """GTSAM's smoothers behind the same interface."""
 
 UNBOUNDED = ("ekf", "iekf")
-"""Algorithms whose cost of a step grows with the map: on long recordings they run on a clip."""
+"""Algorithms of the engine that keep every feature."""
+
+GROWING = (*UNBOUNDED, "isam2")
+"""All whose cost of a step grows where features come back: there they run on a clip."""
 
 
 @dataclass(slots=True)

@@ -105,6 +105,9 @@ class RunConfig(Settings):
     """Seed of all random numbers."""
     min_coverage: float = Field(default=0.5, ge=0, le=1)
     """Smallest part of the time asked for that the estimate must cover for a run to succeed."""
+    overlap: bool = True
+    """Whether the front end tracks the next frame in a thread while the back end works on this one;
+    the results are the same."""
     frontend: FrontendConfig = FrontendConfig()
     """From images to features."""
     backend: BackendConfig = BackendConfig()

@@ -5,19 +5,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Protocol
 
 from slam_graph.backend.build import build_estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.base import Sequence
 from slam_graph.errors import DataError
+from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
 from slam_graph.output.run_result import RunResult
-from slam_graph.output.timing import Stopwatch, milliseconds
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
+from slam_graph.tracking import Tracking
 from slam_graph.visualization.viewer import NullViewer, Viewer
 
 __all__ = ["Progress", "RunResult", "run"]
@@ -87,14 +88,15 @@ def run(
     estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
 
+    tracking = Tracking(_packets(sequence, result), frontend, config.overlap)
     with (
         outcome(result, estimator, sequence.diagnostics),
         _watched(viewer, result),
         interrupts_between_frames() as frame_done,
+        closing(tracking.run()) as packets,
     ):
-        for packet, clock in _packets(sequence, result):
-            features = frontend.track(packet.frame)
-            clock.lap("frontend", milliseconds(frontend.frame_stats))
+        for tracked in packets:
+            packet, features, clock = tracked.packet, tracked.features, tracked.clock
             start.apply(estimator, packet.frame.stamp_ns, result)
             estimator.add_imu(packet.imu)
             state = estimate(estimator, features)
@@ -103,13 +105,14 @@ def run(
                 result.steps.append(features.stamp_ns, estimator.costs, estimator.columns)
             result.innovations.append(features.stamp_ns, estimator.innovations)
             ids, points = estimator.landmarks()
+            tracking.tell(Feedback.of(state, estimator.rejected, ids, points))
             if state is not None:
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
             if state is not None and estimator.calibration is not None:
                 result.calibration.append(estimator.calibration)
-            result.count_frame(features.stamp_ns, clock.milliseconds, frontend.frame_stats)
+            result.count_frame(features.stamp_ns, clock.milliseconds, tracked.frame_stats)
             recorder.write(packet.imu, features)
             progress.advance(features.stamp_ns, estimator.initialized)
             viewer.show(packet.frame, features, state, points)
@@ -140,20 +143,15 @@ def _open(sequence: Sequence, config: RunConfig) -> RunResult:
     return RunResult(info, config, rig, start_ns, end_ns, truth=sequence.groundtruth())
 
 
-def _packets(sequence: Sequence, result: RunResult) -> Iterator[tuple[Packet, Stopwatch]]:
-    """The packets that are asked for, each with a watch that has timed its reading."""
+def _packets(sequence: Sequence, result: RunResult) -> Iterator[Packet]:
+    """The packets that are asked for."""
     packets = sequence.packets(
         result.start_ns if result.config.start_s > 0 else None,
         result.end_ns if result.config.duration_s is not None else None,
     )
     count = len(result.rig.cameras)
-    while True:
-        clock = Stopwatch()
-        packet = next(packets, None)
-        if packet is None:
-            return
-        clock.lap("read")
-        yield Packet(packet.imu, _first_cameras(packet.frame, count)), clock
+    for packet in packets:
+        yield Packet(packet.imu, _first_cameras(packet.frame, count))
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:

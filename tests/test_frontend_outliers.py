@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the epipolar checks, on random scenes."""
 
+from typing import Literal
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,14 +11,17 @@ from numpy.typing import NDArray
 
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.outliers import (
+    direction_inliers,
     eight_point,
     epipolar_distance,
     essential_matrix,
     fundamental_inliers,
+    map_inliers,
     triangulated_depths,
 )
 
 FOCAL_PX = 450.0
+Method = Literal["fundamental", "essential", "magsac", "gyroscope"]
 B_T_A = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.05, -0.1, 0.02])), [0.2, -0.05, 0.1])
 
 
@@ -69,19 +74,59 @@ def test_eight_points_give_the_essential_matrix_up_to_scale() -> None:
     assert min(np.linalg.norm(F - E), np.linalg.norm(F + E)) < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_outliers_are_found_among_noisy_matches(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def noisy_scene(
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Matches (200, 2) in a and b, with the indices of the 50 that are wrong."""
     m_a, m_b, _ = scene(rng, 200)
     m_b += rng.normal(scale=0.2 / FOCAL_PX, size=m_b.shape)
     wrong = rng.permutation(200)[:50]
     m_b[wrong] += rng.uniform(-40, 40, (50, 2)) / FOCAL_PX
+    return m_a, m_b, wrong
+
+
+@pytest.mark.parametrize("method", ["fundamental", "essential", "magsac", "gyroscope"])
+@pytest.mark.parametrize("seed", range(5))
+def test_outliers_are_found_among_noisy_matches(seed: int, method: Method) -> None:
+    m_a, m_b, wrong = noisy_scene(np.random.default_rng(seed))
+    config = FrontendConfig(outliers=method)
+
+    def found() -> NDArray[np.bool_]:
+        if method != "gyroscope":
+            return fundamental_inliers(m_a, m_b, FOCAL_PX, config)
+        R = B_T_A.rotation().matrix()
+        return direction_inliers(m_a, m_b, R, FOCAL_PX, config, np.random.default_rng(seed))
+
     true_distance_px = epipolar_distance(essential_matrix(B_T_A), m_a, m_b) * FOCAL_PX
-    inlier = fundamental_inliers(m_a, m_b, FOCAL_PX, FrontendConfig())
+    inlier = found()
     right = np.setdiff1d(np.arange(200), wrong)
     assert np.mean(inlier[right]) > 0.97
     assert not np.any(inlier[true_distance_px > 3.0])
-    np.testing.assert_array_equal(inlier, fundamental_inliers(m_a, m_b, FOCAL_PX, FrontendConfig()))
+    np.testing.assert_array_equal(inlier, found())
+
+
+def test_with_the_rotation_known_the_majority_may_be_wrong() -> None:
+    rng = np.random.default_rng(6)
+    m_a, m_b, _ = scene(rng, 200)
+    m_b[:120] = m_a[:120] + rng.uniform(-20, 20, (120, 2)) / FOCAL_PX
+    R = B_T_A.rotation().matrix()
+    inlier = direction_inliers(m_a, m_b, R, FOCAL_PX, FrontendConfig(), rng)
+    assert np.mean(inlier[120:]) > 0.97
+    distance_px = epipolar_distance(essential_matrix(B_T_A), m_a, m_b) * FOCAL_PX
+    assert not np.any(inlier[distance_px > 3.0])
+
+
+def test_observations_that_do_not_fit_the_map_are_found() -> None:
+    rng = np.random.default_rng(7)
+    points = rng.uniform([-2, -2, 2], [2, 2, 8], (100, 3))
+    in_b = np.asarray(B_T_A.transformFrom(points.T)).T
+    m = in_b[:, :2] / in_b[:, 2:] + rng.normal(scale=0.3 / FOCAL_PX, size=(100, 2))
+    m[:20] += 10.0 / FOCAL_PX
+    guess = B_T_A.retract(np.full(6, 0.01))
+    config = FrontendConfig(map_check_px=2.0)
+    fits = map_inliers(points, m, guess, FOCAL_PX, config)
+    np.testing.assert_array_equal(fits, np.arange(100) >= 20)
+    assert np.all(map_inliers(points[:5], m[:5], guess, FOCAL_PX, config))
 
 
 def test_a_still_camera_and_few_points_reject_nothing() -> None:

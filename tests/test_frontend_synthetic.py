@@ -8,80 +8,44 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from images import (
+    BASELINE_M,
+    CAMERA,
+    CONFIG,
+    FOCAL_PX,
+    HEIGHT,
+    MONO,
+    STEREO,
+    WIDTH,
+    Image,
+    Spline,
+    common,
+    feed,
+    painted,
+    rotation,
+    shift,
+    transfer,
+    view,
+)
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from scipy import ndimage
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.frontend.base import Frontend
 from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.detectors import DETECTORS
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera
 
-Image = NDArray[np.uint8]
-WIDTH, HEIGHT, FOCAL_PX, BASELINE_M = 480, 320, 300.0, 0.1
-CAMERA = Camera(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, "none", (), WIDTH, HEIGHT)
-MONO = Rig((RigCamera(CAMERA, gtsam.Pose3(), name="left"),))
-STEREO = Rig(
-    (
-        RigCamera(CAMERA, gtsam.Pose3(), name="left"),
-        RigCamera(CAMERA, gtsam.Pose3(gtsam.Rot3(), [BASELINE_M, 0, 0]), name="right"),
-    )
-)
-CONFIG = FrontendConfig(features=120, grid=(6, 4))
-
-
-Spline = NDArray[np.float64]
-
 
 @pytest.fixture(scope="module")
 def texture() -> Spline:
-    """A smooth random texture, larger than the images, as coefficients of a cubic spline."""
-    rng = np.random.default_rng(3)
-    smooth = ndimage.gaussian_filter(rng.normal(size=(HEIGHT + 200, WIDTH + 200)), 3.0)
-    return ndimage.spline_filter(np.clip(128 + 45 * smooth / np.std(smooth), 5, 250))
+    return painted()
 
 
-def view(texture: Spline, H: NDArray[np.float64] | None = None) -> Image:
-    """The image in which the point of the texture's middle part at p appears at H(p).
-
-    Interpolated by splines, because OpenCV's warps round positions to 1/32 px and more.
-    """
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-    source = pixels if H is None else transfer(np.linalg.inv(H), pixels)
-    values = ndimage.map_coordinates(texture, source[:, ::-1].T + 100, order=3, prefilter=False)
-    return np.rint(values.clip(0, 255)).astype(np.uint8).reshape(HEIGHT, WIDTH)
-
-
-def shift(du: float, dv: float) -> NDArray[np.float64]:
-    return np.array([[1, 0, du], [0, 1, dv], [0, 0, 1.0]])
-
-
-def rotation(angles_rad: list[float]) -> NDArray[np.float64]:
-    """The homography of a pure rotation of the camera."""
-    return CAMERA.K @ gtsam.Rot3.Expmap(np.array(angles_rad)).matrix() @ np.linalg.inv(CAMERA.K)
-
-
-def transfer(H: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    return cv2.perspectiveTransform(pixels[:, None], H)[:, 0]
-
-
-def common(
-    a: FeatureObservations, b: FeatureObservations
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
-    return in_a, in_b
-
-
-def feed(frontend: Frontend, *images: tuple[Image | None, ...]) -> list[FeatureFrame]:
-    return [frontend.track(CameraFrame(k, pair)) for k, pair in enumerate(images)]
-
-
-@pytest.mark.parametrize("detector", ["shi_tomasi", "fast"])
+@pytest.mark.parametrize("detector", sorted(DETECTORS))
 @pytest.mark.parametrize(
     "H",
     [shift(0, 0), shift(3.3, -2.7), shift(-17.4, 9.6), rotation([0.01, -0.02, 0.01])],

@@ -20,7 +20,7 @@ LAYERS = (
     {"mapping", "simulation", "config_tree"},
     {"evaluation", "visualization", "config"},
     {"output"},
-    {"known_start", "supervision"},
+    {"known_start", "supervision", "tracking"},
     {"pipeline"},
     {"experiment"},
     {"cli"},

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [README, *((ROOT / "docs" / page).read_text() for page in ("results.md", "datasets.md"))]
 
-GROUPS = ("data", "config")
+GROUPS = ("data", "config", "frontend")
 """Commands of `slam-graph` that have commands of their own."""
 
 

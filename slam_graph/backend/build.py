@@ -67,6 +67,11 @@ class EstimatorLike(Protocol):
         ...
 
     @property
+    def rejected(self) -> NDArray[np.int64]:
+        """Ids (N,) of the features that the gate rejected in the last step."""
+        ...
+
+    @property
     def calibration(self) -> CalibrationEstimate | None:
         """The calibration now; None if nothing of it is estimated, or there is no state yet."""
         ...

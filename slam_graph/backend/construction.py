@@ -86,7 +86,11 @@ class ConstructedCost:
 
 
 class CostConstruction:
-    """Builds the cost of each step by the policy of an algorithm."""
+    """Builds the cost of each step by the policy of an algorithm.
+
+    Attributes:
+        rejected: ids (N,) of the features that the gate rejected in the last step, ascending.
+    """
 
     def __init__(
         self,
@@ -99,6 +103,7 @@ class CostConstruction:
         self.rig = rig
         self.config = config
         self.diagnostics = diagnostics
+        self.rejected = np.zeros(0, np.int64)
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
         """The cost now.
@@ -108,6 +113,7 @@ class CostConstruction:
             still: whether the platform stands still; then images say nothing new, and the new pose
                 takes the place of the last one.
         """
+        self.rejected = np.zeros(0, np.int64)
         cost = Cost(window.state, self.rig, self.config, window.prior, list(window.factors))
         nothing = np.zeros(0, np.bool_)
         if still:
@@ -161,6 +167,7 @@ class CostConstruction:
         obs = cost.fresh.obs
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
         fits = cost.squared_errors(obs, cost.fresh.points) < limit
+        self.rejected = np.union1d(self.rejected, obs.ids[obs.feature[~fits]])
         window.tracks.forget(obs.rows(~fits))
         rejected = int(np.sum(~fits))
         self.diagnostics.counts["observation_rejected_by_gate"] += rejected
@@ -218,9 +225,13 @@ class CostConstruction:
         """Leave out what the gate rejects, and make variables of the features that stay."""
         self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
         if linear.tracked is not None and cost.tracked is not None:
+            bad = cost.tracked.rows(~gate.tracked)
+            self.rejected = np.union1d(self.rejected, bad.ids[bad.feature])
             cost.tracked = cost.tracked.rows(gate.tracked)
         if linear.fresh is not None and cost.fresh is not None:
-            window.tracks.consume(cost.fresh.obs.ids[~gate.fresh])
+            bad_ids = cost.fresh.obs.ids[~gate.fresh]
+            self.rejected = np.union1d(self.rejected, bad_ids)
+            window.tracks.consume(bad_ids)
             cost.fresh = cost.fresh.subset(gate.fresh)
             for row in np.flatnonzero(cost.fresh.in_state):
                 cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])

@@ -196,6 +196,11 @@ class Estimator:
             return self.window.current(self.window.prior)
 
     @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected in the last step."""
+        return self._construction.rejected
+
+    @property
     def calibration(self) -> CalibrationEstimate | None:
         """The calibration now; None if nothing of it is estimated, or there is no state yet."""
         if self.window is None or not self._calibration.keys:

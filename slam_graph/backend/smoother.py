@@ -67,6 +67,11 @@ class SmootherEstimator(Estimator):
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
         return self._features.active, stacked_points(self._estimate, self._features.active.tolist())
 
+    @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected when a state was last added."""
+        return self._features.rejected
+
     def _step(self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool) -> NavState:
         """Predict the state, and add it to the graph if it is time for one."""
         with self._timed("propagation"):

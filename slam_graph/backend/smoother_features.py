@@ -55,6 +55,7 @@ class SmootherFeatures:
 
     Attributes:
         active: ids (N,) of the features that are variables, ascending.
+        rejected: ids (N,) of those whose last observation the gate rejected.
         innovations: how far the last observations of these were from what was predicted, by a
             covariance that lacks that of the features.
     """
@@ -63,6 +64,7 @@ class SmootherFeatures:
         self, rig: Rig, policy: SmootherPolicy, config: BackendConfig, diagnostics: Diagnostics
     ) -> None:
         self.active = np.zeros(0, np.int64)
+        self.rejected = np.zeros(0, np.int64)
         self.innovations = Innovations()
         self._policy = policy
         self._config = config
@@ -113,6 +115,7 @@ class SmootherFeatures:
         self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray
     ) -> NDArray[np.bool_]:
         """Which observations (N,) are where the predicted pose lets them be."""
+        self.rejected = np.zeros(0, np.int64)
         self.innovations = Innovations()
         if len(obs) == 0:
             return np.zeros(0, np.bool_)
@@ -126,6 +129,7 @@ class SmootherFeatures:
         dof = np.full(len(obs), 2)
         largest = GATE_SCALE * threshold(dof, self._config.gating.confidence)
         good = (distances < largest) & (depths > 0.0)
+        self.rejected = np.unique(obs.ids[obs.feature[~good]])
         self.innovations = Innovations.of(distances, dof, largest, good)
         self._diagnostics.counts["feature_rejected_by_gate"] += self.innovations.rejected
         return np.asarray(good)

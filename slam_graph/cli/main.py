@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from slam_graph.cli import compare, config, data, evaluate, optimize, run, simulate
+from slam_graph.cli import compare, config, data, evaluate, frontend, optimize, run, simulate
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
 
@@ -36,6 +36,7 @@ app.command("rpe")(evaluate.rpe)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)
+app.add_typer(frontend.app, name="frontend")
 app.add_typer(data.app, name="data")
 app.add_typer(config.app, name="config")
 

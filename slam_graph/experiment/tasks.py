@@ -73,7 +73,7 @@ class RecordTask(Settings):
         truth, start = sequence.groundtruth(), sequence.initial_state()
         with TrackRecorder(self.folder, sequence.rig, self.source.name, truth, start) as recorder:
             for packet in sequence.packets(start_ns if config.start_s > 0 else None, end_ns):
-                recorder.write(packet.imu, frontend.track(packet.frame))
+                recorder.write(packet.imu, frontend.track(packet.frame, packet.imu))
 
 
 class RunTask(Settings):

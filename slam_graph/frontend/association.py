@@ -1,95 +1,96 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Data association: the same points in another image, by pyramidal Lucas-Kanade."""
+"""Data association: the same points in another image. The protocol of both families of methods."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.frontend.config import FrontendConfig
-
-Image = NDArray[np.uint8]
-Points = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.frontend.prediction import Prediction
+from slam_graph.frontend.tracks import Image, Tracks
 
 
 @dataclass(frozen=True, eq=False)
-class Association:
-    """Where points of one image are in another.
+class Match:
+    """What became of features in the next image.
 
     Attributes:
-        points: (N, 2) float32 pixels in the other image.
-        found: (N,) whether Lucas-Kanade converged inside the image.
-        consistent: (N,) whether tracking back also ends where it started; implies `found`.
+        points: (N, 2) float32 pixels there.
+        good: (N,) whether a feature was found.
+        fates: (N,) which of the others were lost, by cause.
     """
 
     points: Points
-    found: Mask
-    consistent: Mask
+    good: Mask
+    fates: dict[str, Mask]
 
 
-class LucasKanade:
-    """Pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check (Kalal et al. 2010)."""
+@dataclass(frozen=True, eq=False)
+class Births:
+    """Features that could be new.
 
-    def __init__(self, config: FrontendConfig) -> None:
-        self._config = config
-        self._criteria = (
-            cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
-            config.lk_iterations,
-            config.lk_epsilon_px,
-        )
+    Attributes:
+        points: (M, 2) float32 pixels in the new image.
+        origins: (M, 2) float32 pixels in the image before, or None if they were not looked for.
+        share: their epipolar distance must be below this share of what is allowed to others.
+    """
 
-    def associate(
-        self,
-        source: Image,
-        target: Image,
-        points: Points,
-        guess: Points | None = None,
-        levels: int | None = None,
-    ) -> Association:
-        """Find `points` of `source` in `target`.
+    points: Points
+    origins: Points | None
+    share: float = 1.0
+
+
+class Associator(Protocol):
+    """Finds the features of one camera in its next image, and new ones there.
+
+    For each image `follow`, `recover`, `births` and `adopt` are called in this order.
+    """
+
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
+        """Find features in the next image.
 
         Args:
-            source: (height, width) image.
-            target: image of the same size.
-            points: (N, 2) float32 pixels in `source`.
-            guess: (N, 2) where to start in `target`; where they are in `source` if None.
-            levels: of the pyramid; as configured if None.
+            before: of the image before.
+            image: the next one.
+            guess: where to look first.
         """
-        if len(points) == 0:
-            nothing = np.zeros(0, np.bool_)
-            return Association(np.zeros((0, 2), np.float32), nothing, nothing)
-        config = self._config
-        levels = config.pyramid_levels if levels is None else levels
-        start = points if guess is None else guess
-        forward, found = self._lucas_kanade(source, target, points, start, levels)
-        found &= inside(forward, target.shape, config.border_px)
-        # The way back starts where it should end, so it needs no pyramid: what it tests is whether
-        # the patch that was found is, seen from the other side, the patch that was looked for.
-        back, returned = self._lucas_kanade(target, source, forward, points, config.backward_levels)
-        error = np.linalg.norm(back - points, axis=1)
-        return Association(forward, found, found & returned & (error < config.forward_backward_px))
+        ...
 
-    def _lucas_kanade(
-        self, source: Image, target: Image, points: Points, start: Points, levels: int
-    ) -> tuple[Points, Mask]:
-        window = self._config.window_px
-        moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            source,
-            target,
-            points,
-            start.copy(),  # it is overwritten
-            winSize=(window, window),
-            maxLevel=levels,
-            criteria=self._criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=self._config.lk_min_eigenvalue,
-        )
-        return np.asarray(moved, np.float32), status[:, 0] == 1
+    def recover(self, before: Tracks, after: Tracks) -> tuple[NDArray[np.int64], Points]:
+        """Features that were lost and are seen again, or were missed at first.
+
+        Args:
+            before: features of the image before.
+            after: those of them that were found and have passed all tests.
+
+        Returns:
+            ids: (M,) ascending.
+            points: (M, 2) pixels.
+        """
+        ...
+
+    def births(self, before: Tracks, after: Tracks, verify: bool) -> Births:
+        """Candidates for new features where there are few, found in the image before too.
+
+        Args:
+            before: features of the image before.
+            after: all features of the new image so far.
+            verify: whether to look for them in the image before.
+        """
+        ...
+
+    def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
+        """The last births (M,) that were `chosen` have become features with these ids (K,)."""
+        ...
+
+    def forget(self, ids: NDArray[np.int64]) -> None:
+        """Do not look for some features any more."""
+        ...
 
 
 def inside(points: Points, shape: tuple[int, ...], border_px: int) -> Mask:

@@ -1,15 +1,45 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol that every front end fulfils."""
+"""The protocol that every front end fulfils, and what it hears of the back end."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """What the back end knows after a frame.
+
+    Attributes:
+        state: its estimate; None as long as there is none.
+        rejected: (N,) ids of features that its χ² gate rejected.
+        ids: (M,) ids of features whose position is estimated, ascending.
+        points: (M, 3) these positions in the world.
+    """
+
+    state: NavState | None = None
+    rejected: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @staticmethod
+    def of(
+        state: NavState | None,
+        rejected: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        points: NDArray[np.float64],
+    ) -> Feedback:
+        """The same from features in any order."""
+        order = np.argsort(ids, kind="stable")
+        return Feedback(state, rejected, ids[order], points[order])
 
 
 @runtime_checkable
@@ -22,13 +52,21 @@ class Frontend(Protocol):
 
     frame_stats: dict[str, float]
 
-    def track(self, frame: CameraFrame | FeatureFrame) -> FeatureFrame:
+    def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
         """The features of the next frame.
 
         Ids increase and are never used again for another feature.
+
+        Args:
+            frame: what the cameras recorded.
+            imu: the samples since the frame before, as in `Packet`; None where there are none.
         """
         ...
 
     def drop(self, ids: NDArray[np.int64]) -> None:
         """Do not report these features any more: the back end rejected them."""
+        ...
+
+    def hear(self, feedback: Feedback) -> None:
+        """Take note of what the back end made of an earlier frame."""
         ...

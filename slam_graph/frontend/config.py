@@ -9,8 +9,39 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+OWN_DETECTORS = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
+"""The detector that each descriptor was published with; BRIEF has none of its own."""
+
 Pixels = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]
+
+
+class MatchingConfig(BaseModel):
+    """How descriptors are matched, for the front ends that match."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    candidates: Count = 500
+    """Keypoints that are described in each image; features are matched to these."""
+
+    distance_px: Pixels = 5.0
+    """Keypoints keep at least this distance from one another."""
+
+    search_radius_px: Pixels = 20.0
+    """A match lies within this distance of where the feature is predicted."""
+
+    ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.85
+    """Ratio test: the best match is less than this share of the distance of the second best."""
+
+    mutual: bool = True
+    """Whether a match must be the best one seen from either image."""
+
+    epipolar_px: Pixels = 1.5
+    """What `ransac_px` is for corners that are followed; keypoints are found anew in each image,
+    which is less exact."""
+
+    memory_frames: Annotated[int, Field(ge=0)] = 5
+    """A feature that found no match is looked for in so many more frames before it is lost."""
 
 
 class FrontendConfig(BaseModel):
@@ -19,7 +50,8 @@ class FrontendConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     method: str = "klt"
-    """Which front end to build (a name in the registry of front ends)."""
+    """`klt` follows corners by Lucas-Kanade; `sift`, `surf`, `orb`, `brisk` and `brief` match these
+    descriptors."""
 
     features: Count = 200
     """Number of features aimed at in the first camera; the other cameras see these same ones."""
@@ -36,8 +68,25 @@ class FrontendConfig(BaseModel):
     border_px: Annotated[int, Field(ge=0)] = 5
     """Features are neither found nor kept within this distance of the edge of the image."""
 
-    detector: Literal["shi_tomasi", "fast"] = "shi_tomasi"
-    """Corner detector: the smaller eigenvalue of the gradient's covariance, or FAST."""
+    detector: Literal["auto", "shi_tomasi", "harris", "fast", "dog", "surf", "orb", "brisk"] = (
+        "auto"
+    )
+    """What finds features; `auto` is Shi-Tomasi for `klt`, and what a descriptor was published with
+    for the others (FAST for BRIEF)."""
+
+    subpixel: bool = False
+    """Whether new keypoints are moved to the corner to a fraction of a pixel."""
+
+    prediction: Literal["none", "flow", "gyroscope", "state"] = "gyroscope"
+    """Where features are looked for first: where they were; moved on as in the last frame; the same
+    with the rotation that the gyroscope measured; or where state and map of the back end say."""
+
+    verify_new: bool = True
+    """Whether a new feature must also be found in the image before."""
+
+    verification: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
+    """Errors allowed to a new corner of `klt`, as a share of those allowed to one that is
+    followed."""
 
     min_corner_score: Annotated[float, Field(ge=0.0)] = 1e-3
     """Smallest Shi-Tomasi eigenvalue of a corner (OpenCV's scale: grey levels / 255)."""
@@ -57,6 +106,10 @@ class FrontendConfig(BaseModel):
     pyramid_levels: Annotated[int, Field(ge=0, le=8)] = 3
     """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
 
+    guided_levels: Annotated[int, Field(ge=0, le=8)] = 1
+    """Halvings where the prediction is good (the rotation is measured, the rest known); features
+    that are not found that way are looked for again with all `pyramid_levels`."""
+
     lk_iterations: Count = 15
     """Most iterations on each level of the pyramid."""
 
@@ -72,11 +125,22 @@ class FrontendConfig(BaseModel):
     forward_backward_px: Pixels = 0.5
     """Largest distance between a point and itself after tracking forward and back."""
 
-    ransac_px: Pixels = 0.7
-    """Largest epipolar distance of an inlier of the fundamental matrix between two frames."""
+    outliers: Literal["fundamental", "essential", "magsac", "gyroscope", "none"] = "fundamental"
+    """RANSAC between two frames: on the fundamental matrix (7 points), the essential matrix (5),
+    the fundamental matrix by MAGSAC++, or the direction of motion under the gyroscope's rotation
+    (2)."""
+
+    ransac_px: Pixels = 1.0
+    """Largest epipolar distance of an inlier between two frames, for `klt`."""
 
     ransac_confidence: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.999
     """Probability with which RANSAC draws at least one sample without an outlier."""
+
+    map_check_px: Pixels | None = None
+    """Largest reprojection error against the back end's map (PnP with RANSAC); no check if null."""
+
+    drop_rejected: bool = False
+    """Whether features that the χ² gate of the back end rejects are not followed any more."""
 
     stereo_epipolar_px: Pixels = 1.5
     """Largest distance of a match in another camera from its epipolar line."""
@@ -95,3 +159,18 @@ class FrontendConfig(BaseModel):
 
     masks: tuple[Path | None, ...] = ()
     """One grey image per camera, or none; no features are taken where it is black (< 128)."""
+
+    matching: MatchingConfig = MatchingConfig()
+    """How descriptors are matched."""
+
+    @property
+    def detector_name(self) -> str:
+        """The detector that `detector` and `method` choose."""
+        if self.detector != "auto":
+            return self.detector
+        return OWN_DETECTORS.get(self.method, "shi_tomasi")
+
+    @property
+    def epipolar_px(self) -> float:
+        """Largest epipolar distance of an inlier between two frames, for the method chosen."""
+        return self.ransac_px if self.method == "klt" else self.matching.epipolar_px

@@ -20,6 +20,9 @@ MIN_POINTS = 8
 MAX_ITERATIONS = 1000
 """Most samples that RANSAC draws."""
 
+DIRECTION_SAMPLES = 64
+"""Samples of two points: with half of the matches wrong, one in four is good."""
+
 
 def fundamental_inliers(
     before: FloatArray, after: FloatArray, focal_px: float, config: FrontendConfig
@@ -30,35 +33,166 @@ def fundamental_inliers(
         before: (N, 2) normalised coordinates in the earlier frame.
         after: (N, 2) the same points in the later frame.
         focal_px: focal length, which turns the threshold in pixels into one on the plane z = 1.
-        config: threshold and confidence.
+        config: method, threshold and confidence.
 
     Returns:
         (N,) True for inliers.
     """
     if len(before) < MIN_POINTS:
         return np.ones(len(before), np.bool_)
-    # OpenCV's solvers expect numbers of the size of pixels
-    matrix, inliers = cv2.findFundamentalMat(
-        before * focal_px,
-        after * focal_px,
-        cv2.FM_RANSAC,
-        config.ransac_px,
-        config.ransac_confidence,
-        MAX_ITERATIONS,
-    )
-    if matrix is None or inliers is None:
+    result = _sampled(before, after, focal_px, config)
+    if result is None:
         return np.ones(len(before), np.bool_)
-    result: Mask = np.asarray(inliers)[:, 0] == 1
-    # A sample of seven noisy points fits some of the others badly; all that agree fit them better
+    # A sample of a few noisy points fits some others badly; all that agree fit them better
     for _ in range(2):
         if np.count_nonzero(result) < MIN_POINTS:
             break
         F = eight_point(before[result], after[result])
-        refined: Mask = epipolar_distance(F, before, after) * focal_px < config.ransac_px
+        refined: Mask = epipolar_distance(F, before, after) * focal_px < config.epipolar_px
         if np.count_nonzero(refined) <= np.count_nonzero(result):
             break
         result = refined
     return result
+
+
+def _sampled(
+    before: FloatArray, after: FloatArray, focal_px: float, config: FrontendConfig
+) -> Mask | None:
+    """The inliers (N,) of the best sample that OpenCV finds; None if it finds none."""
+    if config.outliers == "essential":
+        # five points, calibrated: what does not belong to a rotation and a direction is excluded
+        matrix, inliers = cv2.findEssentialMat(
+            before,
+            after,
+            np.eye(3),
+            cv2.RANSAC,
+            config.ransac_confidence,
+            config.epipolar_px / focal_px,
+            MAX_ITERATIONS,
+        )
+    else:
+        # OpenCV's solvers expect numbers of the size of pixels
+        matrix, inliers = cv2.findFundamentalMat(
+            before * focal_px,
+            after * focal_px,
+            cv2.USAC_MAGSAC if config.outliers == "magsac" else cv2.FM_RANSAC,
+            config.epipolar_px,
+            config.ransac_confidence,
+            MAX_ITERATIONS,
+        )
+    if matrix is None or inliers is None:
+        return None
+    found: Mask = np.asarray(inliers)[:, 0] == 1
+    return found
+
+
+def direction_inliers(
+    before: FloatArray,
+    after: FloatArray,
+    after_R_before: FloatArray,
+    focal_px: float,
+    config: FrontendConfig,
+    rng: np.random.Generator,
+) -> Mask:
+    """Which matches fit a motion whose rotation is known, by 2-point RANSAC.
+
+    With the rotation given, the planes of all matches contain the translation: their normals
+    n = R f × f' are orthogonal to it, and two of them give its direction n₁ × n₂ (Troiani et al.
+    2014).
+
+    Args:
+        before: (N, 2) normalised coordinates in the earlier frame.
+        after: (N, 2) the same points in the later frame.
+        after_R_before: (3, 3) rotation of the camera, e.g. from the gyroscope.
+        focal_px: focal length.
+        config: threshold.
+        rng: draws the samples.
+
+    Returns:
+        (N,) True for inliers.
+    """
+    n = len(before)
+    if n < MIN_POINTS:
+        return np.ones(n, np.bool_)
+    turned = np.column_stack([before, np.ones(n)]) @ after_R_before.T
+    ahead = np.maximum(turned[:, 2:], 1e-3)
+    turned, seen = turned / ahead, np.column_stack([after, np.ones(n)])
+    normals = np.cross(turned, seen)
+    first, second = rng.integers(0, n, (2, DIRECTION_SAMPLES))
+    directions = np.cross(normals[first], normals[second])
+    length = np.linalg.norm(directions, axis=1)
+    directions = directions[length > 0] / length[length > 0, None]
+    # m'ᵀ [t]× R m = t · n, and its gradients by m and m' are of the length |t × m|, first two rows
+    tolerance = config.epipolar_px / focal_px
+    if len(directions) == 0:
+        return np.ones(n, np.bool_)
+    best = _within(directions, normals, turned, seen, tolerance)
+    inlier: Mask = best[np.argmax(np.count_nonzero(best, axis=1))]
+    for _ in range(2):
+        _, vectors = np.linalg.eigh(normals[inlier].T @ normals[inlier])
+        refined = _within(vectors[:, :1].T, normals, turned, seen, tolerance)[0]
+        if np.count_nonzero(refined) <= np.count_nonzero(inlier):
+            break
+        inlier = refined
+    return inlier
+
+
+def _within(
+    directions: FloatArray, normals: FloatArray, a: FloatArray, b: FloatArray, tolerance: float
+) -> NDArray[np.bool_]:
+    """Whether Sampson's distance (K, N) from each direction of motion (K, 3) is small."""
+    residual = np.abs(directions @ normals.T)
+    tx, ty, tz = (directions[:, i, None] for i in range(3))
+
+    def squared_gradient(m: FloatArray) -> FloatArray:
+        x, y = m[:, 0], m[:, 1]
+        squared: FloatArray = (ty - tz * y) ** 2 + (tz * x - tx) ** 2
+        return squared
+
+    gradient = np.sqrt(squared_gradient(a) + squared_gradient(b))
+    close: NDArray[np.bool_] = residual < tolerance * np.maximum(gradient, 1e-9)
+    return close
+
+
+def map_inliers(
+    points: FloatArray,
+    normalized: FloatArray,
+    guess: gtsam.Pose3,
+    focal_px: float,
+    config: FrontendConfig,
+) -> Mask:
+    """Which observations fit one pose against known points, by PnP with RANSAC.
+
+    Args:
+        points: (N, 3) in the world.
+        normalized: (N, 2) where the camera sees them.
+        guess: camera_T_world to start from.
+        focal_px: focal length.
+        config: `map_check_px` and confidence.
+
+    Returns:
+        (N,) True for inliers; all where there are too few to tell, or no pose fits most of them.
+    """
+    everything = np.ones(len(points), np.bool_)
+    if len(points) < MIN_POINTS or config.map_check_px is None:
+        return everything
+    found, _, _, inliers = cv2.solvePnPRansac(
+        points,
+        normalized,
+        np.eye(3),
+        None,
+        rvec=np.array(gtsam.Rot3.Logmap(guess.rotation())).reshape(3, 1),  # copies: they are
+        tvec=np.array(guess.translation()).reshape(3, 1),  # overwritten
+        useExtrinsicGuess=True,
+        iterationsCount=100,
+        reprojectionError=config.map_check_px / focal_px,
+        confidence=config.ransac_confidence,
+    )
+    if not found or inliers is None or 2 * len(inliers) < len(points):
+        return everything
+    fits = np.zeros(len(points), np.bool_)
+    fits[np.ravel(inliers)] = True
+    return fits
 
 
 def eight_point(m_a: FloatArray, m_b: FloatArray) -> FloatArray:

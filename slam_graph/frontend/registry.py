@@ -11,12 +11,14 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.base import Frontend
 from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.descriptors import DESCRIPTORS
 from slam_graph.frontend.replay import ReplayFrontend
-from slam_graph.frontend.tracker import KltTracker
+from slam_graph.frontend.tracker import ImageFrontend
 from slam_graph.sensors.rig import Rig
 
 FRONTENDS: dict[str, Callable[[Rig, FrontendConfig, int, Diagnostics], Frontend]] = {
-    "klt": KltTracker,
+    "klt": ImageFrontend,
+    **dict.fromkeys(DESCRIPTORS, ImageFrontend),
 }
 """Front ends that find features in images, by the name that `FrontendConfig.method` gives."""
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
 
@@ -24,14 +25,15 @@ class ReplayFrontend:
     def __init__(
         self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
     ) -> None:
-        """Prepare for the first frame; only the number of cameras of the rig matters."""
+        """Prepare for the first frame; `drop_rejected` is the only option that matters."""
         self._cameras = len(rig.cameras)
+        self._drop_rejected = config.drop_rejected
         self._seen = np.zeros(0, np.int64)
         self._dropped = np.zeros(0, np.int64)
         self.frame_stats: dict[str, float] = {}
 
-    def track(self, frame: CameraFrame | FeatureFrame) -> FeatureFrame:
-        """The recorded features.
+    def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
+        """The recorded features; the IMU says nothing new of them.
 
         Raises:
             DataError: if the frame holds images, or features of another number of cameras.
@@ -60,6 +62,11 @@ class ReplayFrontend:
     def drop(self, ids: NDArray[np.int64]) -> None:
         """Do not report these features any more."""
         self._dropped = np.union1d(self._dropped, ids)
+
+    def hear(self, feedback: Feedback) -> None:
+        """Drop what the back end rejected, if so configured."""
+        if self._drop_rejected and len(feedback.rejected):
+            self.drop(feedback.rejected)
 
 
 def _without(features: FeatureObservations, ids: NDArray[np.int64]) -> FeatureObservations:

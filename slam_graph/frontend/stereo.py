@@ -16,10 +16,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.frontend.association import LucasKanade
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.epipolar_search import EpipolarSearch, reduce
 from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
 from slam_graph.frontend.tracks import Image, Tracks
 from slam_graph.sensors.camera import Camera
@@ -82,31 +82,30 @@ class StereoMatcher:
         self._frames = 0
         self.counts = MatchCounts()
 
-    def match(self, reference: Tracks, image: Image, first_new_id: int) -> Tracks:
+    def match(self, reference: Tracks, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
         """The features of the reference camera that another camera sees at the same time.
 
         Args:
             reference: features of the reference camera.
             image: of the other camera.
+            stamp_ns: its time.
             first_new_id: features from this id on have not been matched before.
         """
         self._frames += 1
         self.counts = MatchCounts()
         reference_image = reference.image
         if reference_image is None or len(reference) == 0:
-            return Tracks.empty(image)
+            return Tracks.empty(image, stamp_ns)
         worthwhile, guess = self._guess(reference, reference_image, image, first_new_id)
         reference, guess = reference.select(worthwhile), guess[worthwhile]
-        match = self._lucas_kanade.associate(
-            reference_image, image, reference.pixels, guess, LEVELS
-        )
-        keep = match.consistent.copy()
+        match = self._lucas_kanade.flow(reference_image, image, reference.pixels, guess, LEVELS)
+        keep = match.found & (match.error_px < self._config.forward_backward_px)
         keep[keep] = self._extractor.allows(match.points[keep])
         reference, pixels = reference.select(keep), match.points[keep]
         normalized = self._camera.undistort(pixels.astype(np.float64))
         good = self._inliers(reference.normalized, normalized)
         self.counts = MatchCounts(int(np.sum(good)), int(np.sum(~good)))
-        matches = Tracks(image, reference.ids, pixels, normalized).select(good)
+        matches = Tracks.of(image, stamp_ns, reference.ids, pixels, normalized).select(good)
         self._ids, self._offsets = matches.ids, matches.pixels - reference.pixels[good]
         return matches
 

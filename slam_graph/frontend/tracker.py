@@ -1,13 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The KLT front end: corners of the first camera followed in time and matched across the rig."""
+"""The front end for images: features followed in time and matched across the rig."""
 
 from __future__ import annotations
-
-import time
-from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -15,25 +10,36 @@ from numpy.typing import NDArray
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.frontend.association import LucasKanade
+from slam_graph.frontend.association import Associator
+from slam_graph.frontend.base import Feedback
+from slam_graph.frontend.camera_tracker import CameraTracker
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor, camera_mask
-from slam_graph.frontend.outliers import fundamental_inliers
+from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
+from slam_graph.frontend.matching import DescriptorMatching
+from slam_graph.frontend.motion import ImuMotion
+from slam_graph.frontend.prediction import PointPredictor
+from slam_graph.frontend.references import reference_cameras
+from slam_graph.frontend.stats import FrameStats
 from slam_graph.frontend.stereo import StereoMatcher
-from slam_graph.frontend.tracks import Image, Mask, Tracks
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
+from slam_graph.frontend.tracks import Image, Tracks
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
 FEW_FEATURES = 15
 """Fewer features than this left of a frame with more are worth a warning."""
 
 
-class KltTracker:
-    """Follows corners of the first camera (the reference) and finds them in the other cameras.
+class ImageFrontend:
+    """Follows features of the first camera and finds them in the cameras that see the same.
+
+    A camera that sees little of what an earlier one sees has features of its own.
 
     Attributes:
-        frame_stats: of the last frame: features by fate (`tracked`, `new`, `stereo`, and those
-            lost by cause: `lost_klt`, `lost_fb`, `lost_mask`, `lost_merged`, `rejected_ransac`,
+        frame_stats: of the last frame: features by fate (`tracked`, `new`, `recovered`, `stereo`,
+            and those lost by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
+            `lost_merged`, `rejected_ransac`, `rejected_map`, `rejected_gate`, `rejected_new`,
             `rejected_stereo`), and milliseconds per stage (`prepare_ms`, `temporal_ms`,
             `ransac_ms`, `detect_ms`, `stereo_ms`).
     """
@@ -50,32 +56,47 @@ class KltTracker:
             diagnostics: where faults are counted.
 
         Raises:
-            ConfigError: if a mask cannot be read or does not fit its camera.
+            ConfigError: if a mask cannot be read or does not fit its camera, or a method needs a
+                library that is not installed.
         """
         self._rig = rig
         self._config = config
-        self._rng = np.random.default_rng(seed)
         self._diagnostics = diagnostics
-        self._lucas_kanade = LucasKanade(config)
-        self._extractors = _extractors(rig, config)
-        reference = rig.cameras[0].body_T_camera
-        self._matchers = {
-            i: StereoMatcher(
-                other.camera,
-                other.body_T_camera.between(reference),
-                self._lucas_kanade,
-                self._extractors[i],
-                config,
+        self._stats = FrameStats()
+        self._motion = ImuMotion()
+        self._feedback = Feedback()
+        self._gated = 0
+        self._references = reference_cameras(rig)
+        masks = _masks(rig, config)
+        rng = np.random.default_rng(seed)
+        self._trackers: list[CameraTracker] = []
+        self._matchers: dict[int, StereoMatcher] = {}
+        for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
+            camera, reference = mounted.camera, self._references[i]
+            extractor = CornerExtractor(config, camera.width, camera.height, mask)
+            associator: Associator = CornerTracking(extractor, config)
+            if reference == i:
+                associator = _associator(camera, extractor, config, mask)
+            else:
+                # a camera that is matched follows its features by itself only in an emergency
+                pose = rig.cameras[reference].body_T_camera
+                self._matchers[i] = StereoMatcher(
+                    camera,
+                    mounted.body_T_camera.between(pose),
+                    LucasKanade(config),
+                    extractor,
+                    config,
+                )
+            predictor = PointPredictor(mounted, self._motion, config)
+            self._trackers.append(
+                CameraTracker(mounted, extractor, associator, predictor, config, self._stats, rng)
             )
-            for i, other in enumerate(rig.cameras)
-            if i > 0
-        }
         self._clahe = cv2.createCLAHE(config.clahe_clip_limit, config.clahe_tiles)
         self._tracks = [Tracks.empty() for _ in rig.cameras]
         self._next_id = 0
         self.frame_stats: dict[str, float] = {}
 
-    def track(self, frame: CameraFrame | FeatureFrame) -> FeatureFrame:
+    def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
         """The features of the next frame; those of the frame before keep their ids.
 
         Where the image of a camera is missing, its features wait in its last image; where the
@@ -84,20 +105,24 @@ class KltTracker:
         Raises:
             DataError: if the frame has not one image per camera of the size that the rig says.
         """
-        self.frame_stats = defaultdict(float)
-        with self._timed("prepare_ms"):
+        self._stats.clear()
+        self._stats.add("rejected_gate", self._gated)
+        self._gated = 0
+        if imu is not None:
+            self._motion.add(imu)
+        with self._stats.timed("prepare_ms"):
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id
-        if images[0] is not None:
-            self._tracks[0] = self._follow(0, images[0])
-            self._tracks[0] = self._replenish(self._tracks[0], images[0])
-        for i, image in enumerate(images[1:], start=1):
-            if image is None:
-                continue
-            if images[0] is None:
-                self._tracks[i] = self._follow(i, image)
-            else:
-                self._tracks[i] = self._match(i, image, first_new_id)
+        for i, image in enumerate(images):
+            if image is not None and (
+                self._references[i] == i or images[self._references[i]] is None
+            ):
+                self._follow(i, image, frame.stamp_ns)
+        for i, image in enumerate(images):
+            reference = self._references[i]
+            if image is not None and reference != i and images[reference] is not None:
+                self._tracks[i] = self._match(i, image, frame.stamp_ns, first_new_id)
+        self.frame_stats = dict(self._stats)
         return FeatureFrame(
             frame.stamp_ns,
             tuple(
@@ -109,6 +134,17 @@ class KltTracker:
     def drop(self, ids: NDArray[np.int64]) -> None:
         """Forget features in all cameras, e.g. those that the back end rejected."""
         self._tracks = [tracks.select(~np.isin(tracks.ids, ids)) for tracks in self._tracks]
+        for tracker in self._trackers:
+            tracker.forget(ids)
+
+    def hear(self, feedback: Feedback) -> None:
+        """Note state and map of the back end, and drop what it rejected if so configured."""
+        self._feedback = feedback
+        self._motion.state = feedback.state or self._motion.state
+        if self._config.drop_rejected and len(feedback.rejected):
+            followed = np.unique(np.concatenate([tracks.ids for tracks in self._tracks]))
+            self._gated += int(np.count_nonzero(np.isin(followed, feedback.rejected)))
+            self.drop(feedback.rejected)
 
     def _checked(self, frame: CameraFrame | FeatureFrame) -> tuple[Image | None, ...]:
         """The images of a frame, after a look at their number and sizes."""
@@ -140,95 +176,50 @@ class KltTracker:
             return np.asarray(cv2.equalizeHist(image), np.uint8)
         return np.asarray(self._clahe.apply(image), np.uint8)
 
-    def _follow(self, index: int, image: Image) -> Tracks:
-        """The features of a camera in its next image."""
+    def _follow(self, index: int, image: Image, stamp_ns: int) -> None:
+        """Follow the features of a camera into its next image, and find new ones if it may."""
         before = self._tracks[index]
-        if before.image is None or len(before) == 0:
-            return Tracks.empty(image)
-        with self._timed("temporal_ms"):
-            match = self._lucas_kanade.associate(before.image, image, before.pixels)
-            keep = match.consistent.copy()
-            keep[keep] = self._extractors[index].allows(match.points[keep])
-            self._count(
-                lost_klt=~match.found,
-                lost_fb=match.found & ~match.consistent,
-                lost_mask=match.consistent & ~keep,
-            )
-        with self._timed("ransac_ms"):
-            camera = self._rig.cameras[index].camera
-            normalized = camera.undistort(match.points[keep].astype(np.float64))
-            after = Tracks(image, before.ids[keep], match.points[keep], normalized)
-            inlier = self._rigid(before.normalized[keep], normalized, camera.fx)
-            after = after.select(inlier)
-            alone = _apart(after.pixels, self._config.merge_distance_px)
-            self._count(rejected_ransac=~inlier, lost_merged=~alone)
-            after = after.select(alone)
-        if index == 0:
-            self.frame_stats["tracked"] = len(after)
+        tracker = self._trackers[index]
+        after = tracker.follow(before, image, stamp_ns, self._feedback)
+        if self._references[index] == index:
+            self._stats.add("tracked", len(after))
             if len(after) < FEW_FEATURES <= len(before):
                 self._diagnostics.warn(
                     "few_features", f"{len(after)} of {len(before)} features could be followed"
                 )
-        return after
+            after = tracker.replenish(before, after, self._next_id)
+            self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
+        self._tracks[index] = after
 
-    def _rigid(
-        self, before: NDArray[np.float64], after: NDArray[np.float64], focal_px: float
-    ) -> Mask:
-        """Which matches (N, 2) fit a rigid motion; the seed decides what RANSAC tries first."""
-        order = self._rng.permutation(len(before))
-        inlier = np.empty(len(before), np.bool_)
-        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, self._config)
-        return inlier
-
-    def _replenish(self, tracks: Tracks, image: Image) -> Tracks:
-        """The features of the reference camera, and new ones where it has few."""
-        with self._timed("detect_ms"):
-            corners = self._extractors[0].extract(image, tracks.pixels)
-            ids = np.arange(self._next_id, self._next_id + len(corners), dtype=np.int64)
-            self._next_id += len(corners)
-            self.frame_stats["new"] = len(corners)
-            normalized = self._rig.cameras[0].camera.undistort(corners.astype(np.float64))
-            return tracks.append(ids, corners, normalized)
-
-    def _match(self, index: int, image: Image, first_new_id: int) -> Tracks:
+    def _match(self, index: int, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
         """The features of the reference camera that another camera sees too."""
-        with self._timed("stereo_ms"):
+        with self._stats.timed("stereo_ms"):
             matcher = self._matchers[index]
-            matches = matcher.match(self._tracks[0], image, first_new_id)
-            self.frame_stats["stereo"] += matcher.counts.matched
-            self.frame_stats["rejected_stereo"] += matcher.counts.rejected
+            reference = self._tracks[self._references[index]]
+            matches = matcher.match(reference, image, stamp_ns, first_new_id)
+            self._stats.add("stereo", matcher.counts.matched)
+            self._stats.add("rejected_stereo", matcher.counts.rejected)
             return matches
 
-    def _count(self, **fates: Mask) -> None:
-        for fate, features in fates.items():
-            self.frame_stats[fate] += int(np.count_nonzero(features))
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.frame_stats[stage] += (time.perf_counter() - start) * 1e3
+def _associator(
+    camera: Camera, extractor: CornerExtractor, config: FrontendConfig, mask: Image | None
+) -> Associator:
+    """What follows features: Lucas-Kanade, or the descriptor that the method names."""
+    if config.method == "klt":
+        return CornerTracking(extractor, config)
+    return DescriptorMatching(camera, extractor, config, mask)
 
 
-def _extractors(rig: Rig, config: FrontendConfig) -> list[CornerExtractor]:
-    """One extractor per camera, with its mask: what is told, and what a wide lens cannot use."""
+def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
+    """The mask of each camera: what is told, and what a wide lens cannot use."""
     if len(config.masks) > len(rig.cameras):
         raise ConfigError(
             f"frontend.masks lists {len(config.masks)} masks, "
             f"the rig has {len(rig.cameras)} cameras"
         )
-    masks = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
-    extractors = []
-    for rig_camera, path in zip(rig.cameras, masks, strict=True):
-        width, height = rig_camera.camera.width, rig_camera.camera.height
-        mask = camera_mask(rig_camera.camera, path, config.window_px)
-        extractors.append(CornerExtractor(config, width, height, mask))
-    return extractors
-
-
-def _apart(pixels: NDArray[np.float32], distance_px: float) -> Mask:
-    """Which points (N, 2) are not within a distance of an earlier one."""
-    u, v = pixels.T
-    close = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2 < distance_px**2
-    result: Mask = ~np.any(np.tril(close, -1), axis=1)
-    return result
+    paths = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
+    return [
+        camera_mask(mounted.camera, path, config.window_px)
+        for mounted, path in zip(rig.cameras, paths, strict=True)
+    ]

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from slam_graph.sensors.measurements import FeatureObservations
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,38 +22,71 @@ class Tracks:
 
     Attributes:
         image: the last image of the camera, equalised; None before the first one.
+        stamp_ns: its time.
         ids: (N,) int64, increasing, so that older features come first.
         pixels: (N, 2) float32 in `image`.
         normalized: (N, 2) undistorted coordinates on the plane z = 1.
+        drift: (N, 2) velocity of `normalized` in 1/s beyond what the rotation of the camera makes;
+            NaN where it is not known.
     """
 
     image: Image | None
+    stamp_ns: int
     ids: NDArray[np.int64]
     pixels: NDArray[np.float32]
-    normalized: NDArray[np.float64]
+    normalized: FloatArray
+    drift: FloatArray
 
     @staticmethod
-    def empty(image: Image | None = None) -> Tracks:
+    def of(
+        image: Image | None,
+        stamp_ns: int,
+        ids: NDArray[np.int64],
+        pixels: NDArray[np.float32],
+        normalized: FloatArray,
+    ) -> Tracks:
+        """Features whose velocity is not known."""
+        return Tracks(image, stamp_ns, ids, pixels, normalized, np.full((len(ids), 2), np.nan))
+
+    @staticmethod
+    def empty(image: Image | None = None, stamp_ns: int = 0) -> Tracks:
         """No features."""
-        return Tracks(image, np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2)))
+        nothing = np.zeros((0, 2))
+        return Tracks.of(
+            image, stamp_ns, np.zeros(0, np.int64), nothing.astype(np.float32), nothing
+        )
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def select(self, keep: Mask) -> Tracks:
-        """The features where `keep` (N,) is true."""
-        return Tracks(self.image, self.ids[keep], self.pixels[keep], self.normalized[keep])
-
-    def append(
-        self, ids: NDArray[np.int64], pixels: NDArray[np.float32], normalized: NDArray[np.float64]
-    ) -> Tracks:
-        """The features and younger ones."""
-        return Tracks(
-            self.image,
-            np.concatenate([self.ids, ids]),
-            np.concatenate([self.pixels, pixels]),
-            np.concatenate([self.normalized, normalized]),
+    def select(self, keep: Mask | NDArray[np.int64]) -> Tracks:
+        """The features where `keep` (N,) is true, or with some indices."""
+        return replace(
+            self,
+            ids=self.ids[keep],
+            pixels=self.pixels[keep],
+            normalized=self.normalized[keep],
+            drift=self.drift[keep],
         )
+
+    def joined(self, other: Tracks) -> Tracks:
+        """These features and others, in the order of their ids."""
+        ids = np.concatenate([self.ids, other.ids])
+        order = np.argsort(ids, kind="stable")
+        return replace(
+            self,
+            ids=ids[order],
+            pixels=np.concatenate([self.pixels, other.pixels])[order],
+            normalized=np.concatenate([self.normalized, other.normalized])[order],
+            drift=np.concatenate([self.drift, other.drift])[order],
+        )
+
+    def common(self, other: Tracks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Indices here and there (M,) of the features in both."""
+        _, here, there = np.intersect1d(
+            self.ids, other.ids, assume_unique=True, return_indices=True
+        )
+        return here, there
 
     def observations(self) -> FeatureObservations:
         """What the back end gets to see."""

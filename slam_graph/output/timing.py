@@ -99,6 +99,10 @@ class Stopwatch:
         self.milliseconds: dict[str, float] = {"total": 0.0}
         self._since = time.perf_counter()
 
+    def restart(self) -> None:
+        """Leave out the time since the last stage ended."""
+        self._since = time.perf_counter()
+
     def lap(self, stage: str, parts: Mapping[str, float] | None = None) -> None:
         """End a stage that began when the stage before it ended.
 

@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph frontend`: the front end alone, its tracks drawn and judged; and several compared."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from slam_graph.cli.config import ConfigFile, Overrides
+from slam_graph.cli.data import Calibration, Data, Format, Groundtruth, Json
+from slam_graph.cli.output import echo_json, echo_table, number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from slam_graph.config import RunConfig
+    from slam_graph.datasets.base import Sequence
+    from slam_graph.experiment.frontends import FrontendReport
+    from slam_graph.tracking import TrackedPacket
+
+Cameras = Annotated[
+    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
+]
+Start = Annotated[
+    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+]
+Duration = Annotated[
+    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
+]
+
+EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
+
+
+class RunByDefault(TyperGroup):
+    """A group whose first command is meant where none is named: `frontend DATA`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the name of the first command before arguments that do not begin with one."""
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=RunByDefault,
+    help="Run the front end alone and look at its tracks: `frontend DATA` is `frontend run DATA`.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@app.command("run")
+def run(
+    data: Data,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    cameras: Cameras = None,
+    start: Start = None,
+    duration: Duration = None,
+    picture: Annotated[
+        Path, typer.Option("--picture", help="PNG of the frame in the middle with its tracks.")
+    ] = Path("tracks.png"),
+    video: Annotated[
+        Path | None, typer.Option("--video", help="MP4 of all frames with their tracks.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Folder to record the tracks to, for replay.")
+    ] = None,
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    as_json: Json = False,
+) -> None:
+    """Track a recording, report how good the tracks are, and draw them."""
+    from slam_graph.config import load_config
+    from slam_graph.datasets.registry import open_dataset
+    from slam_graph.experiment.frontends import track
+
+    settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
+    sequence = open_dataset(
+        data,
+        format=format_,
+        cameras=settings.cameras,
+        calibration=calibration,
+        groundtruth=groundtruth,
+    )
+    with ExitStack() as stack:
+        watch = _watch(sequence, settings, picture, video, record, stack)
+        report = track(sequence, settings, settings.frontend.method, watch)
+    files = [str(path) for path in (picture, video, record) if path is not None]
+    if as_json:
+        echo_json({**_plain(report), "files": files})
+        return
+    echo_table(_lines(report))
+    typer.echo("\n" + " ".join(files))
+
+
+@app.command("compare")
+def compare(
+    data: Data,
+    frontends: Annotated[
+        str,
+        typer.Option("--frontends", help="METHOD or METHOD/DETECTOR, with commas between."),
+    ] = EVERYTHING,
+    algorithm: Annotated[
+        str | None,
+        typer.Option("--algorithm", help="Also estimate the trajectory from each one's tracks."),
+    ] = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    cameras: Cameras = None,
+    start: Start = None,
+    duration: Duration = None,
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    as_json: Json = False,
+) -> None:
+    """Run several front ends on one recording, and print a table."""
+    from slam_graph.config import load_config
+    from slam_graph.datasets.registry import open_dataset
+    from slam_graph.experiment.frontends import parse_frontends, track, track_and_estimate
+
+    said = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
+    reports = []
+    for name, changes in parse_frontends(n for n in frontends.split(",") if n).items():
+        settings = load_config(config, [*(set_ or ()), *changes], **said)
+        sequence = open_dataset(
+            data,
+            format=format_,
+            cameras=settings.cameras,
+            calibration=calibration,
+            groundtruth=groundtruth,
+        )
+        go = track if algorithm is None else track_and_estimate
+        reports.append(go(sequence, settings, name))
+        typer.echo(f"{name}: done", err=True)
+    if as_json:
+        echo_json([_plain(report) for report in reports])
+    else:
+        echo_table([COLUMNS, *map(_row, reports)])
+
+
+def _watch(
+    sequence: Sequence,
+    settings: RunConfig,
+    picture: Path,
+    video: Path | None,
+    record: Path | None,
+    stack: ExitStack,
+) -> Callable[[TrackedPacket], None]:
+    """What is done with every frame: drawn, and recorded if asked for."""
+    from slam_graph.datasets.recording import TrackRecorder
+    from slam_graph.sensors.measurements import CameraFrame
+    from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
+
+    painter = TrackPainter()
+    film = None if video is None else stack.enter_context(TrackVideo(video))
+    recorder = None
+    info = sequence.info()
+    if record is not None:
+        recorder = stack.enter_context(
+            TrackRecorder(record, sequence.rig, info.name, sequence.groundtruth())
+        )
+    length_ns = info.end_ns - info.start_ns - round(settings.start_s * 1e9)
+    if settings.duration_s is not None:
+        length_ns = min(length_ns, round(settings.duration_s * 1e9))
+    middle_ns = info.start_ns + round(settings.start_s * 1e9) + length_ns // 2
+    saved = False
+
+    def watch(tracked: TrackedPacket) -> None:
+        nonlocal saved
+        frame = tracked.packet.frame
+        assert isinstance(frame, CameraFrame)
+        drawn = painter.paint(frame, tracked.features)
+        if film is not None:
+            film.write(drawn)
+        if not saved and frame.stamp_ns >= middle_ns:
+            save_picture(picture, drawn)
+            saved = True
+        if recorder is not None:
+            recorder.write(tracked.packet.imu, tracked.features)
+
+    return watch
+
+
+COLUMNS = (
+    "front end",
+    "features",
+    "length median",
+    "mean",
+    "inliers",
+    "coverage",
+    "epipolar px",
+    "wrong",
+    "ms",
+    "ATE m",
+    "status",
+)
+
+
+def _row(report: FrontendReport) -> list[str]:
+    """The cells of a front end in the table."""
+    tracks = report.tracks
+    return [
+        report.name,
+        f"{tracks.features:.0f}",
+        f"{tracks.median_length:.0f}",
+        f"{tracks.mean_length:.1f}",
+        f"{report.inliers:.3f}",
+        f"{tracks.coverage:.2f}",
+        number(tracks.epipolar_px, 2),
+        number(tracks.wrong, 3),
+        f"{report.ms.get('total', 0.0):.1f}",
+        number(report.ate_m, 4),
+        report.status or "-",
+    ]
+
+
+def _lines(report: FrontendReport) -> list[tuple[str, str]]:
+    """The report of one front end."""
+    tracks = report.tracks
+    counts = ", ".join(f"{name} {value:.1f}" for name, value in report.counts.items())
+    stages = ", ".join(f"{name} {value:.2f}" for name, value in report.ms.items())
+    return [
+        ("frames", str(tracks.frames)),
+        ("features a frame", f"{tracks.features:.1f}"),
+        ("track length", f"median {tracks.median_length:.0f}, mean {tracks.mean_length:.1f}"),
+        ("inliers", f"{report.inliers:.3f}"),
+        ("coverage", f"{tracks.coverage:.2f} of the cells hold a feature"),
+        ("epipolar error", f"{number(tracks.epipolar_px, 2)} px against the true motion"),
+        ("wrong", f"{number(tracks.wrong, 4)} of the features"),
+        ("between cameras", f"{number(tracks.stereo_px, 2)} px from the epipolar line"),
+        ("counts a frame", counts),
+        ("ms a frame", stages),
+    ]
+
+
+def _plain(report: FrontendReport) -> dict[str, Any]:
+    """A report for JSON, which knows no NaN."""
+    table = report.table()
+    if table["inliers"] != table["inliers"]:
+        table["inliers"] = None
+    return table

@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Detectors: what in an image is worth following.
+
+Corner scores are local, so those detectors look only at the cells of the grid that need features.
+The others build a pyramid, and look at the image as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.keypoints import Indices, Keypoints, Points
+from slam_graph.frontend.optional import require
+from slam_graph.frontend.tracks import Image
+
+HARRIS_K = 0.04
+"""Weight of the trace in Harris' score det - k trace² (Harris and Stephens 1988)."""
+
+FAST_SIZE_PX = 7.0
+"""Diameter of FAST's circle."""
+
+SUBPIXEL_RADIUS_PX = 3
+SUBPIXEL_LIMIT_PX = 1.5
+"""A corner that refinement moves further has been drawn to another one."""
+
+
+class Detector(Protocol):
+    """Finds keypoints.
+
+    Attributes:
+        local: whether a part of an image is enough to judge a keypoint in it.
+    """
+
+    local: bool
+
+    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+        """The strongest keypoints, best first.
+
+        Args:
+            image: (height, width), or a part of it.
+            allowed: of the same size, zero where none are wanted.
+            count: how many are wanted; there may be more, and too close together.
+        """
+        ...
+
+
+class GradientCorners:
+    """Corners by the covariance of the gradient: Shi and Tomasi 1994, or Harris and Stephens 1988.
+
+    Both scores are functions of its eigenvalues λ₁ ≤ λ₂: λ₁, and λ₁ λ₂ - k (λ₁ + λ₂)².
+    """
+
+    local = True
+
+    def __init__(self, config: FrontendConfig, harris: bool) -> None:
+        self._config = config
+        self._harris = harris
+        # Harris' score of a corner with two eigenvalues that are just large enough
+        self._smallest = config.min_corner_score
+        if harris:
+            self._smallest = (1.0 - 4.0 * HARRIS_K) * config.min_corner_score**2
+
+    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+        """The strongest corners."""
+        config = self._config
+        corners, scores = cv2.goodFeaturesToTrackWithQuality(
+            image,
+            count,
+            # the share is one of eigenvalues, of which Harris' score is the square
+            config.relative_corner_score ** (2 if self._harris else 1),
+            config.min_distance_px,
+            allowed,
+            blockSize=config.corner_window_px,
+            useHarrisDetector=self._harris,
+            k=HARRIS_K,
+        )
+        if corners is None:
+            return Keypoints.concatenate([])
+        found = Keypoints.of(
+            np.asarray(corners, np.float32),
+            np.ravel(scores).astype(np.float32),
+            float(config.corner_window_px),
+        )
+        return found.select(found.scores >= self._smallest)
+
+
+class FastCorners:
+    """FAST (Rosten and Drummond 2006): a circle of which a long arc is brighter or darker."""
+
+    local = True
+
+    def __init__(self, config: FrontendConfig) -> None:
+        # Thresholds to try one after the other: as configured, then half of it
+        self._detectors = [
+            cv2.FastFeatureDetector.create(max(1, config.fast_threshold // divisor))
+            for divisor in (1, 2)
+        ]
+
+    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+        """The corners with the largest threshold at which they would still be found."""
+        for detector in self._detectors:
+            found = detector.detect(image, allowed)
+            if len(found) >= count:
+                break
+        keypoints = Keypoints.from_opencv(found)
+        return keypoints.select(_strongest_first(keypoints))
+
+
+class WholeImage:
+    """A detector of OpenCV that looks at several scales.
+
+    Args:
+        detector: does the work.
+        shrink: by what factor the image is reduced before it is looked at.
+    """
+
+    local = False
+
+    def __init__(self, detector: cv2.Feature2D, shrink: int = 1) -> None:
+        self._detector = detector
+        self._shrink = shrink
+
+    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+        """The strongest keypoints of all scales."""
+        shrink = self._shrink
+        if shrink > 1:
+            size = (image.shape[1] // shrink, image.shape[0] // shrink)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            allowed = np.asarray(cv2.resize(allowed, size, interpolation=cv2.INTER_NEAREST))
+        found = Keypoints.from_opencv(self._detector.detect(image, allowed))
+        if shrink > 1:
+            # pixel centres are at integers: pixel u of the reduced image is the middle of a block
+            pixels = ((found.pixels + 0.5) * shrink - 0.5).astype(np.float32)
+            size_px = (found.sizes_px * shrink).astype(np.float32)
+            found = Keypoints(pixels, found.scores, size_px, found.angles_deg, found.octaves)
+        return found.select(_strongest_first(found))
+
+
+class SurfBlobs:
+    """SURF's detector: maxima of the determinant of the Hessian over space and scale (Bay 2008).
+
+    Raises:
+        ConfigError: where mahotas is not installed.
+    """
+
+    local = False
+
+    def __init__(self) -> None:
+        self._surf = require("mahotas.features.surf", "detector and descriptor SURF")
+
+    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+        """The strongest blobs."""
+        rows = self._surf.interest_points(image, nr_octaves=3, nr_scales=4, max_points=2 * count)
+        found = Keypoints.of(rows[:, 1::-1].astype(np.float32), rows[:, 3].astype(np.float32), 0.0)
+        # a blob of scale s is one of a Gaussian of that width
+        sizes = (2.0 * rows[:, 2]).astype(np.float32)
+        found = Keypoints(found.pixels, found.scores, sizes, found.angles_deg, found.octaves)
+        u, v = np.rint(found.pixels).astype(int).T
+        height, width = allowed.shape
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        inside[inside] = allowed[v[inside], u[inside]] > 0
+        found = found.select(inside)
+        return found.select(_strongest_first(found))
+
+
+def _difference_of_gaussians(config: FrontendConfig) -> Detector:
+    """SIFT's detector (Lowe 2004).
+
+    OpenCV doubles the image first, as Lowe does. On video the finest octave costs three quarters of
+    the time and gives the least stable keypoints, so the image is halved before.
+    """
+    return WholeImage(cv2.SIFT.create(4 * config.features, contrastThreshold=0.02), shrink=2)
+
+
+def _orb(config: FrontendConfig) -> Detector:
+    """ORB's detector (Rublee et al. 2011): FAST on a pyramid, ranked by Harris, with direction."""
+    return WholeImage(
+        cv2.ORB.create(
+            20 * config.features,
+            nlevels=ORB_LEVELS,
+            edgeThreshold=ORB_EDGE_PX,
+            fastThreshold=max(1, config.fast_threshold // 4),
+        )
+    )
+
+
+def _brisk(config: FrontendConfig) -> Detector:
+    """BRISK's detector (Leutenegger et al. 2011): AGAST corners, maximal over scale too."""
+    return WholeImage(cv2.BRISK.create(thresh=config.fast_threshold, octaves=BRISK_OCTAVES))
+
+
+ORB_LEVELS = 4
+ORB_EDGE_PX = 20
+BRISK_OCTAVES = 2
+
+DETECTORS: dict[str, Callable[[FrontendConfig], Detector]] = {
+    "shi_tomasi": lambda config: GradientCorners(config, harris=False),
+    "harris": lambda config: GradientCorners(config, harris=True),
+    "fast": FastCorners,
+    "dog": _difference_of_gaussians,
+    "surf": lambda config: SurfBlobs(),
+    "orb": _orb,
+    "brisk": _brisk,
+}
+"""Detectors by the name that `FrontendConfig.detector` gives."""
+
+
+def refine(image: Image, pixels: Points) -> Points:
+    """Corners (N, 2) to a fraction of a pixel.
+
+    All gradients around a corner are orthogonal to the way to it (Förstner and Gülch 1987).
+    """
+    if len(pixels) == 0:
+        return pixels
+    window = (SUBPIXEL_RADIUS_PX, SUBPIXEL_RADIUS_PX)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
+    refined = np.asarray(cv2.cornerSubPix(image, pixels.copy(), window, (-1, -1), criteria))
+    refined = refined.reshape(-1, 2)
+    moved = np.linalg.norm(refined - pixels, axis=1)
+    return np.where((moved < SUBPIXEL_LIMIT_PX)[:, None], refined, pixels).astype(np.float32)
+
+
+def _strongest_first(keypoints: Keypoints) -> Indices:
+    return np.argsort(-keypoints.scores, kind="stable")

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the features of a camera will be in its next image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from slam_graph.frontend.base import Feedback
+from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.frontend.motion import ImuMotion
+from slam_graph.frontend.tracks import Tracks
+from slam_graph.sensors.rig import RigCamera
+
+FloatArray = NDArray[np.float64]
+
+NEAREST_DEPTH_M = 0.1
+"""Points of the map nearer than this, or behind the camera, predict nothing."""
+
+MAX_TANGENT = 2.75
+"""Largest normalised coordinate that a camera model is asked about."""
+
+NEIGHBOURS = 3
+"""The motion of this many neighbours stands for that of a new feature."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where features will be.
+
+    Attributes:
+        points: (N, 2) float32 pixels.
+        trusted: (N,) whether the rotation was measured and the rest is known of the frame before.
+    """
+
+    points: Points
+    trusted: Mask
+
+
+class PointPredictor:
+    """Predicts the features of one camera.
+
+    Attributes:
+        camera_R: end_R_start of the camera over the last prediction; the identity where unknown.
+        rotation_known: whether the gyroscope measured it.
+    """
+
+    def __init__(self, mounted: RigCamera, motion: ImuMotion, config: FrontendConfig) -> None:
+        self._camera = mounted.camera
+        self._body_T_camera = mounted.body_T_camera
+        self._offset_ns = round(mounted.time_offset_s * 1e9)
+        self._motion = motion
+        self._mode = config.prediction
+        self.camera_R: FloatArray = np.eye(3)
+        self.rotation_known = False
+
+    def advance(self, start_ns: int, end_ns: int) -> None:
+        """Integrate the rotation between two frames (times of the camera)."""
+        start_R_end = self._motion.rotation(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        self.rotation_known = start_R_end is not None and self._mode != "flow"
+        self.camera_R = np.eye(3)
+        if start_R_end is not None:
+            body_R_camera = self._body_T_camera.rotation().matrix()
+            self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
+
+    def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Prediction:
+        """Where to look for the features of the image before.
+
+        Args:
+            before: in the image from which `advance` started.
+            stamp_ns: time of the new image.
+            feedback: the map, for the mode `state`.
+        """
+        if self._mode == "none" or len(before) == 0:
+            return Prediction(before.pixels, np.zeros(len(before), np.bool_))
+        trusted: Mask = np.isfinite(before.drift[:, 0]) & self.rotation_known
+        m = self._rotated(before.normalized)
+        m = m + np.nan_to_num(before.drift) * ((stamp_ns - before.stamp_ns) * 1e-9)
+        if self._mode == "state":
+            known, by_map = self._by_map(before.ids, stamp_ns, feedback)
+            m[known], trusted[known] = by_map[known], True
+        sane = np.all(np.abs(m) < MAX_TANGENT, axis=1)
+        pixels = before.pixels.copy()
+        pixels[sane] = self._camera.distort(m[sane])[0]
+        size = np.array([self._camera.width - 1, self._camera.height - 1])
+        outside = np.any((pixels < 0) | (pixels > size), axis=1)
+        pixels[outside] = before.pixels[outside]
+        return Prediction(pixels, trusted & sane & ~outside)
+
+    def body_pose(self, stamp_ns: int) -> gtsam.Pose3 | None:
+        """world_T_body at a time of the camera; None where it is not known."""
+        return self._motion.pose(stamp_ns + self._offset_ns)
+
+    def drift(self, start: FloatArray, end: FloatArray, seconds: float) -> FloatArray:
+        """What (N, 2) normalised points have moved beyond the rotation, in 1/s."""
+        if seconds <= 0:
+            return np.zeros_like(end)
+        moved: FloatArray = (end - self._rotated(start)) / seconds
+        return moved
+
+    def _rotated(self, normalized: FloatArray) -> FloatArray:
+        if self._mode == "flow":
+            return normalized.copy()
+        rays = np.column_stack([normalized, np.ones(len(normalized))]) @ self.camera_R.T
+        turned: FloatArray = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
+        return turned
+
+    def _by_map(
+        self, ids: NDArray[np.int64], stamp_ns: int, feedback: Feedback
+    ) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Which features (N,) are in the map, and where (N, 2) the predicted pose sees them."""
+        m = np.zeros((len(ids), 2))
+        known = np.isin(ids, feedback.ids)
+        world_T_body = self.body_pose(stamp_ns)
+        if world_T_body is None or not known.any():
+            return np.zeros(len(ids), np.bool_), m
+        points = feedback.points[np.searchsorted(feedback.ids, ids[known])]
+        camera_T_world: gtsam.Pose3 = (world_T_body * self._body_T_camera).inverse()
+        seen = np.asarray(camera_T_world.transformFrom(points.T)).T
+        m[known] = seen[:, :2] / np.maximum(seen[:, 2:], NEAREST_DEPTH_M)
+        known[known] = seen[:, 2] > NEAREST_DEPTH_M
+        return known, m
+
+
+def neighbour_flow(start: Points, end: Points, at: Points) -> Points:
+    """The motion (M, 2) of the nearest of N features at other places.
+
+    Args:
+        start: (N, 2) pixels of features in one image.
+        end: (N, 2) the same features in another.
+        at: (M, 2) pixels in the first one.
+    """
+    if len(start) < NEIGHBOURS:
+        return np.zeros_like(at)
+    _, nearest = cKDTree(start).query(at, k=NEIGHBOURS)
+    return np.asarray(np.median((end - start)[nearest], axis=1), np.float32)

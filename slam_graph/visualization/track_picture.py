@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Feature tracks drawn on the images: where each feature is and the way that it came."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.errors import DataError
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+
+Picture = NDArray[np.uint8]
+
+TAIL_FRAMES = 15
+"""How much of its way is drawn behind a feature, and the age at which its colour is full."""
+
+FRAMES_PER_S = 20.0
+
+
+class TrackPainter:
+    """Draws the tracks of each frame on its images, the cameras side by side.
+
+    Young features are blue and old ones red; one that is also seen by another camera has a ring.
+    """
+
+    def __init__(self) -> None:
+        self._ages: dict[int, int] = {}
+        self._tails: list[dict[int, deque[tuple[int, int]]]] = []
+
+    def paint(self, frame: CameraFrame, features: FeatureFrame) -> Picture:
+        """The picture of a frame (height, width of all cameras, 3), BGR."""
+        seen = [set(camera.ids.tolist()) for camera in features.cameras]
+        everywhere: dict[int, int] = defaultdict(int)
+        for ids in seen:
+            for j in ids:
+                everywhere[j] += 1
+        self._ages = {j: self._ages.get(j, 0) + 1 for j in everywhere}
+        self._tails = self._tails or [{} for _ in seen]
+        pictures = []
+        sizes = [image.shape for image in frame.images if image is not None]
+        for number, (image, camera) in enumerate(zip(frame.images, features.cameras, strict=True)):
+            if image is None:
+                image = np.zeros(sizes[0] if sizes else (480, 640), np.uint8)
+            picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+            tails = self._tails[number]
+            for j, (u, v) in zip(camera.ids.tolist(), camera.pixels.tolist(), strict=True):
+                tail = tails.setdefault(j, deque(maxlen=TAIL_FRAMES))
+                tail.append((round(8 * u), round(8 * v)))
+                self._mark(picture, tail, self._ages[j], everywhere[j] > 1)
+            self._tails[number] = {j: tail for j, tail in tails.items() if j in seen[number]}
+            pictures.append(picture)
+        height = max(picture.shape[0] for picture in pictures)
+        return np.concatenate([_padded(picture, height) for picture in pictures], axis=1)
+
+    def _mark(
+        self, picture: NDArray[np.uint8], tail: deque[tuple[int, int]], age: int, shared: bool
+    ) -> None:
+        """Draw one feature; places are in eighths of a pixel."""
+        share = min(age / TAIL_FRAMES, 1.0)
+        colour = (255 * (1 - share), 160 * (1 - abs(2 * share - 1)) + 40, 255 * share)
+        way = np.array(tail, np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [way], False, colour, 1, cv2.LINE_AA, 3)
+        cv2.circle(picture, tail[-1], 16, colour, cv2.FILLED, cv2.LINE_AA, 3)
+        if shared:
+            cv2.circle(picture, tail[-1], 36, colour, 1, cv2.LINE_AA, 3)
+
+
+class TrackVideo:
+    """Writes pictures to a video; a context manager.
+
+    Args:
+        path: of the file; its ending names the container, e.g. .mp4.
+
+    Raises:
+        DataError: at the first picture, if it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._writer: cv2.VideoWriter | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._writer is not None:
+            self._writer.release()
+
+    def write(self, picture: Picture) -> None:
+        """Append a picture."""
+        if self._writer is None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            size = (picture.shape[1], picture.shape[0])
+            self._writer = cv2.VideoWriter(str(self._path), code, FRAMES_PER_S, size)
+            if not self._writer.isOpened():
+                raise DataError(f"{self._path}: cannot be written as a video; use .mp4")
+        self._writer.write(picture)
+
+
+def save_picture(path: Path, picture: Picture) -> None:
+    """Write a picture as PNG.
+
+    Raises:
+        DataError: if it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    good, data = cv2.imencode(".png", picture)
+    if not good:
+        raise DataError(f"{path}: the picture cannot be encoded")
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}") from error
+
+
+def _padded(picture: Picture, height: int) -> Picture:
+    """A picture with black below, so that all are equally high."""
+    return np.pad(picture, ((0, height - picture.shape[0]), (0, 0), (0, 0)))
