@@ -34,7 +34,7 @@ from slam_graph.mapping.bal_problem import (
 RowArray = NDArray[np.int32]
 
 MOST_CAMERAS = 1_800
-"""Beyond this the reduced system, which is dense, needs more than 2 GB, and nearly three times that to solve."""
+"""Beyond this the reduced system, which is dense, needs more than 2 GB, and to solve it 6 GB."""
 MOST_PAIRS = 100_000_000
 """Beyond this the table of pairs of observations needs more than 1 GB."""
 
