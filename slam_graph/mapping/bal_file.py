@@ -48,8 +48,8 @@ def is_bal(path: Path) -> bool:
 
 
 def problem_name(path: Path) -> str:
-    """The name of a file without `.txt` or `.txt.bz2`."""
-    return path.name.removesuffix(".bz2").removesuffix(".txt") or path.name
+    """The name of a file without `.txt` or `.txt.bz2`; it also names a folder of results."""
+    return path.name.removesuffix(".bz2").removesuffix(".txt").strip(".") or "problem"
 
 
 def read_bal(path: Path | str) -> BalProblem:
