@@ -8,6 +8,7 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 from __future__ import annotations
 
 from benchmarks import (
+    bal,
     cost_over_time,
     frontend,
     memory,
@@ -32,4 +33,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
+    **bal.BENCHMARKS,
 }
