@@ -8,6 +8,7 @@ A module offers `BENCHMARKS`, a table of `Benchmark` by name.
 from __future__ import annotations
 
 from benchmarks import (
+    bal,
     cost_over_time,
     final_ba,
     frontend,
@@ -34,4 +35,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
+    **bal.BENCHMARKS,
 }

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.config import RunConfig, load_config
+from slam_graph.mapping.bal_policy import BalPolicy
 from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
@@ -43,10 +44,20 @@ schema, for editors that check YAML.
 POSE_GRAPHS = """\
 ## Pose graphs
 
-`slam-graph optimize` has settings of its own, for its `--config` and `--set`:
+`slam-graph optimize` has settings of its own, for its `--config` and `--set`. For a pose graph:
 
 ```sh
 slam-graph optimize graph.g2o --set cost.robust=gnc --set gauss_newton.tolerance=1e-9
+```
+"""
+
+BUNDLES = """\
+## Bundle adjustment of BAL files
+
+The settings of `slam-graph optimize` for a problem in BAL's format:
+
+```sh
+slam-graph optimize problem.txt --set cost.robust_width_px=1.5 --set gauss_newton.tolerance=1e-9
 ```
 """
 
@@ -58,9 +69,10 @@ def page() -> str:
     schema = RunConfig.model_json_schema()
     defaults = load_config().model_dump(mode="json")
     sections = [INTRODUCTION, *_sections(schema, schema["$defs"], defaults, "")]
-    schema = PoseGraphPolicy.model_json_schema()
-    defaults = PoseGraphPolicy().model_dump(mode="json")
-    sections += [POSE_GRAPHS, *_sections(schema, schema["$defs"], defaults, "")]
+    for heading, policy in ((POSE_GRAPHS, PoseGraphPolicy()), (BUNDLES, BalPolicy())):
+        schema = policy.model_json_schema()
+        defaults = policy.model_dump(mode="json")
+        sections += [heading, *_sections(schema, schema["$defs"], defaults, "")]
     return "\n".join(sections)
 
 

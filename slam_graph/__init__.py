@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
+    from slam_graph.mapping.bal_adjustment import adjust_bundle
+    from slam_graph.mapping.bal_file import read_bal
+    from slam_graph.mapping.bal_policy import BalPolicy
     from slam_graph.mapping.pose_graph_certificate import certify
     from slam_graph.mapping.pose_graph_file import read_pose_graph
     from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from slam_graph.pipeline import RunResult, run
 
 __all__ = [
+    "BalPolicy",
     "Estimator",
     "NavState",
     "PoseGraphPolicy",
@@ -38,12 +42,14 @@ __all__ = [
     "SlamGraphError",
     "Trajectory",
     "__version__",
+    "adjust_bundle",
     "ape",
     "build_estimator",
     "certify",
     "load_config",
     "open_dataset",
     "optimize_pose_graph",
+    "read_bal",
     "read_groundtruth",
     "read_pose_graph",
     "rpe",
@@ -51,6 +57,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "BalPolicy": "slam_graph.mapping.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
     "NavState": "slam_graph.geometry.trajectory",
     "PoseGraphPolicy": "slam_graph.mapping.pose_graph_policy",
@@ -58,12 +65,14 @@ _HOME = {
     "RunResult": "slam_graph.pipeline",
     "SlamGraphError": "slam_graph.errors",
     "Trajectory": "slam_graph.geometry.trajectory",
+    "adjust_bundle": "slam_graph.mapping.bal_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "build_estimator": "slam_graph.backend.build",
     "certify": "slam_graph.mapping.pose_graph_certificate",
     "load_config": "slam_graph.config",
     "open_dataset": "slam_graph.datasets.registry",
     "optimize_pose_graph": "slam_graph.mapping.pose_graph_optimization",
+    "read_bal": "slam_graph.mapping.bal_file",
     "read_groundtruth": "slam_graph.datasets.groundtruth",
     "read_pose_graph": "slam_graph.mapping.pose_graph_file",
     "rpe": "slam_graph.evaluation.rpe",

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph optimize` for pose graphs: their optimum, its certificate and its covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from slam_graph.cli.logs import collected_log
+from slam_graph.cli.optimization import timed, write_result
+from slam_graph.cli.output import echo_json, echo_table
+
+if TYPE_CHECKING:
+    from slam_graph.diagnostics import Diagnostics
+    from slam_graph.mapping.pose_graph import PoseGraph, RotationInformation
+    from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
+    from slam_graph.output.pose_graph_result import PoseGraphResult
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is asked for beside the poses.
+
+    Attributes:
+        certificate: whether the result is the global optimum.
+        covariances: of every pose.
+    """
+
+    certificate: bool
+    covariances: bool
+
+
+def optimize_pose_graph_file(
+    file: Path,
+    information: RotationInformation,
+    policy: PoseGraphPolicy,
+    wanted: Wanted,
+    save: Path | None,
+    output: Path,
+    as_json: bool,
+) -> None:
+    """Estimate all poses, write the results and print what was reached."""
+    from slam_graph.diagnostics import Diagnostics
+    from slam_graph.mapping.pose_graph_file import g2o_lines, read_pose_graph
+    from slam_graph.output.files import write_text
+
+    diagnostics = Diagnostics()
+    seconds: dict[str, float] = {}
+    with collected_log() as log:
+        with timed(seconds, "read"):
+            graph = read_pose_graph(file, diagnostics, information)
+        result = _solve(graph, policy, diagnostics, seconds, wanted)
+        folder, files = write_result(result, graph.name, output, log)
+        if save is not None:
+            write_text(save, g2o_lines(graph, result.solution.poses))
+    if as_json:
+        echo_json({**result.metrics, "folder": str(folder), "files": [str(path) for path in files]})
+    else:
+        _report(result, folder, files)
+
+
+def _solve(
+    graph: PoseGraph,
+    policy: PoseGraphPolicy,
+    diagnostics: Diagnostics,
+    seconds: dict[str, float],
+    wanted: Wanted,
+) -> PoseGraphResult:
+    """Optimise, and find out what else is asked for."""
+    from slam_graph.mapping.pose_graph_certificate import certify
+    from slam_graph.mapping.pose_graph_covariance import marginal_covariances
+    from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
+    from slam_graph.output.pose_graph_result import PoseGraphResult
+
+    with timed(seconds, "optimize"):
+        solution = optimize_pose_graph(graph, policy, diagnostics)
+    certificate = covariances = None
+    if wanted.certificate:
+        with timed(seconds, "certify"):
+            certificate = certify(solution.weighted_graph(), solution.poses)
+    if wanted.covariances:
+        with timed(seconds, "covariances"):
+            covariances = marginal_covariances(solution)
+    return PoseGraphResult(policy, solution, certificate, covariances, seconds, diagnostics.counts)
+
+
+def _report(result: PoseGraphResult, folder: Path, files: list[Path]) -> None:
+    """Print what was reached, and where the files are."""
+    metrics = result.metrics
+    echo_table(_overview(metrics))
+    typer.echo("")
+    echo_table(_costs(metrics["chi2"]))
+    typer.echo(f"\n{folder}/")
+    typer.echo("  " + " ".join(path.name for path in files))
+
+
+def _overview(metrics: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What the problem was, and how it was solved."""
+    graph, certificate = metrics["graph"], metrics["certificate"]
+    parts = f", {graph['connected_parts']} parts" if graph["connected_parts"] > 1 else ""
+    yield (
+        "graph",
+        f"{graph['name']}: {graph['dimension']}D, {graph['poses']} poses, {graph['edges']} edges, "
+        f"{graph['loop_closures']} of them loop closures{parts}",
+    )
+    ended = "converged" if metrics["converged"] else "not converged"
+    yield "method", f"{metrics['method']}, {metrics['steps']} steps, {ended}"
+    if metrics["robust"] != "none":
+        yield "robust", f"{metrics['robust']}, {metrics['rejected_edges']} edges rejected"
+    if certificate is not None:
+        verdict = "globally optimal" if certificate["certified"] else "NOT certified"
+        yield (
+            "certificate",
+            f"{verdict}: SE-Sync's objective is {certificate['objective']:.8g} and cannot be below "
+            f"{certificate['bound']:.8g}",
+        )
+        yield (
+            "",
+            f"at {certificate['moved_m']:.3g} m, {certificate['moved_deg']:.3g} deg from the "
+            "estimate, which minimises GTSAM's",
+        )
+    yield "seconds", ", ".join(f"{part} {s:.2f}" for part, s in metrics["timing_s"].items())
+    if metrics["warnings"]:
+        yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
+
+
+def _costs(chi2: dict[str, dict[str, float]]) -> Iterator[tuple[str, ...]]:
+    """The cost before, at the start and after, as three programs count it."""
+    yield "", "GTSAM error", "GTSAM chi2", "g2o chi2", "SE-Sync F"
+    for stage, values in chi2.items():
+        yield stage, *(f"{value:.8g}" for value in values.values())

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All that a bundle adjustment of a BAL problem found out, and its files."""
+
+from __future__ import annotations
+
+import bz2
+import json
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_graph.config import dump_yaml
+from slam_graph.mapping.bal_cost import reprojection_errors
+from slam_graph.mapping.bal_file import bal_lines
+from slam_graph.mapping.bal_policy import BalPolicy, BalSolution
+from slam_graph.mapping.bal_problem import BalEstimates, FloatArray
+from slam_graph.output.files import appearing, write_text
+from slam_graph.output.metrics import finite, versions
+
+SCHEMA_VERSION = 1
+"""Counts up whenever a key changes its name or meaning."""
+
+POINT_COLOUR = (200, 200, 200)
+CAMERA_COLOUR = (220, 30, 30)
+
+Table = dict[str, Any]
+
+
+@dataclass(eq=False)
+class BalResult:
+    """What a bundle adjustment found out.
+
+    Attributes:
+        policy: how it was done.
+        solution: the estimates.
+        seconds: wall time of each part.
+        warnings: counted faults and repairs.
+    """
+
+    policy: BalPolicy
+    solution: BalSolution
+    seconds: dict[str, float] = field(default_factory=dict)
+    warnings: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def name(self) -> str:
+        """Of the problem."""
+        return self.solution.problem.name
+
+    @cached_property
+    def after(self) -> BalEstimates:
+        """Estimates of what was in the cost."""
+        return self.solution.estimates.select(self.solution.part.cameras, self.solution.part.points)
+
+    @cached_property
+    def errors_px(self) -> dict[str, FloatArray]:
+        """Reprojection errors of the observations in the cost: (N,) before and after."""
+        problem = self.solution.part.problem
+        return {
+            "before": reprojection_errors(problem, problem.estimates),
+            "after": reprojection_errors(problem, self.after),
+        }
+
+    @cached_property
+    def metrics(self) -> Table:
+        """The content of `metrics.json`; JSON can hold every value of it."""
+        problem, part, minimum = self.solution.problem, self.solution.part, self.solution.minimum
+        table: Table = finite(
+            {
+                "schema_version": SCHEMA_VERSION,
+                "problem": {
+                    "name": problem.name,
+                    "cameras": problem.cameras,
+                    "points": problem.points,
+                    "observations": len(problem.camera),
+                    "used_cameras": part.problem.cameras,
+                    "used_points": part.problem.points,
+                    "used_observations": len(part.problem.camera),
+                    "groups": int(part.groups.max()) + 1,
+                },
+                "intrinsics": self.policy.cost.intrinsics,
+                "robust": self.policy.cost.robust,
+                "cost": {"before": minimum.start_cost, "after": minimum.cost},
+                "reprojection_px": {
+                    stage: {
+                        "rmse": float(np.sqrt(np.mean(errors**2))),
+                        "median": float(np.median(errors)),
+                        "max": float(np.max(errors)),
+                    }
+                    for stage, errors in self.errors_px.items()
+                },
+                "steps": minimum.steps,
+                "rejected_steps": minimum.rejected,
+                "converged": minimum.converged,
+                "timing_s": self.seconds,
+                "warnings": dict(sorted(self.warnings.items())),
+                "versions": versions(),
+            }
+        )
+        return table
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write all files into a folder, each whole or not at all.
+
+        Returns:
+            The files.
+        """
+        texts = {
+            "optimized.txt": self.lines(),
+            "config.yaml": [dump_yaml(self.policy)],
+            "metrics.json": [json.dumps(self.metrics, indent=2, allow_nan=False), "\n"],
+        }
+        for name, lines in texts.items():
+            write_text(folder / name, lines)
+        write_scene_ply(folder / "scene.ply", self.after)
+        self._draw(folder / "bundle_adjustment.png")
+        return [folder / name for name in (*texts, "scene.ply", "bundle_adjustment.png")]
+
+    def lines(self) -> Iterable[str]:
+        """The whole problem with its estimates, in BAL's format."""
+        return bal_lines(self.solution.problem, self.solution.estimates)
+
+    def save_problem(self, path: Path) -> None:
+        """Write the whole problem with its estimates, compressed if the name ends with `.bz2`."""
+        if path.suffix != ".bz2":
+            write_text(path, self.lines())
+            return
+        with appearing(path) as partial:
+            partial.write_bytes(bz2.compress("".join(self.lines()).encode("ascii")))
+
+    def _draw(self, path: Path) -> None:
+        from slam_graph.visualization.bal_plot import plot_bundle
+
+        part = self.solution.part.problem
+        title = f"{self.name}: {part.cameras} cameras, {part.points} points"
+        with appearing(path) as partial:
+            plot_bundle(partial, title, self.after.points, self.after.centres(), self.errors_px)
+
+
+def write_scene_ply(path: Path, estimates: BalEstimates) -> None:
+    """Write points in grey and the centres of cameras in red as one binary PLY point cloud."""
+    places = np.concatenate([estimates.points, estimates.centres()])
+    colours = np.repeat(
+        np.array([POINT_COLOUR, CAMERA_COLOUR], np.uint8),
+        (len(estimates.points), len(estimates.rotations)),
+        axis=0,
+    )
+    vertices = np.empty(len(places), [("place", "<f8", 3), ("colour", "u1", 3)])
+    vertices["place"], vertices["colour"] = places, colours
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header",
+    ]
+    with appearing(path) as partial:
+        partial.write_bytes("\n".join(lines).encode("ascii") + b"\n" + vertices.tobytes())
