@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -144,7 +145,10 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
         "1",
     ]
     process = subprocess.Popen(
-        [*COMMAND, *arguments, "--output", tmp_path], stderr=subprocess.PIPE, text=True
+        [*COMMAND, *arguments, "--output", tmp_path],
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
     )
     assert process.stderr is not None
     first = process.stderr.readline()
