@@ -114,7 +114,7 @@ class RunConfig(Settings):
     backend: BackendConfig = BackendConfig()
     """From features and IMU to states."""
     final_ba: FinalBaConfig = FinalBaConfig()
-    """The bundle adjustment over the whole recording that ends a run."""
+    """The bundle adjustment of the whole recording at the end of a run."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 
