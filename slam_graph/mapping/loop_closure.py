@@ -58,16 +58,16 @@ class LoopClosures:
         length = np.maximum(stamps[after] - stamps[before], 1)
         weight = np.clip((trajectory.stamps_ns - stamps[before]) / length, 0.0, 1.0)
         causal = stacked([k.world_T_body for k in self.keyframes])
-        body = Poses(
-            Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions
-        )
+        body = Poses(Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions)
         ends = [
             self.poses.select(at).compose(causal.select(at).inverse()).compose(body)
             for at in (before, after)
         ]
         mixed = _between(*ends, weight)
         return Trajectory(
-            trajectory.stamps_ns, mixed.translations, Rotation.from_matrix(mixed.rotations).as_quat()
+            trajectory.stamps_ns,
+            mixed.translations,
+            Rotation.from_matrix(mixed.rotations).as_quat(),
         )
 
     def points(self) -> FloatArray:
@@ -106,9 +106,17 @@ def close_loops(
         seed: of the training of the vocabulary.
         diagnostics: counts what is rejected.
     """
-    diagnostics = diagnostics or Diagnostics()
+    return correct_by(keyframes, find_loops(keyframes, rig, config, seed), config, diagnostics)
+
+
+def correct_by(
+    keyframes: list[Keyframe],
+    loops: list[Loop],
+    config: LoopClosureConfig,
+    diagnostics: Diagnostics | None = None,
+) -> LoopClosures:
+    """Correct keyframes by loop closures, some of which may be false."""
     causal = stacked([k.world_T_body for k in keyframes])
-    loops = find_loops(keyframes, rig, config, seed)
     if not loops:
         return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal)
     stamps = np.array([k.stamp_ns for k in keyframes])
@@ -157,7 +165,8 @@ class PlaceRecognition:
     """
 
     def __init__(self, vocabulary: Vocabulary, config: PlaceConfig) -> None:
-        self._database = PlaceDatabase(vocabulary)
+        self._vocabulary = vocabulary
+        self._database = PlaceDatabase(len(vocabulary.words))
         self._config = config
         self._stamps_ns: list[int] = []
         self._similar: list[IntArray] = []
@@ -165,13 +174,14 @@ class PlaceRecognition:
     def add(self, keyframe: Keyframe) -> IntArray:
         """Add the next keyframe, and numbers of earlier ones that may show the same place."""
         config = self._config
-        scores = self._database.query(keyframe.descriptors)
+        bag = self._vocabulary.words_of(keyframe.descriptors)
+        scores = self._database.query(bag)
         old = np.searchsorted(self._stamps_ns, keyframe.stamp_ns - config.min_gap_s * 1e9)
         # what the keyframe just before scores says how similar views of one place are here
         least = config.min_score_ratio * scores[-1] if len(scores) else 0.0
         similar = best_places(scores[:old], least, config.candidates, config.same_place)
         consistent = [place for place in similar.tolist() if self._was_similar(place)]
-        self._database.add(keyframe.descriptors)
+        self._database.add(bag)
         self._stamps_ns.append(keyframe.stamp_ns)
         self._similar.append(similar)
         return np.array(consistent, dtype=np.int64)

@@ -85,9 +85,7 @@ def level(graph: PoseGraph) -> PoseGraph:
     )
 
 
-def _level_information(
-    information: FloatArray, A_i: FloatArray, A_j: FloatArray
-) -> FloatArray:
+def _level_information(information: FloatArray, A_i: FloatArray, A_j: FloatArray) -> FloatArray:
     """(M, 6, 6) of level measurements from that of the bodies': yaw and translation, tilt held.
 
     The tangent is that at the second end, so A_j turns it into the level frame there.

@@ -130,7 +130,9 @@ class LoopVerifier:
         camera_R_body = self._body_T_camera.rotation().matrix().T
         x, y, z = ((body - self._body_T_camera.translation()) @ camera_R_body.T).T
         zero = np.zeros_like(x)
-        by_camera = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(2, 0, 1)
+        by_camera = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(
+            2, 0, 1
+        )
         turn = np.cross(body[:, None, :], np.eye(3)).transpose(0, 2, 1)
         by_pose = np.concatenate([turn, np.tile(-np.eye(3), (len(points), 1, 1))], axis=2)
         J = (by_camera @ camera_R_body @ by_pose).reshape(-1, 6)

@@ -11,6 +11,7 @@ inverted index reaches the keyframes that share a word without looking at the ot
 from __future__ import annotations
 
 from array import array
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,6 +20,19 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WordVector:
+    """A bag of words.
+
+    Attributes:
+        words: (M,) numbers of the words that it has, ascending.
+        weights: (M,) tf-idf weights, of unit length.
+    """
+
+    words: IntArray
+    weights: FloatArray
 
 
 class Vocabulary:
@@ -40,11 +54,11 @@ class Vocabulary:
         matches = self._matcher.match(descriptors)
         return np.fromiter((m.trainIdx for m in matches), np.int64, len(matches))
 
-    def vector(self, descriptors: Descriptors) -> tuple[IntArray, FloatArray]:
-        """The words (M,) of a keyframe, ascending, and their tf-idf weights, of unit length."""
+    def words_of(self, descriptors: Descriptors) -> WordVector:
+        """The bag of words of a keyframe with descriptors (N, B)."""
         words, counts = np.unique(self.quantize(descriptors), return_counts=True)
         weights = counts * self.idf[words]
-        return words, weights / max(float(np.linalg.norm(weights)), 1e-12)
+        return WordVector(words, weights / max(float(np.linalg.norm(weights)), 1e-12))
 
     @staticmethod
     def train(
@@ -91,42 +105,36 @@ def _majority(bits: NDArray[np.int32], nearest: IntArray, centres: Descriptors) 
 class PlaceDatabase:
     """Keyframes by the words that they have.
 
-    A query costs one quantisation, and one pass over the keyframes that share words.
+    A query is one pass over the entries of the words that it has.
 
     Args:
-        vocabulary: of the words.
+        words: size of the vocabulary.
     """
 
-    def __init__(self, vocabulary: Vocabulary) -> None:
-        self.vocabulary = vocabulary
+    def __init__(self, words: int) -> None:
         self._count = 0
-        self._keyframes = [array("q") for _ in range(len(vocabulary.words))]
-        self._weights = [array("d") for _ in range(len(vocabulary.words))]
+        self._keyframes = [array("q") for _ in range(words)]
+        self._weights = [array("d") for _ in range(words)]
 
     def __len__(self) -> int:
         return self._count
 
-    def add(self, descriptors: Descriptors) -> int:
-        """Add the next keyframe, and the number that it has now."""
-        words, weights = self.vocabulary.vector(descriptors)
-        for word, weight in zip(words.tolist(), weights.tolist(), strict=True):
+    def add(self, bag: WordVector) -> None:
+        """Add the next keyframe."""
+        for word, weight in zip(bag.words.tolist(), bag.weights.tolist(), strict=True):
             self._keyframes[word].append(self._count)
             self._weights[word].append(weight)
         self._count += 1
-        return self._count - 1
 
-    def query(self, descriptors: Descriptors) -> FloatArray:
+    def query(self, bag: WordVector) -> FloatArray:
         """Similarity (K,) to every keyframe, from 0 to 1."""
-        words, weights = self.vocabulary.vector(descriptors)
-        keyframes = [np.array(self._keyframes[word]) for word in words.tolist()]
-        shares = [
-            weight * np.array(self._weights[word])
-            for word, weight in zip(words.tolist(), weights.tolist(), strict=True)
-        ]
-        if not keyframes:
+        if len(bag.words) == 0:
             return np.zeros(self._count)
-        joined = np.concatenate(keyframes).astype(np.int64)
-        return np.bincount(joined, np.concatenate(shares), minlength=self._count)
+        words = bag.words.tolist()
+        shared = [np.array(self._keyframes[word], dtype=np.int64) for word in words]
+        weights = [np.array(self._weights[word], dtype=np.float64) for word in words]
+        products = np.concatenate(weights) * np.repeat(bag.weights, [len(x) for x in shared])
+        return np.bincount(np.concatenate(shared), products, minlength=self._count)
 
 
 def best_places(scores: FloatArray, least: float, count: int, apart: int) -> IntArray:
