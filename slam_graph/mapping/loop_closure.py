@@ -59,11 +59,11 @@ class LoopClosures:
         weight = np.clip((trajectory.stamps_ns - stamps[before]) / length, 0.0, 1.0)
         causal = stacked([k.world_T_body for k in self.keyframes])
         body = Poses(Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions)
-        ends = [
+        first, second = (
             self.poses.select(at).compose(causal.select(at).inverse()).compose(body)
             for at in (before, after)
-        ]
-        mixed = _between(*ends, weight)
+        )
+        mixed = _between(first, second, weight)
         return Trajectory(
             trajectory.stamps_ns,
             mixed.translations,

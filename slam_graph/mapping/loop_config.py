@@ -65,7 +65,7 @@ class VerificationConfig(Settings):
     ransac_iterations: int = Field(200, ge=1)
     """Random samples that are tried at most."""
     max_tilt_rad: float = Field(0.05, gt=0)
-    """How much roll and pitch may contradict those of the estimator, which knows them by gravity."""
+    """How much roll and pitch may contradict the estimator, which knows them by gravity."""
     sigma_px: float = Field(2.0, gt=0)
     """Standard deviation of reprojection errors, those of the points included."""
 

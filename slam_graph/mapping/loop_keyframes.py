@@ -44,7 +44,7 @@ class Keyframe:
     points: FloatArray
 
     def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
-        """Ids (M,) and positions (M, 3) in the world of the known points, at another pose if given."""
+        """Ids (M,) and world positions (M, 3) of known points, seen from this pose or another."""
         pose = world_T_body or self.world_T_body
         known = np.isfinite(self.points).all(axis=1)
         rotation = pose.rotation().matrix()

@@ -5,10 +5,10 @@
 An accelerometer and a gyroscope see the vertical, so roll and pitch of a visual-inertial estimate
 do not drift; yaw and position do. With world_R_body = R_z(ψ) A, where R_z(ψ) is the turn about the
 vertical and A the rest, each body has a *level* frame with orientation R_z(ψ), and a relative pose
-i_T_j becomes one of level frames, A_i i_T_j A_j⁻¹, whose rotation is a turn about the vertical up to
-noise. Only that turn is kept. A graph of level measurements has its optimum at level poses: ψ and
-the position are estimated, A stays exactly as it was. What solves any pose graph in space so solves
-this one (Qin, Li and Shen 2018 write the four degrees of freedom out instead).
+i_T_j becomes one of level frames, A_i i_T_j A_j⁻¹, whose rotation is a turn about the vertical, up
+to noise. Only that turn is kept. A graph of level measurements has its optimum at level poses: ψ
+and the position are estimated, A stays exactly as it was. What solves any pose graph in space so
+solves this one (Qin, Li and Shen 2018 write the four degrees of freedom out instead).
 """
 
 from __future__ import annotations
@@ -56,9 +56,11 @@ def loop_graph(
     )
     if loops:
         back = np.argsort(ROTATION_FIRST)
-        information = np.linalg.inv([x.covariance[back[:, None], back] for x in loops])
+        covariances = np.array([x.covariance[back[:, None], back] for x in loops])
         ends = np.array([(x.first, x.second) for x in loops], dtype=np.int64)
-        graph = graph.add_edges(ends, stacked([x.first_T_second for x in loops]), information)
+        graph = graph.add_edges(
+            ends, stacked([x.first_T_second for x in loops]), np.linalg.inv(covariances)
+        )
     return level(graph) if config.degrees_of_freedom == 4 else graph
 
 

@@ -74,7 +74,8 @@ class LoopVerifier:
 
         Args:
             keyframes: all.
-            first, second: numbers of the two, the earlier one first.
+            first: number of the earlier one.
+            second: number of the later one.
             gravity: whether roll and pitch of the keyframes are known.
         """
         config = self._config

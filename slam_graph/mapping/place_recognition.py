@@ -134,7 +134,7 @@ class PlaceDatabase:
         shared = [np.array(self._keyframes[word], dtype=np.int64) for word in words]
         weights = [np.array(self._weights[word], dtype=np.float64) for word in words]
         products = np.concatenate(weights) * np.repeat(bag.weights, [len(x) for x in shared])
-        return np.bincount(np.concatenate(shared), products, minlength=self._count)
+        return np.bincount(np.concatenate(shared), products, self._count).astype(np.float64)
 
 
 def best_places(scores: FloatArray, least: float, count: int, apart: int) -> IntArray:
@@ -146,7 +146,8 @@ def best_places(scores: FloatArray, least: float, count: int, apart: int) -> Int
         count: how many at most.
         apart: numbers of two candidates differ by more than this.
     """
-    left, best = scores.copy(), []
+    left = scores.copy()
+    best: list[int] = []
     while len(best) < count and len(left):
         at = int(np.argmax(left))
         if left[at] < least or left[at] <= 0:
