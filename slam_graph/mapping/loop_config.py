@@ -22,6 +22,8 @@ class KeyframeConfig(Settings):
     """From how many recent frames the points that a keyframe sees are triangulated."""
     frame_spacing_s: float = Field(0.1, ge=0)
     """Time between these frames."""
+    further_corners: int = Field(200, ge=0)
+    """Corners of an image that are described beside the tracked features."""
     max_reprojection_px: float = Field(3.0, gt=0)
     """Points that fit their observations worse than this (root mean square) are left out."""
     max_depth_error: float = Field(0.1, gt=0)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.tracks import TrackWindow
 from slam_graph.backend.triangulation import triangulate
+from slam_graph.frontend.tracks import Image
+from slam_graph.mapping.loop_appearance import KeyframeDescriber
 from slam_graph.mapping.loop_config import KeyframeConfig
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig
@@ -30,7 +32,7 @@ class Keyframe:
     Attributes:
         stamp_ns: time.
         world_T_body: causal estimate of the pose.
-        ids: (N,) features that the first camera sees; -1 for keypoints that are not tracked.
+        ids: (N,) features that the first camera sees; -1 for corners that are not tracked.
         normalized: (N, 2) where, on the plane z = 1.
         descriptors: (N, B) what they look like.
         points: (N, 3) where they are in the body frame, in metres; NaN where that is not known.
@@ -79,15 +81,19 @@ class KeyframeLog:
         self._config = config
         self._projection = RigProjection(rig)
         camera = rig.cameras[0].camera
+        self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
         self._recent: deque[_View] = deque(maxlen=config.points_from_frames)
 
-    def add(self, frame: FeatureFrame, world_T_body: gtsam.Pose3) -> Keyframe | None:
+    def add(
+        self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
+    ) -> Keyframe | None:
         """Take a frame, and the keyframe that it has become, if any.
 
         Args:
-            frame: features; those of the first camera with descriptors.
+            frame: features; those of the first camera with descriptors if there is no image.
             world_T_body: causal estimate of the pose then.
+            image: of the first camera.
         """
         wanted = self._is_keyframe(world_T_body)
         spacing_ns = self._config.frame_spacing_s * 1e9
@@ -98,6 +104,8 @@ class KeyframeLog:
         rotation = world_T_body.rotation().matrix()
         self._recent.append(_View(frame, rotation, world_T_body.translation()))
         seen = frame.cameras[0]
+        if wanted and image is not None:
+            seen = self._describer.describe(image, seen)
         if not wanted or seen.descriptors is None or len(seen) == 0:
             return None
         points = self._points(seen.ids)

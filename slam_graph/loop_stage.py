@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closure as a stage of a run: keyframes are collected on the way, loops closed at the end.
+
+Whatever goes wrong in it is counted as a warning, and the causal result stays as it is.
+"""
+
+from __future__ import annotations
+
+import time
+
+import gtsam
+import numpy as np
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import SlamGraphError
+from slam_graph.mapping.loop_closure import LoopClosures, close_loops
+from slam_graph.mapping.loop_config import LoopClosureConfig
+from slam_graph.mapping.loop_keyframes import KeyframeLog
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.sensors.rig import Rig
+
+
+class LoopStage:
+    """Collects the keyframes of a run and closes its loops.
+
+    Args:
+        rig: the cameras.
+        config: all settings.
+        seed: of the training of the vocabulary.
+        diagnostics: counts what goes wrong.
+
+    Attributes:
+        seconds: what collecting and closing took.
+    """
+
+    def __init__(
+        self, rig: Rig, config: LoopClosureConfig, seed: int, diagnostics: Diagnostics
+    ) -> None:
+        self.seconds = 0.0
+        self._rig, self._config, self._seed = rig, config, seed
+        self._diagnostics = diagnostics
+        self._log = KeyframeLog(rig, config.keyframes)
+
+    def keep(
+        self, frame: CameraFrame | FeatureFrame, features: FeatureFrame, world_T_body: gtsam.Pose3
+    ) -> None:
+        """Take a frame with what was found in it, and the causal estimate of the pose then."""
+        if not self._config.enabled:
+            return
+        start = time.perf_counter()
+        image = frame.images[0] if isinstance(frame, CameraFrame) else None
+        self._log.add(features, world_T_body, image)
+        self.seconds += time.perf_counter() - start
+
+    def finish(self) -> LoopClosures | None:
+        """Close the loops, if there is anything to find them by."""
+        keyframes = self._log.keyframes
+        if not self._config.enabled:
+            return None
+        if not keyframes:
+            message = "nothing to recognise places by: no images, and tracks without descriptors"
+            self._diagnostics.warn("loop_closure_impossible", message)
+            return None
+        start = time.perf_counter()
+        try:
+            return close_loops(keyframes, self._rig, self._config, self._seed, self._diagnostics)
+        except (RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
+            reason = " ".join(str(error).split())[:200]
+            self._diagnostics.warn("loop_closure_failed", f"the drift stays: {reason}")
+            return None
+        finally:
+            self.seconds += time.perf_counter() - start
