@@ -19,6 +19,7 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.config_tree import ConfigTree, closest, override, read_tree, validate
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
+from slam_graph.mapping.loop_config import LoopClosureConfig
 
 DEFAULT_ALGORITHM = "msckf"
 
@@ -112,6 +113,8 @@ class RunConfig(Settings):
     """From images to features."""
     backend: BackendConfig = BackendConfig()
     """From features and IMU to states."""
+    loop_closure: LoopClosureConfig = LoopClosureConfig()
+    """What takes the drift out at the end, where places are seen again."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 

@@ -15,6 +15,7 @@ from slam_graph.errors import DataError
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
+from slam_graph.loop_stage import LoopStage
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
@@ -22,6 +23,10 @@ from slam_graph.tracking import Tracking
 from slam_graph.visualization.viewer import NullViewer, Viewer
 
 __all__ = ["Progress", "RunResult", "run"]
+
+
+CORRECTED = ("ok", "low_coverage")
+"""How runs end of which loops are closed: who interrupts one does not want to wait."""
 
 
 class Progress(Protocol):
@@ -87,6 +92,7 @@ def run(
     )
     estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
+    loops = LoopStage(result.rig, config.loop_closure, config.seed, sequence.diagnostics)
 
     tracking = Tracking(_packets(sequence, result), frontend, config.overlap)
     with (
@@ -110,6 +116,7 @@ def run(
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
+                loops.keep(packet.frame, features, state.world_T_body)
             if state is not None and estimator.calibration is not None:
                 result.calibration.append(estimator.calibration)
             result.count_frame(features.stamp_ns, clock.milliseconds, tracked.frame_stats)
@@ -117,6 +124,9 @@ def run(
             progress.advance(features.stamp_ns, estimator.initialized)
             viewer.show(packet.frame, features, state, points)
             frame_done()
+    if result.status in CORRECTED:
+        result.loops = loops.finish()
+        result.warnings = +sequence.diagnostics.counts
     return result
 
 

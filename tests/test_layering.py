@@ -20,7 +20,7 @@ LAYERS = (
     {"mapping", "simulation", "config_tree"},
     {"evaluation", "visualization", "config"},
     {"output"},
-    {"known_start", "supervision", "tracking"},
+    {"known_start", "supervision", "tracking", "loop_stage"},
     {"pipeline"},
     {"experiment"},
     {"cli"},

@@ -61,6 +61,14 @@ def run(
     progress: Annotated[
         bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
     ] = True,
+    loop_closure: Annotated[
+        bool | None,
+        typer.Option(
+            "--loop-closure/--no-loop-closure",
+            help="Take the drift out at the end where places are seen again (off by default).",
+            show_default=False,
+        ),
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -74,7 +82,14 @@ def run(
     from slam_graph.config import load_config
     from slam_graph.datasets.registry import open_dataset
 
-    said = {"algorithm": algorithm, "cameras": cameras, "start_s": start, "duration_s": duration}
+    said: dict[str, Any] = {
+        "algorithm": algorithm,
+        "cameras": cameras,
+        "start_s": start,
+        "duration_s": duration,
+    }
+    if loop_closure is not None:
+        said["loop_closure"] = {"enabled": loop_closure}
     settings = load_config(config, set_ or (), **said, seed=seed)
     with collected_log() as log:
         sequence = open_dataset(

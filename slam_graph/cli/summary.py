@@ -25,6 +25,9 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["accuracy"]))
+    if metrics["loop_closure"] and metrics["loop_closure"]["accuracy"]:
+        typer.echo("")
+        echo_table(_accuracy(metrics["loop_closure"]["accuracy"], "loops closed"))
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
@@ -61,13 +64,17 @@ def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
     stages = {name: s for name, s in timing["stages"].items() if "." not in name}
     if stages:
         yield "ms a frame", ", ".join(f"{name} {s['mean_ms']:.2f}" for name, s in stages.items())
+    if metrics["loop_closure"]:
+        table = metrics["loop_closure"]
+        found = f"{table['accepted']} accepted of {table['verified']} verified"
+        yield "loop closures", f"{found}, {table['keyframes']} keyframes"
     if metrics["warnings"]:
         yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
 
 
-def _accuracy(accuracy: Table) -> Iterator[tuple[str, ...]]:
+def _accuracy(accuracy: Table, title: str = "alignment") -> Iterator[tuple[str, ...]]:
     """Absolute and relative errors under each alignment."""
-    yield "alignment", "ATE rmse [m]", "[deg]", "RPE rmse, 1 m [m]", "[deg]", "scale"
+    yield title, "ATE rmse [m]", "[deg]", "RPE rmse, 1 m [m]", "[deg]", "scale"
     for mode, table in accuracy.items():
         if "unavailable" in table:
             yield mode, table["unavailable"]

@@ -9,6 +9,7 @@ It works on what a run has collected and leaves the causal trajectory as it is.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -69,6 +70,14 @@ class LoopClosures:
             mixed.translations,
             Rotation.from_matrix(mixed.rotations).as_quat(),
         )
+
+    def csv_lines(self) -> Iterator[str]:
+        """A table of all loop closures that passed verification."""
+        yield "first_stamp_ns,second_stamp_ns,inliers,matches,accepted\n"
+        for loop, accepted in zip(self.loops, self.accepted.tolist(), strict=True):
+            stamps = (self.keyframes[k].stamp_ns for k in (loop.first, loop.second))
+            row = (*stamps, loop.inliers, loop.matches, int(accepted))
+            yield ",".join(map(str, row)) + "\n"
 
     def points(self) -> FloatArray:
         """(P, 3) points of the map in the world, each where its last keyframe has it."""

@@ -40,6 +40,7 @@ def metrics_table(result: RunResult) -> Table:
             "seed": result.config.seed,
             "extent": _extent(result),
             "accuracy": _accuracy(result),
+            "loop_closure": _loop_closure(result),
             "nees": _nees(result),
             "nis": innovation_report(result.innovations.columns()),
             "calibration": result.calibration.table(),
@@ -97,6 +98,20 @@ def _accuracy(result: RunResult) -> Table | None:
     if truth is None or len(result.history) == 0:
         return None
     return accuracy_report(truth, result.trajectory)
+
+
+def _loop_closure(result: RunResult) -> Table | None:
+    """What loop closure found and reached, if loops were to be closed."""
+    loops, truth = result.loops, result.truth_of_run()
+    if loops is None:
+        return None
+    corrected = loops.correct(result.trajectory)
+    return {
+        "keyframes": len(loops.keyframes),
+        "verified": len(loops.loops),
+        "accepted": int(loops.accepted.sum()),
+        "accuracy": None if truth is None else accuracy_report(truth, corrected),
+    }
 
 
 def _nees(result: RunResult) -> Table | None:

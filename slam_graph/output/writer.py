@@ -48,6 +48,11 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
     states = folder / "states.csv"
     write_text(states, state_lines(result.history))
     files = [trajectory, states]
+    if result.loops is not None:
+        files += [folder / "trajectory_loop.tum", folder / "loops.csv", folder / "map_loop.ply"]
+        write_text(files[-3], tum_lines(result.loops.correct(result.trajectory)))
+        write_text(files[-2], result.loops.csv_lines())
+        write_ply(files[-1], result.loops.points())
     truth = result.truth_of_run()
     if truth is not None:
         files.append(folder / "groundtruth.tum")
