@@ -11,6 +11,7 @@ from benchmarks import (
     bal,
     cost_over_time,
     frontend,
+    loop_closure,
     memory,
     mh01,
     monte_carlo,
@@ -34,4 +35,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,
+    **loop_closure.BENCHMARKS,
 }

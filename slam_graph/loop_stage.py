@@ -7,8 +7,10 @@ Whatever goes wrong in it is counted as a warning, and the causal result stays a
 
 from __future__ import annotations
 
+import logging
 import time
 
+import cv2
 import gtsam
 import numpy as np
 
@@ -19,6 +21,8 @@ from slam_graph.mapping.loop_config import LoopClosureConfig
 from slam_graph.mapping.loop_keyframes import KeyframeLog
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
+
+logger = logging.getLogger(__name__)
 
 
 class LoopStage:
@@ -64,10 +68,22 @@ class LoopStage:
             return None
         start = time.perf_counter()
         try:
-            return close_loops(keyframes, self._rig, self._config, self._seed, self._diagnostics)
-        except (RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
-            reason = " ".join(str(error).split())[:200]
-            self._diagnostics.warn("loop_closure_failed", f"the drift stays: {reason}")
-            return None
-        finally:
-            self.seconds += time.perf_counter() - start
+            closures = close_loops(
+                keyframes, self._rig, self._config, self._seed, self._diagnostics
+            )
+        except (cv2.error, RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
+            return self._give_up(" ".join(str(error).split())[:200])
+        except KeyboardInterrupt:
+            return self._give_up("interrupted")
+        self.seconds += time.perf_counter() - start
+        logger.info(
+            "loop closure: %d keyframes, %d loop closures, %d accepted, %.1f s in all",
+            len(keyframes),
+            len(closures.loops),
+            closures.accepted.sum(),
+            self.seconds,
+        )
+        return closures
+
+    def _give_up(self, reason: str) -> None:
+        self._diagnostics.warn("loop_closure_failed", f"the drift stays: {reason}")

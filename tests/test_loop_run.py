@@ -5,6 +5,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -73,3 +74,19 @@ def test_tracks_without_looks_are_said_to_have_no_loops() -> None:
     assert result.status == "ok"
     assert result.loops is None
     assert result.warnings["loop_closure_impossible"] == 1
+
+
+def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks = TrackConfig(features=30, descriptors=True)
+    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
+    for error in (cv2.error("bad points"), KeyboardInterrupt()):
+
+        def fail(*_: object, error: BaseException = error) -> None:
+            raise error
+
+        monkeypatch.setattr("slam_graph.loop_stage.close_loops", fail)
+        result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
+        assert result.status == "ok"
+        assert len(result.trajectory) > 10
+        assert result.loops is None
+        assert result.warnings["loop_closure_failed"] >= 1
