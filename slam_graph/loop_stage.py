@@ -72,9 +72,11 @@ class LoopStage:
                 keyframes, self._rig, self._config, self._seed, self._diagnostics
             )
         except (cv2.error, RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
-            return self._give_up(" ".join(str(error).split())[:200])
+            self._give_up(" ".join(str(error).split())[:200])
+            return None
         except KeyboardInterrupt:
-            return self._give_up("interrupted")
+            self._give_up("interrupted")
+            return None
         self.seconds += time.perf_counter() - start
         logger.info(
             "loop closure: %d keyframes, %d loop closures, %d accepted, %.1f s in all",
