@@ -11,11 +11,11 @@ import logging
 import time
 
 import cv2
-import gtsam
 import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
+from slam_graph.geometry.trajectory import NavState
 from slam_graph.mapping.loop_closure import LoopClosures, close_loops
 from slam_graph.mapping.loop_config import LoopClosureConfig
 from slam_graph.mapping.loop_keyframes import KeyframeLog
@@ -47,14 +47,15 @@ class LoopStage:
         self._log = KeyframeLog(rig, config.keyframes)
 
     def keep(
-        self, frame: CameraFrame | FeatureFrame, features: FeatureFrame, world_T_body: gtsam.Pose3
+        self, frame: CameraFrame | FeatureFrame, features: FeatureFrame, state: NavState
     ) -> None:
-        """Take a frame with what was found in it, and the causal estimate of the pose then."""
+        """Take a frame with what was found in it, and the causal estimate then."""
         if not self._config.enabled:
             return
         start = time.perf_counter()
         image = frame.images[0] if isinstance(frame, CameraFrame) else None
-        self._log.add(features, world_T_body, image)
+        # the time of the estimate is that of the IMU's clock, also where the offset is estimated
+        self._log.add(FeatureFrame(state.stamp_ns, features.cameras), state.world_T_body, image)
         self.seconds += time.perf_counter() - start
 
     def finish(self) -> LoopClosures | None:

@@ -116,7 +116,7 @@ def run(
                 check_sane(state, config.limits)
                 result.history.append(state)
                 result.points.update(ids, points)
-                loops.keep(packet.frame, features, state.world_T_body)
+                loops.keep(packet.frame, features, state)
             if state is not None and estimator.calibration is not None:
                 result.calibration.append(estimator.calibration)
             result.count_frame(features.stamp_ns, clock.milliseconds, tracked.frame_stats)
