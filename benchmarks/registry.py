@@ -12,6 +12,7 @@ from benchmarks import (
     cost_over_time,
     final_ba,
     frontend,
+    loop_closure,
     memory,
     mh01,
     monte_carlo,
@@ -36,4 +37,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,
+    **loop_closure.BENCHMARKS,
 }
