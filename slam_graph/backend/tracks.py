@@ -53,8 +53,8 @@ class Observations:
         starts = np.cumsum(counts) - counts
         return np.arange(len(self)) - starts[self.feature]
 
-    def rows(self, keep: NDArray[np.bool_]) -> Observations:
-        """The observations where `keep` (N,) holds, of the same features."""
+    def rows(self, keep: NDArray[np.bool_] | IntArray) -> Observations:
+        """Some of the observations, by mask or number, of the same features."""
         return Observations(
             self.ids,
             self.frames,

@@ -26,6 +26,7 @@ from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.frame_log import FrameLog
+from slam_graph.mapping.fused_piece import with_fused_features
 from slam_graph.mapping.keyframe_states import states_at
 from slam_graph.mapping.keyframes import read_piece
 from slam_graph.sensors.rig import Rig
@@ -143,6 +144,8 @@ def adjust_recording(
             start = laid_on(start, start[anchor], states[joint])
         steps = sum(part.iterations for part in solved)
         told = _told_of_all(report, first, len(keyframes), steps)
+        if config.fuse_features:
+            piece, start = with_fused_features(piece, start, anchor, rig, backend, config, told)
         adjusted = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
         _check(adjusted)
         states = adjusted.states[begin:]

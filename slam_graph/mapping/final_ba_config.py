@@ -24,6 +24,10 @@ class FinalBaConfig(Settings):
     """How many features each keyframe is given at least, if it has as many: the longest tracks."""
     average_frames: bool = True
     """Whether the frames between keyframes add what they saw to the observations of these."""
+    fuse_features: bool = True
+    """Whether tracks that are found to be of the same point are made one feature."""
+    fusion_reach_px: float = Field(8.0, gt=0)
+    """How far drift may have moved the projection of a feature for it to be recognised."""
     learn_pixel_sigma: bool = True
     """Whether the noise of the tracks may be less than noise.pixel_sigma, if residuals say so."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"

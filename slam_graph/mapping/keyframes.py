@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.backend.config import ZeroVelocityConfig
+from slam_graph.backend.config import BackendConfig, ZeroVelocityConfig
 from slam_graph.backend.imu import ImuBuffer
+from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.tracks import Observations
+from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
@@ -22,6 +24,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
+MAX_START_ERROR_PX = 30.0
+"""Features with a larger root mean square reprojection error do not begin, in units of σ."""
 RECENT_NS = 10_000_000_000
 """How much of the IMU is looked through for standing still."""
 
@@ -189,3 +193,22 @@ def longest_tracks(seen: Observations, per_keyframe: int, least: int) -> BoolArr
             chosen[j] = True
             given[frames] += 1
     return chosen
+
+
+def triangulated(
+    obs: Observations,
+    poses: tuple[FloatArray, FloatArray],
+    projection: RigProjection,
+    backend: BackendConfig,
+) -> tuple[FloatArray, BoolArray]:
+    """Points (J, 3) of features, and which of them (J,) are usable.
+
+    Args:
+        obs: at least two observations of every feature.
+        poses: world_R_body (F, 3, 3) and world_p_body (F, 3) of the frames of `obs`.
+        projection: of the rig.
+        backend: noise and thresholds.
+    """
+    found = triangulate(obs, projection, *poses, backend.triangulation)
+    limit_px = MAX_START_ERROR_PX * backend.noise.pixel_sigma
+    return found.points, found.good & (found.reprojection_px < limit_px)
