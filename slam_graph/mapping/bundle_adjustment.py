@@ -66,7 +66,7 @@ class Adjustment:
         features: number of features in the cost.
         observations: number of observations in the cost.
         iterations: Levenberg-Marquardt steps.
-        cost_before: of all observations, where it began.
+        cost_before: of all observations, where the adjustment of all keyframes began.
         cost_after: without outliers, at the minimum.
         imu_residual: root mean square of the whitened residuals of the IMU.
         pixel_residual: of the observations.
@@ -96,6 +96,9 @@ class BundleAdjustment:
         backend: noise and triangulation.
         config: how to solve.
         report: is told of each step.
+
+    Attributes:
+        iterations: Levenberg-Marquardt steps until now.
     """
 
     def __init__(
@@ -119,7 +122,7 @@ class BundleAdjustment:
         chosen = longest_tracks(seen, config.features, MIN_KEYFRAMES)
         self._candidates = seen.subset(chosen)
         self._everything = piece.seen.subset(chosen)
-        self._iterations = 0
+        self.iterations = 0
         self._sigma_px = backend.noise.pixel_sigma
         self._values = gtsam.Values()
         for k, state in enumerate(states):
@@ -147,7 +150,7 @@ class BundleAdjustment:
             len(self._piece.keyframes),
             len(obs.ids),
             len(obs),
-            self._iterations,
+            self.iterations,
             before,
             cost,
             float(np.sqrt(2.0 * imu_cost / dynamics)),
@@ -255,10 +258,10 @@ class BundleAdjustment:
         before = cost = optimizer.error()
         for _ in range(self._config.max_iterations):
             optimizer.iterate()
-            self._iterations += 1
+            self.iterations += 1
             fallen = cost - optimizer.error()
             cost = optimizer.error()
-            self._report(self._iterations)
+            self._report(self.iterations)
             if fallen <= tolerance * cost or optimizer.lambda_() > MAX_LAMBDA:
                 break
         if not math.isfinite(cost):

@@ -68,13 +68,15 @@ def agreeing(
     count, chance = len(offsets), min(limit**2 * chance, 1.0)
     lengths = np.linalg.norm(offsets, axis=1)
     undrifted = lengths < limit
-    if tests * binom.sf(np.sum(undrifted) - 1, count, chance) < MAX_FALSE_ALARMS:
-        return undrifted, lengths
+    alarms = tests * binom.sf(np.sum(undrifted) - 1, count, chance)
     agree, left = _largest_set(J, offsets, limit, rng)
+    if alarms < MAX_FALSE_ALARMS and np.sum(undrifted) >= np.sum(agree):
+        return undrifted, lengths
     # two of them were chosen to fit
-    tests *= math.comb(count, 2)
-    alarms = tests * binom.sf(np.sum(agree) - 3, count - 2, chance)
-    return agree & (alarms < MAX_FALSE_ALARMS), left
+    drifted = tests * math.comb(count, 2) * binom.sf(np.sum(agree) - 3, count - 2, chance)
+    if drifted < MAX_FALSE_ALARMS:
+        return agree, left
+    return undrifted & (alarms < MAX_FALSE_ALARMS), lengths
 
 
 def _largest_set(

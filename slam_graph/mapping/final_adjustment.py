@@ -59,7 +59,7 @@ class FinalBaSummary:
         features: number of features in the costs.
         observations: number of observations in the costs.
         iterations: Levenberg-Marquardt steps.
-        cost_before: of all observations, at the start.
+        cost_before: of all observations, where the adjustment of all keyframes began.
         cost_after: without outliers, at the minimum.
         imu_residual: root mean square of the whitened residuals of the IMU.
         pixel_residual: of the observations.
@@ -143,10 +143,14 @@ def adjust_recording(
             parts.append(_trajectory(states[:joint]))
             start = laid_on(start, start[anchor], states[joint])
         steps = sum(part.iterations for part in solved)
+        fusing = 0
         told = _told_of_all(report, first, len(keyframes), steps)
         if config.fuse_features:
-            piece, start = with_fused_features(piece, start, anchor, rig, backend, config, told)
+            fused = with_fused_features(piece, start, anchor, rig, backend, config, told)
+            piece, start, fusing = fused
+        told = _told_of_all(report, first, len(keyframes), steps + fusing)
         adjusted = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+        adjusted = replace(adjusted, iterations=adjusted.iterations + fusing)
         _check(adjusted)
         states = adjusted.states[begin:]
         solved.append(replace(adjusted, states=[]))

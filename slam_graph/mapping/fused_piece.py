@@ -29,7 +29,7 @@ IntArray = NDArray[np.int64]
 
 THINNING = 2
 """Of so many keyframes one is in the rough bundle adjustments."""
-TURNS, SETTLED = 10, 0.05
+TURNS, SETTLED = 10, 0.1
 """Most turns, and the share of the fused features below which a change of these ends them."""
 
 
@@ -41,7 +41,7 @@ def with_fused_features(
     backend: BackendConfig,
     config: FinalBaConfig,
     report: Callable[[int], None],
-) -> tuple[Piece, list[NavState]]:
+) -> tuple[Piece, list[NavState], int]:
     """Fuse the features of a piece.
 
     Args:
@@ -54,18 +54,26 @@ def with_fused_features(
         report: is told of each step.
 
     Returns:
-        The piece with fused features, and the states of its keyframes after the last adjustment.
+        The piece with fused features, the states of its keyframes after the last rough adjustment,
+        and the number of steps that these took.
 
     Raises:
         EstimationError: if there is no minimum.
     """
     chosen = np.unique([*range(anchor % THINNING, len(states), THINNING), 0, len(states) - 1])
 
+    steps = 0
+
     def adjusted(piece: Piece, states: list[NavState]) -> list[NavState]:
+        nonlocal steps
+        before = steps
         thin = replace(piece, keyframes=piece.keyframes[chosen])
         start, fixed = [states[k] for k in chosen], int(np.searchsorted(chosen, anchor))
-        problem = BundleAdjustment(thin, start, fixed, rig, backend, config, report)
+        problem = BundleAdjustment(
+            thin, start, fixed, rig, backend, config, lambda n: report(before + n)
+        )
         everywhere = problem.solve_roughly()
+        steps += problem.iterations
         return [everywhere[frame] for frame in piece.keyframes]
 
     states, own = adjusted(piece, states), np.arange(len(piece.seen.ids))
@@ -75,7 +83,7 @@ def with_fused_features(
         if np.sum(label != before) <= SETTLED * np.sum(label != own):
             break
         states, before = adjusted(_relabelled(piece, label), states), label
-    return _relabelled(piece, label), states
+    return _relabelled(piece, label), states, steps
 
 
 def _relabelled(piece: Piece, label: IntArray) -> Piece:

@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks of one point become one feature, others do not, and a drift is taken out by it."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.reprojection import Geometry, RigProjection
+from slam_graph.backend.tracks import Observations
+from slam_graph.datasets.base import Sequence
+from slam_graph.evaluation.ape import ape
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.mapping.drift_consensus import agreeing, by_drift
+from slam_graph.mapping.feature_fusion import fused, relabelled
+from slam_graph.mapping.final_adjustment import adjust_recording
+from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.mapping.frame_log import FrameLog
+from slam_graph.mapping.keyframes import read_piece, triangulated
+from slam_graph.mapping.projected_matches import Scene
+from slam_graph.simulation.config import (
+    FlightConfig,
+    LandmarkConfig,
+    SimulationConfig,
+    TrackConfig,
+)
+from slam_graph.simulation.sequence import SimulatedSequence
+from slam_graph.simulation.simulator import simulate
+
+LENGTH_S = 40.0
+BROKEN_EVERY_S = 5.0
+
+
+def flight() -> SimulatedSequence:
+    """Two rounds through a room; features keep the identity of their landmark."""
+    return simulate(
+        SimulationConfig(
+            cameras=2,
+            duration_s=LENGTH_S,
+            rate_hz=5.0,
+            flight=FlightConfig(hover_s=0.0),
+            landmarks=LandmarkConfig(density=4.0),
+            tracks=TrackConfig(features=60, keep_ids=True),
+        )
+    )
+
+
+def broken(ids: np.ndarray, stamp_ns: int) -> np.ndarray:
+    """Identities that are given anew from time to time; the landmark is what divides by 1000."""
+    return ids * 1000 + int(stamp_ns * 1e-9 / BROKEN_EVERY_S)
+
+
+@pytest.fixture(scope="module")
+def sequence() -> SimulatedSequence:
+    return flight()
+
+
+@pytest.fixture(scope="module")
+def log(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> FrameLog:
+    folder: Path = tmp_path_factory.mktemp("frames")
+    with FrameLog.recording(sequence.rig, FinalBaConfig(), folder) as log:
+        for packet in sequence.packets():
+            frame = packet.frame
+            cameras = tuple(
+                replace(seen, ids=broken(seen.ids, frame.stamp_ns)) for seen in frame.cameras
+            )
+            log.add(packet.imu, replace(frame, cameras=cameras), (1.0, 1.0))
+    return log
+
+
+def drifting(truth: Trajectory, metres: float, radians: float) -> Trajectory:
+    """A trajectory that has turned and moved by so much at its end."""
+    part = np.linspace(0.0, 1.0, len(truth))
+    poses = [
+        gtsam.Pose3(gtsam.Rot3.Yaw(radians * p), metres * p * np.array([0.6, -0.8, 0.3])).compose(
+            truth.pose(k)
+        )
+        for k, p in enumerate(part.tolist())
+    ]
+    quaternions = [pose.rotation().toQuaternion().coeffs() for pose in poses]
+    positions = np.array([pose.translation() for pose in poses])
+    return replace(truth, positions=positions, quaternions=np.array(quaternions))
+
+
+def scene_of(log: FrameLog, poses: Trajectory) -> Scene:
+    backend = BackendConfig()
+    piece = read_piece(log, log.keyframes, log.rig, backend.zero_velocity)
+    seen = piece.seen_by_keyframes()
+    seen = seen.subset(seen.counts > 3)
+    rows = np.searchsorted(poses.stamps_ns, piece.keyframe_stamps_ns)
+    matrices = np.array([poses.pose(int(row)).matrix() for row in rows])
+    rotations, positions = matrices[:, :3, :3], matrices[:, :3, 3]
+    projection = RigProjection(log.rig)
+    points, usable = triangulated(seen, (rotations, positions), projection, backend)
+    first = np.searchsorted(seen.feature, np.arange(len(seen.ids)))
+    times_s = piece.keyframe_stamps_ns[seen.frame[first]] * 1e-9
+    return Scene(seen, Geometry(rotations, positions, points), usable, times_s, projection, 1.0)
+
+
+def check_disjoint(seen: Observations, label: np.ndarray) -> None:
+    """No camera sees a feature twice in one frame."""
+    together = relabelled(seen, label)
+    rows = np.stack([together.feature, together.frame, together.camera], axis=1)
+    assert len(np.unique(rows, axis=0)) == len(seen)
+
+
+@pytest.mark.parametrize("drift", [(0.0, 0.0), (0.06, 0.01)], ids=["exact", "drifting"])
+def test_what_is_fused_is_one_landmark(
+    log: FrameLog, sequence: Sequence, drift: tuple[float, float]
+) -> None:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    scene = scene_of(log, drifting(truth, *drift))
+    label = fused(scene, 8.0)
+    landmarks = scene.seen.ids // 1000
+    joined = np.flatnonzero(label != np.arange(len(label)))
+    right = landmarks[joined] == landmarks[label[joined]]
+    copies = sum(count - 1 for count in Counter(landmarks.tolist()).values())
+    assert right.mean() > 0.97
+    assert right.sum() > 0.6 * copies
+    check_disjoint(scene.seen, label)
+
+
+def test_poses_that_are_off_by_more_than_the_reach_fuse_nothing_wrong(
+    log: FrameLog, sequence: Sequence
+) -> None:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    scene = scene_of(log, drifting(truth, 1.0, 0.2))
+    label = fused(scene, 8.0)
+    landmarks = scene.seen.ids // 1000
+    joined = np.flatnonzero(label != np.arange(len(label)))
+    wrong = np.sum(landmarks[joined] != landmarks[label[joined]])
+    assert wrong <= 0.02 * len(label)
+
+
+def test_fusion_takes_out_drift(log: FrameLog, sequence: Sequence) -> None:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    causal = drifting(truth, 0.06, 0.01)
+
+    def error_m(config: FinalBaConfig) -> float:
+        found = adjust_recording(
+            log, causal, sequence.rig, BackendConfig(), config, lambda *_: None
+        )
+        return ape(truth, found.trajectory, "trans_part", "se3").statistics.rmse
+
+    with_fusion, without = error_m(FinalBaConfig()), error_m(FinalBaConfig(fuse_features=False))
+    assert with_fusion < 0.5 * without
+
+
+def test_a_common_drift_is_found_among_wrong_matches() -> None:
+    rng = np.random.default_rng(1)
+    by_point, arms = rng.normal(0.0, 100.0, (20, 2, 3)), rng.normal(0.0, 3.0, (20, 3))
+    J = by_drift(by_point, arms)
+    offsets = J @ [0.02, -0.03, 0.01, 0.005] + rng.normal(0.0, 0.3, (20, 2))
+    offsets[12:] = rng.uniform(-10.0, 10.0, (8, 2))
+    agree, left = agreeing(J, offsets, 3.0, 0.001, 1, rng)
+    assert agree[:12].all()
+    assert agree[12:].sum() <= 1
+    assert np.all(left[:12] < 3.0)
+
+
+def test_chance_agrees_on_no_drift() -> None:
+    rng = np.random.default_rng(2)
+    found = 0
+    for _ in range(200):
+        count = int(rng.integers(3, 30))
+        J = by_drift(rng.normal(0.0, 100.0, (count, 2, 3)), rng.normal(0.0, 3.0, (count, 3)))
+        radius, angle = 10.0 * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
+        offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        agree, _ = agreeing(J, offsets, 3.0, 0.01, 200, rng)
+        found += bool(agree.any())
+    assert found <= 1
+
+
+def test_a_turn_about_the_vertical_is_what_its_derivative_says() -> None:
+    arm, turn = np.array([[1.0, 2.0, 0.5]]), 1e-6
+    J = by_drift(np.eye(3)[None, :2], arm)
+    moved = gtsam.Rot3.Yaw(turn).matrix() @ arm[0] - arm[0]
+    np.testing.assert_allclose(J[0, :, 3], moved[:2] / turn, atol=1e-5)
