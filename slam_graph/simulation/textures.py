@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.simulation.config import random_stream
-from slam_graph.simulation.world import World
 
 Grey = NDArray[np.float32]
 
@@ -86,26 +86,26 @@ def _mix(a: NDArray[np.uint8] | Grey, b: NDArray[np.uint8] | Grey, weight: Grey)
     return mixed
 
 
-def paint(world: World, texel_m: float, seed: int) -> Atlas:
+def paint(sizes: Sequence[tuple[float, float]], texel_m: float, seed: int) -> Atlas:
     """Textures for all panels of a world, so different that places can be told apart.
 
     Args:
-        world: its panels.
+        sizes: of its panels, m.
         texel_m: size of a texel, m.
         seed: of the simulation.
     """
     images: list[NDArray[np.uint8]] = []
-    for index, panel in enumerate(world.panels):
+    for index, size in enumerate(sizes):
         rng = np.random.default_rng(random_stream(seed, "texture", index))
-        width, height = (max(round(side / texel_m), 2) for side in panel.size)
+        width, height = (max(round(side / texel_m), 2) for side in size)
         images += _pyramid(_noise(width, height, texel_m, rng))
-    sizes = np.array([image.shape for image in images], np.int64)
-    ends = np.cumsum(sizes[:, 0] * sizes[:, 1])
+    shapes = np.array([image.shape for image in images], np.int64)
+    ends = np.cumsum(shapes[:, 0] * shapes[:, 1])
     return Atlas(
         texels=np.concatenate([image.ravel() for image in images]),
         offsets=np.concatenate([[0], ends[:-1]]),
-        widths=sizes[:, 1],
-        heights=sizes[:, 0],
+        widths=shapes[:, 1],
+        heights=shapes[:, 0],
         texel_m=texel_m,
     )
 
