@@ -23,7 +23,7 @@ from slam_graph.backend.feature_factors import ReducedFeatures
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
 from slam_graph.backend.marginalization import LinearizationPoints, marginalize
-from slam_graph.backend.motion_start import StartWindow, guess_states
+from slam_graph.backend.motion_start import OUTLIER_PX, StartGuess, StartWindow, guess_states
 from slam_graph.backend.policies import AlgorithmConfig, GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
@@ -42,8 +42,6 @@ IntArray = NDArray[np.int64]
 BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the window of a start in motion is solved."""
 FINAL = GaussNewtonPolicy(max_steps=1)
-OUTLIER_PX = 3.0
-"""Features with a larger root mean square reprojection error leave the window, in units of σ."""
 
 
 def start_from(
@@ -110,6 +108,7 @@ class Initializer:
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
+        self._rng = np.random.default_rng(0)
         largest = config.initialization.static_disparity_px
         self._standstill = StandstillDetector(
             config.zero_velocity.model_copy(update={"max_disparity_px": largest, "enabled": True})
@@ -158,12 +157,12 @@ class Initializer:
             return self.waiting_for
         self._tried_ns = stamp_ns
         window = StartWindow.thinned(self._stamps_ns, self._frames, start.frame_spacing_s)
-        guess = guess_states(window, imu, self._rig, self._params, self._config.noise.gravity)
+        guess = guess_states(window, imu, self._rig, self._params, self._config.noise, self._rng)
         return guess if isinstance(guess, str) else self._refined(window, guess, imu)
 
     # --- the batch problem of a start in motion ---------------------------------------------------
 
-    def _refined(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Window | str:
+    def _refined(self, window: StartWindow, guess: StartGuess, imu: ImuBuffer) -> Window | str:
         """Solve the window by the engine and marginalise all but its last state."""
         cost = self._batch_cost(window, guess, imu)
         try:
@@ -194,17 +193,18 @@ class Initializer:
         covariance = prior.covariance_of(imu_state_keys(last))
         return self._doubt(normalized_cost, covariance) or start
 
-    def _batch_cost(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Cost:
+    def _batch_cost(self, window: StartWindow, guess: StartGuess, imu: ImuBuffer) -> Cost:
         """All states of the window, a prior on the first, and the features they see."""
         state = State()
         factors: list[gtsam.NonlinearFactor] = []
-        for k, nav in enumerate(guess):
+        for k, nav in enumerate(guess.states):
             state.insert_imu_state(k, nav)
-        bias = gtsam.imuBias.ConstantBias(guess[0].accel_bias, guess[0].gyro_bias)
+        start = guess.states[0]
+        bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         for k, samples in enumerate(window.imu_between(imu)):
             factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
         wide = self._config.initialization.motion_prior
-        first = fix_gauge(replace(guess[0], covariance=prior_covariance(wide)), wide)
+        first = fix_gauge(replace(start, covariance=prior_covariance(wide)), wide)
         factors += _prior_factors(first)
         known = self._calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(window.stamps_ns, window.frames, strict=True)):
@@ -212,7 +212,7 @@ class Initializer:
         cost = Cost(state, self._rig, self._config, known, factors)
         tracks = window.tracks()
         ids, lengths = tracks.lengths()
-        long = lengths >= 3
+        long = (lengths >= 3) & is_in(ids, guess.static)
         longest = np.argsort(-lengths[long], kind="stable")[: self._config.initialization.features]
         cost.fresh = self._triangulated(cost, tracks, np.sort(ids[long][longest]))
         return cost

@@ -111,6 +111,8 @@ class MovingObjectConfig(Settings):
     """Its width."""
     height_m: float = Field(2.4, gt=0)
     """Its height."""
+    texel_m: float = Field(0.002, gt=0)
+    """Size of a texel: finer than that of the walls by default, as it is nearer than they are."""
     distance_m: float = Field(1.5, gt=0)
     """How far it keeps ahead of the first camera, whose path it follows smoothly."""
     sway_m: float = Field(0.4, gt=0)

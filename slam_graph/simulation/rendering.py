@@ -91,9 +91,8 @@ class Renderer:
         hit = cast(world, eye, rays)
         # a pixel covers distance / focal length, and more on a wall that is seen at an angle
         footprint = hit.distance * lens.stretch / (lens.focal_px * np.sqrt(hit.slant))
-        level = np.log2(footprint * np.float32(1.0 / self._atlas.texel_m))
         shade = np.array([_shade(panel) for panel in world.panels], np.float32)
-        grey = shade[hit.panel] * self._atlas.sample(hit.panel, level, hit.a, hit.b)
+        grey = shade[hit.panel] * self._atlas.sample(hit.panel, footprint, hit.a, hit.b)
         return np.where(lens.lit, grey, np.float32(0.0))
 
     def _world_at(self, stamp_ns: int) -> World:

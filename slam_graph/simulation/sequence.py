@@ -166,8 +166,11 @@ class SimulatedImages(SimulatedSequence):
         flight, config = self.flight, self.config
         board = self.board
         sizes = [panel.size for panel in flight.world.panels]
-        sizes += [] if board is None else [board.size]
-        atlas = paint(sizes, config.images.texel_m, config.seed)
+        texels_m = [config.images.texel_m] * len(sizes)
+        if board is not None:
+            sizes.append(board.size)
+            texels_m.append(board.config.texel_m)
+        atlas = paint(sizes, texels_m, config.seed)
         return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board)
 
     @cached_property
