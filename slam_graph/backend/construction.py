@@ -191,12 +191,13 @@ class CostConstruction:
         obs = window.tracks.observations(ids)
         lasting = is_in(ids, choice.lasting)
         points, good = self._points(window, obs, lasting)
-        if self.policy.features == "window":
-            window.tracks.consume(ids[lasting & good])
-        else:  # a lasting one that is not good may yet become so
-            window.tracks.consume(ids[~lasting | good])
-        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~good & ~lasting))
-        return NewFeatures(obs, points, lasting).subset(good)
+        entering = is_in(ids, choice.entering(ids[good], room))
+        # a lasting one that is not good may yet become so
+        used = is_in(ids, choice.used) & ~entering & (~lasting | good)
+        consumed = entering if self.policy.features == "window" else entering | used
+        window.tracks.consume(ids[consumed])
+        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(used & ~good))
+        return NewFeatures(obs, points, entering).subset(good & (entering | used))
 
     def _points(
         self, window: Window, obs: Observations, lasting: BoolArray

@@ -31,12 +31,21 @@ class FeatureChoice:
     """Features that are in the cost, ascending ids.
 
     Attributes:
-        used: (J,) those that stay outside the state.
-        lasting: (K,) long-lived ones that may become variables of the state.
+        used: (J,) those whose observations are due.
+        lasting: (K,) long-lived ones that may become variables of the state: all that there are,
+            because only their positions tell which are worth it. An object that moves may have the
+            longest tracks, and must not stand in the way of others.
+        frames: (K,) number of frames that see each lasting one.
     """
 
     used: IntArray
     lasting: IntArray
+    frames: IntArray
+
+    def entering(self, worthy: IntArray, room: int) -> IntArray:
+        """Those lasting ones with the longest tracks that are worthy (ascending ids): new variables."""
+        rows = is_in(self.lasting, worthy)
+        return _longest(self.lasting[rows], self.frames[rows], room)
 
 
 def choose_features(
@@ -53,7 +62,7 @@ def choose_features(
     ids, lengths = window.tracks.lengths()
     live = is_in(ids, window.tracks.seen)
     lasting = live & (lengths >= policy.state_feature_frames)
-    chosen = _longest(ids[lasting], lengths[lasting], max(room, 0))
+    lasting &= room > 0
     if policy.features == "state":
         due = np.zeros(len(ids), np.bool_)
         window.tracks.consume(ids[~live])
@@ -63,8 +72,9 @@ def choose_features(
         due = ~live
         if window.past and window.past[0] in leaving_frames:
             due |= is_in(ids, window.tracks.ids_in(window.past[0]))
-    due &= (lengths >= MIN_FRAMES) & ~is_in(ids, chosen)
-    return FeatureChoice(_longest(ids[due], lengths[due], policy.max_features_per_step), chosen)
+    due &= lengths >= MIN_FRAMES
+    used = _longest(ids[due], lengths[due], policy.max_features_per_step)
+    return FeatureChoice(used, ids[lasting], lengths[lasting])
 
 
 def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:
