@@ -189,6 +189,7 @@ class Estimator:
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
             still = self._standstill.is_still(self._imu, stamp_ns, frame)
+            frame = frame.without(self._standstill.movers)
             if self.window is None:
                 with self._timed("start"):
                     self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
@@ -237,8 +238,5 @@ class Estimator:
         if not bad:
             return frame
         self.diagnostics.warn("feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns")
-        cameras = (
-            FeatureObservations(c.ids[rows], c.pixels[rows], c.normalized[rows])
-            for c, rows in zip(frame.cameras, good, strict=True)
-        )
+        cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
         return FeatureFrame(frame.stamp_ns, tuple(cameras))

@@ -21,9 +21,9 @@ from slam_graph.backend.imu import ImuBuffer, preintegrate
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.start_consensus import static_features
 from slam_graph.backend.static_start import level_rotation
-from slam_graph.backend.tracks import TrackWindow, is_in
+from slam_graph.backend.tracks import TrackWindow
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
+from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -63,8 +63,8 @@ class StartWindow:
         return [imu.between(a, b) for a, b in ends]
 
     def only(self, ids: IntArray) -> StartWindow:
-        """The same frames with some features (ascending ids) alone."""
-        return StartWindow(self.stamps_ns, [_only(frame, ids) for frame in self.frames])
+        """The same frames with some features alone."""
+        return StartWindow(self.stamps_ns, [frame.only(ids) for frame in self.frames])
 
     def tracks(self) -> TrackWindow:
         """The observations of all frames, numbered from 0."""
@@ -129,15 +129,6 @@ def guess_states(
     if alignment is None:
         return "motion that shows gravity and scale"
     return StartGuess(_states(window, motion, alignment, gyro_bias), ids[static])
-
-
-def _only(frame: FeatureFrame, ids: IntArray) -> FeatureFrame:
-    rows = [is_in(seen.ids, ids) for seen in frame.cameras]
-    cameras = (
-        FeatureObservations(seen.ids[keep], seen.pixels[keep], seen.normalized[keep])
-        for seen, keep in zip(frame.cameras, rows, strict=True)
-    )
-    return FeatureFrame(frame.stamp_ns, tuple(cameras))
 
 
 def _integrate(

@@ -22,6 +22,9 @@ from slam_graph.backend.window import Window
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
+RETRY_FRAMES = 4
+"""Lasting features that are not the longest tracks are looked at on one frame out of so many."""
+
 MIN_FRAMES = 2
 """A feature must be seen in this many frames to be used."""
 
@@ -32,9 +35,9 @@ class FeatureChoice:
 
     Attributes:
         used: (J,) those whose observations are due.
-        lasting: (K,) long-lived ones that may become variables of the state: all that there are,
-            because only their positions tell which are worth it. An object that moves may have the
-            longest tracks, and must not stand in the way of others.
+        lasting: (K,) long-lived ones that may become variables of the state: more than there is
+            room for, because only their positions tell which are worth it. An object that moves may
+            have the longest tracks, and must not stand in the way of others.
         frames: (K,) number of frames that see each lasting one.
     """
 
@@ -43,7 +46,7 @@ class FeatureChoice:
     frames: IntArray
 
     def entering(self, worthy: IntArray, room: int) -> IntArray:
-        """Those lasting ones with the longest tracks that are worthy (ascending ids): new variables."""
+        """New variables: the longest tracks of the lasting ones that are worthy (ascending ids)."""
         rows = is_in(self.lasting, worthy)
         return _longest(self.lasting[rows], self.frames[rows], room)
 
@@ -63,6 +66,9 @@ def choose_features(
     live = is_in(ids, window.tracks.seen)
     lasting = live & (lengths >= policy.state_feature_frames)
     lasting &= room > 0
+    lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
+        (ids + window.frame) % RETRY_FRAMES == 0
+    )
     if policy.features == "state":
         due = np.zeros(len(ids), np.bool_)
         window.tracks.consume(ids[~live])
