@@ -153,6 +153,9 @@ def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignm
     high = np.linalg.norm(projected) / gravity + values[-1]
     multiplier = brentq(excess, low, high) if excess(low) > 0 else low
     g = vectors @ (projected / (values + multiplier))
-    g *= gravity / np.linalg.norm(g)
+    length = np.linalg.norm(g)
+    if length == 0.0:
+        raise ValueError("the equations do not see gravity")
+    g *= gravity / length
     v = np.linalg.solve(of_v, R[:3, 6] - R[:3, 3:6] @ g)
     return Alignment(v, g)
