@@ -233,7 +233,9 @@ class Estimator:
         if missing > 0:
             empty = (FeatureObservations.empty(),) * missing
             frame = FeatureFrame(frame.stamp_ns, frame.cameras + empty)
-        good = [np.isfinite(np.hstack([c.pixels, c.normalized])).all(axis=1) for c in frame.cameras]
+        good = [
+            np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in frame.cameras
+        ]
         bad = sum(int(np.sum(~rows)) for rows in good)
         if not bad:
             return frame

@@ -27,6 +27,7 @@ from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 OUTLIER_PX = 3.0
 """Features with a larger root mean square reprojection error leave the window, in units of σ."""
@@ -113,16 +114,22 @@ def guess_states(
         return f"more features that last ({len(ids)} so far)"
     obs = tracks.observations(ids)
     tolerance = OUTLIER_PX * config.pixel_sigma / rig.cameras[0].fx
-    seen = window
-    for _ in range(2):  # what moves by itself spoils the first bias, and so the first consensus
+
+    def agreed(seen: StartWindow) -> tuple[FloatArray, Motion, BoolArray] | None:
         gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params)
         if gyro_bias is None:
-            return "features in common between frames"
+            return None
         motion = _integrate(window, samples, gyro_bias, params)
         static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
-        if static.all():
-            break
-        seen = window.only(ids[static])
+        return gyro_bias, motion, static
+
+    found = agreed(window)
+    if found is not None and not found[2].all():
+        # what moves by itself has spoilt the bias, and so what agrees
+        found = agreed(window.only(ids[found[2]]))
+    if found is None:
+        return "features in common between frames"
+    gyro_bias, motion, static = found
     if np.sum(static) < MIN_FEATURES:
         return "features that agree on a motion"
     alignment = align(obs.subset(static), motion, rig, config.gravity)

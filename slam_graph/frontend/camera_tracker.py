@@ -160,7 +160,7 @@ class CameraTracker:
         """Which candidates (M, 2) for new features move as others do, or as one of their own."""
         limit_px = share * self._config.epipolar_px
         distances = [epipolar_distance(F, origins, points) for F in motions]
-        good = np.min(distances, axis=0) * self._camera.fx < limit_px
+        good: Mask = np.min(distances, axis=0) * self._camera.fx < limit_px
 
         def inliers(rows: IntArray) -> Mask:
             return self._inliers(origins[rows], points[rows], share)
@@ -171,9 +171,8 @@ class CameraTracker:
 
     def _motions(self, before: Tracks, after: Tracks) -> list[FloatArray]:
         """The epipolar matrix (3, 3) of each motion that features common to two images have."""
-        others = self._groups[1:]
-        groups = [~np.isin(after.ids, np.concatenate(others))] if others else [slice(None)]
-        groups += [np.isin(after.ids, ids) for ids in others]
+        others = [np.isin(after.ids, ids) for ids in self._groups[1:]]
+        groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
         matches = ((before.normalized[rows], after.normalized[rows]) for rows in groups)
         return [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
 
