@@ -25,6 +25,10 @@ from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 OWN_MOTION = 3.0
 """What moves by more than so many times what standing still allows, moves by itself."""
 
+STILL_SHARE = 1.0 / 3.0
+"""So many of the features must stand still; others may be on something that moves by itself. When
+the platform moves, the third that moves least does so nearly as much as the median."""
+
 MIN_FEATURES = 5
 """Fewer common features than this say nothing about the motion of the image."""
 
@@ -74,13 +78,14 @@ class StandstillDetector:
     def _images_are_still(self) -> bool:
         now = self._recent[-1][1]
         references = (self._recent[0][1], self._recent[-2][1])
-        return all(_median_motion_px(r, now) < self.config.max_disparity_px for r in references)
+        now = now.select(~np.isin(now.ids, self.movers))
+        return all(_motion_px(r, now) < self.config.max_disparity_px for r in references)
 
     def _note_movers(self) -> None:
         now = self._recent[-1][1]
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
-            own = np.linalg.norm(motion - np.median(motion, axis=0), axis=1)
+            own = np.linalg.norm(motion, axis=1)
             limit_px = OWN_MOTION * self.config.max_disparity_px
             self.movers = np.union1d(self.movers, ids[own > limit_px])
 
@@ -94,10 +99,12 @@ class StandstillDetector:
         )
 
 
-def _median_motion_px(before: FeatureObservations, after: FeatureObservations) -> float:
-    """Median distance that common features moved, infinite if there are too few."""
+def _motion_px(before: FeatureObservations, after: FeatureObservations) -> float:
+    """How far the stillest common features moved, infinite if there are too few."""
     ids, motion = _common_motion_px(before, after)
-    return float(np.median(np.linalg.norm(motion, axis=1))) if len(ids) >= MIN_FEATURES else np.inf
+    if len(ids) < MIN_FEATURES:
+        return float("inf")
+    return float(np.quantile(np.linalg.norm(motion, axis=1), STILL_SHARE))
 
 
 def _common_motion_px(
