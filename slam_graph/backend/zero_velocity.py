@@ -23,11 +23,11 @@ from slam_graph.backend.imu import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 OWN_MOTION = 3.0
-"""What moves by more than so many times what standing still allows, moves by itself."""
+"""What moves by more than so many times what standing still allows, moves by itself, if others
+move by so many times less."""
 
 STILL_SHARE = 1.0 / 3.0
-"""So many of the features must stand still; others may be on something that moves by itself. When
-the platform moves, the third that moves least does so nearly as much as the median."""
+"""So many of the features must stand still, the others may be on something that moves by itself."""
 
 MIN_FEATURES = 5
 """Fewer common features than this say nothing about the motion of the image."""
@@ -79,7 +79,19 @@ class StandstillDetector:
         now = self._recent[-1][1]
         references = (self._recent[0][1], self._recent[-2][1])
         now = now.select(~np.isin(now.ids, self.movers))
-        return all(_motion_px(r, now) < self.config.max_disparity_px for r in references)
+        return all(self._is_still_between(before, now) for before in references)
+
+    def _is_still_between(self, before: FeatureObservations, now: FeatureObservations) -> bool:
+        """Whether most features stand still, or many while the others are on something that moves.
+
+        When the platform moves slowly, those that move least do so nearly as much as the median.
+        """
+        ids, motion = _common_motion_px(before, now)
+        if len(ids) < MIN_FEATURES:
+            return False
+        least, median = np.quantile(np.linalg.norm(motion, axis=1), [STILL_SHARE, 0.5])
+        limit_px = self.config.max_disparity_px
+        return bool(median < limit_px or least < limit_px / OWN_MOTION)
 
     def _note_movers(self) -> None:
         now = self._recent[-1][1]
@@ -97,14 +109,6 @@ class StandstillDetector:
             np.max(np.std(recent.gyro, axis=0)) < self.config.max_gyro_std
             and np.max(np.std(recent.accel, axis=0)) < self.config.max_accel_std
         )
-
-
-def _motion_px(before: FeatureObservations, after: FeatureObservations) -> float:
-    """How far the stillest common features moved, infinite if there are too few."""
-    ids, motion = _common_motion_px(before, after)
-    if len(ids) < MIN_FEATURES:
-        return float("inf")
-    return float(np.quantile(np.linalg.norm(motion, axis=1), STILL_SHARE))
 
 
 def _common_motion_px(
