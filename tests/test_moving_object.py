@@ -23,7 +23,7 @@ from slam_graph.simulation.sequence import SimulatedImages
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.world import World
 
-RUN_S = 3.0
+RUN_S = 4.0
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
 MAX_FAILURES = 3
-"""A feature with so many observations that do not fit after the steps is on something that moves."""
+"""A feature with so many observations that do not fit after the steps is on what moves."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
