@@ -68,7 +68,7 @@ class Estimator:
     ) -> None:
         self.rig = rig
         self.algorithm = algorithm
-        self.config = config or BackendConfig()
+        self.config = _with_loss(config or BackendConfig(), algorithm)
         self.diagnostics = diagnostics or Diagnostics()
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
@@ -242,3 +242,12 @@ class Estimator:
         self.diagnostics.warn("feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns")
         cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
         return FeatureFrame(frame.stamp_ns, tuple(cameras))
+
+
+def _with_loss(config: BackendConfig, algorithm: AlgorithmConfig) -> BackendConfig:
+    """The settings with the robust loss of an algorithm, where it has one of its own."""
+    loss = algorithm.cost.robust_loss
+    if loss is None:
+        return config
+    gating = config.gating.model_copy(update={"robust_loss": loss})
+    return config.model_copy(update={"gating": gating})
