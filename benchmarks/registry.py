@@ -12,6 +12,7 @@ from benchmarks import (
     cost_over_time,
     final_ba,
     frontend,
+    loop_closure,
     memory,
     mh01,
     monte_carlo,
@@ -38,4 +39,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **speed.BENCHMARKS,
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,
+    **loop_closure.BENCHMARKS,
 }

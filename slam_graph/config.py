@@ -20,6 +20,7 @@ from slam_graph.config_tree import ConfigTree, closest, override, read_tree, val
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.mapping.loop_config import LoopClosureConfig
 
 DEFAULT_ALGORITHM = "msckf"
 
@@ -115,6 +116,8 @@ class RunConfig(Settings):
     """From features and IMU to states."""
     final_ba: FinalBaConfig = FinalBaConfig()
     """The bundle adjustment of the whole recording at the end of a run."""
+    loop_closure: LoopClosureConfig = LoopClosureConfig()
+    """What takes the drift out at the end, where places are seen again."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 

@@ -16,6 +16,7 @@ from slam_graph.final_stage import FinalStage
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
+from slam_graph.loop_stage import LoopStage
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
@@ -23,6 +24,10 @@ from slam_graph.tracking import Tracking
 from slam_graph.visualization.viewer import NullViewer, Viewer
 
 __all__ = ["Progress", "RunResult", "run"]
+
+
+CORRECTED = ("ok", "low_coverage")
+"""How runs end of which loops are closed: who interrupts one does not want to wait."""
 
 
 class Progress(Protocol):
@@ -95,6 +100,7 @@ def run(
     )
     estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
+    loops = LoopStage(result.rig, config.loop_closure, config.seed, sequence.diagnostics)
 
     tracking = Tracking(_packets(sequence, result), frontend, config.overlap)
     with FinalStage(result, sequence.diagnostics) as final:
@@ -119,6 +125,7 @@ def run(
                     check_sane(state, config.limits)
                     result.history.append(state)
                     result.points.update(ids, points)
+                    loops.keep(packet.frame, features, state)
                 if state is not None and estimator.calibration is not None:
                     result.calibration.append(estimator.calibration)
                 result.count_frame(features.stamp_ns, clock.milliseconds, tracked.frame_stats)
@@ -128,6 +135,9 @@ def run(
                 viewer.show(packet.frame, features, state, points)
                 frame_done()
         final.finish(progress.adjusting)
+    if result.status in CORRECTED:
+        result.loops = loops.finish()
+        result.warnings = +sequence.diagnostics.counts
     return result
 
 

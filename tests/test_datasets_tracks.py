@@ -19,6 +19,9 @@ from slam_graph.sensors.calibration import read_euroc_rig
 from slam_graph.sensors.kalibr import write_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
+from slam_graph.simulation.config import SimulationConfig, TrackConfig
+from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.writers import write
 
 
 def features(sequence: OpenvinsSimulation | EqvioTracks) -> list[FeatureFrame]:
@@ -290,3 +293,26 @@ def test_another_calibration_moves_the_normalised_points(simulated: Path, tmp_pa
     seen = frame.cameras[0]
     expected = replay.rig.cameras[0].camera.undistort(seen.pixels)
     assert np.array_equal(seen.normalized, expected, equal_nan=True)
+
+
+def test_descriptors_are_replayed_bit_by_bit(tmp_path: Path) -> None:
+    tracks = TrackConfig(features=20, descriptors=True)
+    source = simulate(SimulationConfig(duration_s=1.0, rate_hz=10.0, tracks=tracks))
+    write(source, tmp_path / "recorded")
+    replay = TrackRecordingSequence(tmp_path / "recorded")
+    frames = [f for f in source.frames() if isinstance(f, FeatureFrame)]
+    for first in (0, 4):
+        again = list(replay.frames(frames[first].stamp_ns if first else None))
+        assert len(again) == len(frames) - first
+        for said, read in zip(frames[first:], again, strict=True):
+            assert isinstance(read, FeatureFrame)
+            looks, expected = read.cameras[0].descriptors, said.cameras[0].descriptors
+            assert looks is not None
+            assert expected is not None
+            assert looks.shape == (len(said.cameras[0]), 32)
+            np.testing.assert_array_equal(looks, expected)
+            assert read.cameras[1].descriptors is None
+    file = tmp_path / "recorded" / "descriptors.bin"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(DataError, match="descriptors"):
+        TrackRecordingSequence(tmp_path / "recorded")

@@ -20,7 +20,7 @@ LAYERS = (
     {"mapping", "simulation", "config_tree"},
     {"evaluation", "visualization", "config"},
     {"output"},
-    {"known_start", "supervision", "tracking", "final_stage"},
+    {"known_start", "supervision", "tracking", "final_stage", "loop_stage"},
     {"pipeline"},
     {"experiment"},
     {"cli"},

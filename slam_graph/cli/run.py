@@ -69,6 +69,14 @@ def run(
             show_default=False,
         ),
     ] = None,
+    loop_closure: Annotated[
+        bool | None,
+        typer.Option(
+            "--loop-closure/--no-loop-closure",
+            help="Take the drift out at the end where places are seen again (off by default).",
+            show_default=False,
+        ),
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -90,6 +98,8 @@ def run(
     }
     if final_ba is not None:
         said["final_ba"] = {"enabled": final_ba}
+    if loop_closure is not None:
+        said["loop_closure"] = {"enabled": loop_closure}
     settings = load_config(config, set_ or (), **said, seed=seed)
     with collected_log() as log:
         sequence = open_dataset(

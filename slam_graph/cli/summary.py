@@ -28,6 +28,9 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["final_ba"] and metrics["final_ba"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["final_ba"]["accuracy"], "smoothed"))
+    if metrics["loop_closure"] and metrics["loop_closure"]["accuracy"]:
+        typer.echo("")
+        echo_table(_accuracy(metrics["loop_closure"]["accuracy"], "loops closed"))
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
@@ -66,6 +69,10 @@ def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
         yield "ms a frame", ", ".join(f"{name} {s['mean_ms']:.2f}" for name, s in stages.items())
     if metrics["final_ba"]:
         yield "final BA", _final_ba(metrics["final_ba"])
+    if metrics["loop_closure"]:
+        table = metrics["loop_closure"]
+        found = f"{table['accepted']} accepted of {table['verified']} verified"
+        yield "loop closures", f"{found}, {table['keyframes']} keyframes"
     if metrics["warnings"]:
         yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
 

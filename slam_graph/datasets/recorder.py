@@ -57,6 +57,7 @@ class TrackRecorder:
         self._initial_state = initial_state
         self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
         self._latest_ns: int | None = None
+        self._descriptor_bytes: int | None = None
         self._record = layout.frame_record(len(rig.cameras))
 
     def __enter__(self) -> Self:
@@ -101,6 +102,7 @@ class TrackRecorder:
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
+        self._write_descriptors(frame.cameras[0])
         self._latest_ns = frame.stamp_ns
         samples = np.empty(len(imu), layout.IMU_RECORD)
         samples["stamp"], samples["gyro"], samples["accel"] = imu.stamps_ns, imu.gyro, imu.accel
@@ -114,6 +116,24 @@ class TrackRecorder:
         self._counts["imu_samples"] += len(imu)
         self._counts["features"] += sum(len(seen) for seen in frame.cameras)
 
+    def _write_descriptors(self, seen: FeatureObservations) -> None:
+        """Append the descriptors of the first camera; the first features say how long they are."""
+        if len(seen) == 0:
+            return
+        descriptors = seen.descriptors
+        width = 0 if descriptors is None else descriptors.shape[1]
+        if self._descriptor_bytes is None:
+            self._descriptor_bytes = width
+            if width:
+                self._descriptors = self._open(layout.DESCRIPTORS)
+        if width != self._descriptor_bytes:
+            raise DataError(
+                f"{self.path}: descriptors of {width} bytes cannot be recorded after some of "
+                f"{self._descriptor_bytes}"
+            )
+        if descriptors is not None:
+            self._descriptors.write(np.ascontiguousarray(descriptors, np.uint8).tobytes())
+
     def _open(self, name: str) -> BinaryIO:
         return self._files.enter_context((self._folder / name).open("wb"))
 
@@ -125,6 +145,7 @@ class TrackRecorder:
             "name": self.name,
             "cameras": len(self.rig.cameras),
             **self._counts,
+            "descriptor_bytes": self._descriptor_bytes or 0,
         }
         write_kalibr(self.rig, self._folder / layout.CALIBRATION)
         if self._groundtruth is not None:

@@ -8,9 +8,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import BinaryIO, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,9 +93,12 @@ class TrackRecordingSequence(RecordedSequence):
         self._cameras = int(meta.require("cameras").number())
         if len(rig.cameras) > self._cameras:
             raise DataError(f"{path}: has {self._cameras} cameras, fewer than the calibration")
+        width = meta.get("descriptor_bytes")
+        self._descriptor_bytes = 0 if width is None else int(width.number())
         self._record = layout.frame_record(self._cameras)
         self._check_sizes(counts)
         self._index = np.fromfile(path / layout.FRAMES, self._record)
+        self._check_descriptors()
 
     @property
     def has_groundtruth(self) -> bool:
@@ -123,17 +128,23 @@ class TrackRecordingSequence(RecordedSequence):
         wanted = np.flatnonzero(within(self._index["stamp"], start_ns, end_ns))
         if len(wanted) == 0:
             return
-        size = layout.FEATURE_RECORD.itemsize
-        with (self.path / layout.FEATURES).open("rb") as file:
-            file.seek(int(self._index["counts"][: wanted[0]].sum()) * size)
+        size, before = layout.FEATURE_RECORD.itemsize, self._index["counts"][: wanted[0]]
+        with ExitStack() as files:
+            file = files.enter_context((self.path / layout.FEATURES).open("rb"))
+            file.seek(int(before.sum()) * size)
+            looks = self._open_descriptors(files, int(before[:, 0].sum()))
             for row in self._index[wanted[0] : wanted[-1] + 1]:
                 counts = row["counts"].tolist()
                 features = np.frombuffer(file.read(sum(counts) * size), layout.FEATURE_RECORD)
                 ends = np.cumsum([0, *counts]).tolist()
-                observed = (
+                observed = [
                     self._unpack(features[ends[c] : ends[c + 1]], c)
                     for c in range(len(self.rig.cameras))
-                )
+                ]
+                if looks is not None:
+                    rows = np.frombuffer(looks.read(counts[0] * self._descriptor_bytes), np.uint8)
+                    descriptors = rows.reshape(counts[0], self._descriptor_bytes)
+                    observed[0] = replace(observed[0], descriptors=descriptors)
                 yield FeatureFrame(int(row["stamp"]), tuple(observed))
 
     def groundtruth(self) -> Trajectory | None:
@@ -155,6 +166,19 @@ class TrackRecordingSequence(RecordedSequence):
             normalized = np.ascontiguousarray(rows["normalized"])
         return FeatureObservations(ids, pixels, normalized)
 
+    def _open_descriptors(self, files: ExitStack, first: int) -> BinaryIO | None:
+        """The file of descriptors, from that of some feature on; None where there are none."""
+        if self._descriptor_bytes == 0:
+            return None
+        file = files.enter_context((self.path / layout.DESCRIPTORS).open("rb"))
+        file.seek(first * self._descriptor_bytes)
+        return file
+
+    def _check_descriptors(self) -> None:
+        if self._descriptor_bytes:
+            features = int(self._index["counts"][:, 0].sum())
+            self._check_size(layout.DESCRIPTORS, features * self._descriptor_bytes)
+
     def _check_sizes(self, counts: dict[str, int]) -> None:
         """Refuse files that are not as long as the recorder left them."""
         sizes = {
@@ -163,10 +187,13 @@ class TrackRecordingSequence(RecordedSequence):
             layout.FEATURES: counts["features"] * layout.FEATURE_RECORD.itemsize,
         }
         for name, expected in sizes.items():
-            file = self.path / name
-            size = file.stat().st_size if file.is_file() else -1
-            if size != expected:
-                found = "missing" if size < 0 else f"{size} bytes long"
-                raise DataError(
-                    f"{file}: {found}, {layout.META} says {expected} bytes; record it again"
-                )
+            self._check_size(name, expected)
+
+    def _check_size(self, name: str, expected: int) -> None:
+        file = self.path / name
+        size = file.stat().st_size if file.is_file() else -1
+        if size != expected:
+            found = "missing" if size < 0 else f"{size} bytes long"
+            raise DataError(
+                f"{file}: {found}, {layout.META} says {expected} bytes; record it again"
+            )

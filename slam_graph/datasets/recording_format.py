@@ -11,6 +11,8 @@ A recording is a folder with these files; all numbers are little-endian, and no 
   number of features that each camera saw;
 - ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
   ordered by frame, then camera, then as the front end gave them;
+- ``descriptors.bin``, where features have any: for each feature of the first camera, in the same
+  order, as many bytes as `descriptor_bytes` in ``meta.yaml`` says (0 or nothing if there are none);
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
 - ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
   `NavState` under their names (`world_T_body` as a 4x4 matrix).
@@ -34,6 +36,7 @@ FORMAT_VERSION = 1
 
 META, CALIBRATION = "meta.yaml", "calibration.yaml"
 FRAMES, FEATURES, IMU = "frames.bin", "features.bin", "imu.bin"
+DESCRIPTORS = "descriptors.bin"
 GROUNDTRUTH, INITIAL_STATE = "groundtruth.npz", "initial_state.npz"
 
 IMU_RECORD = np.dtype([("stamp", "<i8"), ("gyro", "<f8", (3,)), ("accel", "<f8", (3,))])

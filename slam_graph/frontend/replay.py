@@ -71,4 +71,10 @@ class ReplayFrontend:
 
 def _without(features: FeatureObservations, ids: NDArray[np.int64]) -> FeatureObservations:
     keep = ~np.isin(features.ids, ids)
-    return FeatureObservations(features.ids[keep], features.pixels[keep], features.normalized[keep])
+    looks = features.descriptors
+    return FeatureObservations(
+        features.ids[keep],
+        features.pixels[keep],
+        features.normalized[keep],
+        None if looks is None else looks[keep],
+    )

@@ -41,6 +41,7 @@ def metrics_table(result: RunResult) -> Table:
             "extent": _extent(result),
             "accuracy": _accuracy(result),
             "final_ba": _final_ba(result),
+            "loop_closure": _loop_closure(result),
             "nees": _nees(result),
             "nis": innovation_report(result.innovations.columns()),
             "calibration": result.calibration.table(),
@@ -107,6 +108,20 @@ def _final_ba(result: RunResult) -> Table | None:
     trajectory, truth = result.final_ba.trajectory, result.truth_of_run()
     accuracy = None if truth is None else accuracy_report(truth, trajectory)
     return {**asdict(result.final_ba.summary), "accuracy": accuracy}
+
+
+def _loop_closure(result: RunResult) -> Table | None:
+    """What loop closure found and reached, if loops were to be closed."""
+    loops, truth = result.loops, result.truth_of_run()
+    if loops is None:
+        return None
+    corrected = loops.correct(result.trajectory)
+    return {
+        "keyframes": len(loops.keyframes),
+        "verified": len(loops.loops),
+        "accepted": int(loops.accepted.sum()),
+        "accuracy": None if truth is None else accuracy_report(truth, corrected),
+    }
 
 
 def _nees(result: RunResult) -> Table | None:

@@ -20,6 +20,7 @@ from slam_graph.evaluation.association import select
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.final_adjustment import FinalBa
+from slam_graph.mapping.loop_closure import LoopClosures
 from slam_graph.output.calibration_log import CalibrationLog
 from slam_graph.output.innovations import InnovationLog
 from slam_graph.output.point_map import PointMap
@@ -48,6 +49,7 @@ class RunResult:
         error: what ended the run, if something was raised.
         history: the causal estimate of every frame.
         final_ba: the trajectory that comes of the recording as a whole, if one was found.
+        loops: what became of places that were seen again, if loops were to be closed.
         points: the map.
         timing: milliseconds of every stage of every frame.
         steps: Gauss-Newton steps of every frame, and the cost before and after.
@@ -72,6 +74,7 @@ class RunResult:
     error: BaseException | None = None
     history: StateHistory = field(default_factory=StateHistory)
     final_ba: FinalBa | None = None
+    loops: LoopClosures | None = None
     points: PointMap = field(default_factory=PointMap)
     timing: TimingLog = field(default_factory=TimingLog)
     steps: StepLog = field(default_factory=StepLog)

@@ -51,6 +51,11 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
     if result.final_ba is not None:
         files.append(folder / "trajectory_smoothed.tum")
         write_text(files[-1], tum_lines(result.final_ba.trajectory))
+    if result.loops is not None:
+        files += [folder / "trajectory_loop.tum", folder / "loops.csv", folder / "map_loop.ply"]
+        write_text(files[-3], tum_lines(result.loops.correct(result.trajectory)))
+        write_text(files[-2], result.loops.csv_lines())
+        write_ply(files[-1], result.loops.points())
     truth = result.truth_of_run()
     if truth is not None:
         files.append(folder / "groundtruth.tum")

@@ -76,11 +76,14 @@ class FeatureObservations:
             same point of the world.
         pixels: (N, 2) raw (distorted) pixel coordinates (u, v).
         normalized: (N, 2) undistorted coordinates on the plane z = 1 of the camera frame.
+        descriptors: (N, B) what each looks like, in B bytes of eight bits that are compared by
+            the number of bits that differ; None where there are none.
     """
 
     ids: IntArray
     pixels: FloatArray
     normalized: FloatArray
+    descriptors: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)

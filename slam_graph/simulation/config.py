@@ -82,6 +82,12 @@ class TrackConfig(Settings):
     """Farthest visible depth."""
     border_px: float = Field(8.0, ge=0)
     """Nothing is seen nearer to the border of the image than this."""
+    descriptors: bool = False
+    """Whether features come with binary descriptors of 256 bits, so that places are recognised."""
+    descriptor_noise: float = Field(0.08, ge=0, lt=0.5)
+    """Probability that a bit of a descriptor is wrong."""
+    descriptor_looks: int = Field(2000, ge=1)
+    """How many different looks there are; landmarks that share one are told apart by place only."""
 
 
 class ImageConfig(Settings):

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
+from slam_graph.simulation.appearance import Appearance
 from slam_graph.simulation.config import TrackConfig, random_stream
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import FloatArray, IntArray, Motion
@@ -89,6 +90,7 @@ class TrackSimulator:
         self._landmarks = landmarks
         self._config = config
         self._rng = np.random.default_rng(random_stream(seed, "tracks"))
+        self._appearance = Appearance(len(landmarks), config, seed) if config.descriptors else None
         self._tracks = [_Tracks() for _ in self.groups]
         self._next_id = 0
         self._next_look = 0
@@ -116,7 +118,10 @@ class TrackSimulator:
         for group, tracks in zip(self.groups, self._tracks, strict=True):
             self._follow(tracks, self.views[group[0]], pose)
             self._begin(tracks, self.views[group[0]], pose)
-            seen[group[0]] = self._measure(self.views[group[0]].camera, tracks.ids, tracks.pixels)
+            leading = self._measure(self.views[group[0]].camera, tracks.ids, tracks.pixels)
+            if self._appearance is not None:
+                leading = replace(leading, descriptors=self._appearance.of(tracks.landmarks))
+            seen[group[0]] = leading
             for camera in group[1:]:
                 index, pixels = self._see(self.views[camera], pose, tracks.landmarks)
                 seen[camera] = self._measure(self.views[camera].camera, tracks.ids[index], pixels)

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes for loop closure: what was seen from where, as it was estimated then."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.triangulation import triangulate
+from slam_graph.frontend.tracks import Image
+from slam_graph.mapping.loop_appearance import KeyframeDescriber
+from slam_graph.mapping.loop_config import KeyframeConfig
+from slam_graph.sensors.measurements import FeatureFrame
+from slam_graph.sensors.rig import Rig
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Descriptors = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A place that one may come back to.
+
+    Attributes:
+        stamp_ns: time.
+        world_T_body: causal estimate of the pose.
+        ids: (N,) features that the first camera sees; -1 for corners that are not tracked.
+        normalized: (N, 2) where, on the plane z = 1.
+        descriptors: (N, B) what they look like.
+        points: (N, 3) where they are in the body frame, in metres; NaN where that is not known.
+    """
+
+    stamp_ns: int
+    world_T_body: gtsam.Pose3
+    ids: IntArray
+    normalized: FloatArray
+    descriptors: Descriptors
+    points: FloatArray
+
+    def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
+        """Ids (M,) and world positions (M, 3) of known points, seen from this pose or another."""
+        pose = world_T_body or self.world_T_body
+        known = np.isfinite(self.points).all(axis=1)
+        rotation = pose.rotation().matrix()
+        return self.ids[known], self.points[known] @ rotation.T + pose.translation()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A recent frame and where it was taken."""
+
+    frame: FeatureFrame
+    rotation: FloatArray
+    position: FloatArray
+
+
+class KeyframeLog:
+    """Picks keyframes from a run and triangulates what they see.
+
+    Points are triangulated from a few recent frames at their causal poses: over so short a way the
+    estimator does not drift, and whatever it has drifted before moves points and keyframe alike.
+
+    Args:
+        rig: the cameras.
+        config: how dense keyframes are.
+
+    Attributes:
+        keyframes: so far.
+    """
+
+    def __init__(self, rig: Rig, config: KeyframeConfig) -> None:
+        self.keyframes: list[Keyframe] = []
+        self._config = config
+        self._projection = RigProjection(rig)
+        camera = rig.cameras[0].camera
+        self._describer = KeyframeDescriber(camera, config.further_corners)
+        self._focal_px = float(np.sqrt(camera.fx * camera.fy))
+        self._recent: deque[_View] = deque(maxlen=config.points_from_frames)
+
+    def add(
+        self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
+    ) -> Keyframe | None:
+        """Take a frame, and the keyframe that it has become, if any.
+
+        Args:
+            frame: features; those of the first camera with descriptors if there is no image.
+            world_T_body: causal estimate of the pose then.
+            image: of the first camera.
+        """
+        wanted = self._is_keyframe(world_T_body)
+        spacing_ns = self._config.frame_spacing_s * 1e9
+        if self._recent and frame.stamp_ns - self._recent[-1].frame.stamp_ns < spacing_ns:
+            if not wanted:
+                return None
+            self._recent.pop()
+        rotation = world_T_body.rotation().matrix()
+        self._recent.append(_View(frame, rotation, world_T_body.translation()))
+        seen = frame.cameras[0]
+        if wanted and image is not None:
+            seen = self._describer.describe(image, seen)
+        if not wanted or seen.descriptors is None or len(seen) == 0:
+            return None
+        points = self._points(seen.ids)
+        body_points = (points - world_T_body.translation()) @ rotation
+        keyframe = Keyframe(
+            frame.stamp_ns, world_T_body, seen.ids, seen.normalized, seen.descriptors, body_points
+        )
+        self.keyframes.append(keyframe)
+        return keyframe
+
+    def _is_keyframe(self, world_T_body: gtsam.Pose3) -> bool:
+        if not self.keyframes:
+            return True
+        moved = self.keyframes[-1].world_T_body.between(world_T_body)
+        turn = float(np.linalg.norm(gtsam.Rot3.Logmap(moved.rotation())))
+        way = float(np.linalg.norm(moved.translation()))
+        return way >= self._config.distance_m or turn >= self._config.angle_rad
+
+    def _points(self, ids: IntArray) -> FloatArray:
+        """Where features (N,) are in the world, (N, 3); NaN where that is not known."""
+        window = TrackWindow()
+        for index, view in enumerate(self._recent):
+            window.add(index, view.frame)
+        obs = window.observations(np.unique(ids))
+        obs = obs.subset(obs.counts >= 2)
+        points = np.full((len(ids), 3), np.nan)
+        if len(obs) == 0:
+            return points
+        rotations = np.array([self._recent[i].rotation for i in obs.frames])
+        positions = np.array([self._recent[i].position for i in obs.frames])
+        found = triangulate(obs, self._projection, rotations, positions, self._config.triangulation)
+        good = found.good & (found.reprojection_px < self._config.max_reprojection_px)
+        good &= found.depth_error < self._config.max_depth_error * self._focal_px
+        place = np.minimum(np.searchsorted(obs.ids, ids), len(obs.ids) - 1)
+        known = good[place] & (obs.ids[place] == ids)
+        points[known] = found.points[place[known]]
+        return points

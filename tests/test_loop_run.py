@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Runs with loop closure, from the command line to the files."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slam_graph.cli.main import app
+from slam_graph.config import load_config
+from slam_graph.pipeline import run
+from slam_graph.simulation.config import LandmarkConfig, SimulationConfig, TrackConfig
+from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.writers import write
+
+SETTINGS = ("--set", "loop_closure.places.words=300")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a tour that comes back into the first room."""
+    config = SimulationConfig(
+        trajectory="rooms",
+        duration_s=60.0,
+        rate_hz=4.0,
+        seed=3,
+        cameras=1,
+        landmarks=LandmarkConfig(density=4.0),
+        tracks=TrackConfig(features=70, descriptors=True),
+    )
+    folder = tmp_path_factory.mktemp("loops") / "tour"
+    write(simulate(config), folder)
+    return folder
+
+
+def results(flight: Path, output: Path, *options: str) -> tuple[Path, dict]:
+    arguments = ["run", str(flight), "--output", str(output), "--no-progress", "--json", *options]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    table = json.loads(done.stdout)
+    return Path(table["folder"]), table
+
+
+def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
+    folder, table = results(flight, tmp_path / "with", "--loop-closure", *SETTINGS)
+    loops = table["loop_closure"]
+    assert 0 < loops["accepted"] <= loops["verified"]
+    rmse = [
+        accuracy["yaw"]["ate"]["translation_m"]["rmse"]
+        for accuracy in (table["accuracy"], loops["accuracy"])
+    ]
+    assert rmse[1] < rmse[0]
+    causal = np.loadtxt(folder / "trajectory.tum")
+    corrected = np.loadtxt(folder / "trajectory_loop.tum")
+    np.testing.assert_array_equal(causal[:, 0], corrected[:, 0])
+    assert len((folder / "loops.csv").read_text().splitlines()) == loops["verified"] + 1
+    assert (folder / "map_loop.ply").read_bytes().startswith(b"ply")
+
+    without, table = results(flight, tmp_path / "without")
+    assert table["loop_closure"] is None
+    assert not (without / "trajectory_loop.tum").exists()
+    # the causal trajectory is the same with loop closure and without
+    assert (without / "trajectory.tum").read_text() == (folder / "trajectory.tum").read_text()
+
+
+def test_tracks_without_looks_are_said_to_have_no_loops() -> None:
+    tracks = TrackConfig(features=30)
+    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
+    result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
+    assert result.status == "ok"
+    assert result.loops is None
+    assert result.warnings["loop_closure_impossible"] == 1
+
+
+def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks = TrackConfig(features=30, descriptors=True)
+    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
+    for error in (cv2.error("bad points"), KeyboardInterrupt()):
+
+        def fail(*_: object, error: BaseException = error) -> None:
+            raise error
+
+        monkeypatch.setattr("slam_graph.loop_stage.close_loops", fail)
+        result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
+        assert result.status == "ok"
+        assert len(result.trajectory) > 10
+        assert result.loops is None
+        assert result.warnings["loop_closure_failed"] >= 1
