@@ -95,7 +95,8 @@ class FeatureObservations:
 
     def select(self, rows: NDArray[np.bool_]) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
-        return FeatureObservations(self.ids[rows], self.pixels[rows], self.normalized[rows])
+        look = None if self.descriptors is None else self.descriptors[rows]
+        return FeatureObservations(self.ids[rows], self.pixels[rows], self.normalized[rows], look)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
