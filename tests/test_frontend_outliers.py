@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.outliers import (
+    coherent_groups,
     direction_inliers,
     eight_point,
     epipolar_distance,
@@ -114,6 +115,37 @@ def test_with_the_rotation_known_the_majority_may_be_wrong() -> None:
     assert np.mean(inlier[120:]) > 0.97
     distance_px = epipolar_distance(essential_matrix(B_T_A), m_a, m_b) * FOCAL_PX
     assert not np.any(inlier[distance_px > 3.0])
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_an_object_that_moves_is_a_group_of_its_own(share: float) -> None:
+    """Neither the object nor the world is lost, whichever has more; errors are."""
+    rng = np.random.default_rng(8)
+    m_a, m_b, _ = scene(rng, 200)
+    count = round(200 * share)
+    m_b[:count] = m_a[:count] + np.array([25.0, -12.0]) / FOCAL_PX
+    m_b += rng.normal(scale=0.2 / FOCAL_PX, size=m_b.shape)
+    m_b[190:] += rng.uniform(20, 40, (10, 2)) / FOCAL_PX
+
+    def inliers(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return fundamental_inliers(m_a[rows], m_b[rows], FOCAL_PX, FrontendConfig())
+
+    first = inliers(np.arange(200))
+    groups = [np.flatnonzero(first), *coherent_groups(inliers, np.flatnonzero(~first), 200)]
+    assert len(groups) == 2
+    kept = np.concatenate(groups)
+    assert np.mean(np.isin(np.arange(190), kept)) > 0.97
+    assert np.mean(np.isin(np.arange(190, 200), kept)) < 0.4
+
+
+def test_a_few_errors_are_no_group() -> None:
+    m_a, m_b, _ = scene(np.random.default_rng(9), 200)
+    m_b[:15] += 10.0 / FOCAL_PX  # all alike, but too few
+
+    def inliers(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return fundamental_inliers(m_a[rows], m_b[rows], FOCAL_PX, FrontendConfig())
+
+    assert coherent_groups(inliers, np.flatnonzero(~inliers(np.arange(200))), 200) == []
 
 
 def test_observations_that_do_not_fit_the_map_are_found() -> None:

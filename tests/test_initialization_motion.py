@@ -6,23 +6,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flight import GRAVITY, Flight, packets, rig, room, scene
+from flight import GRAVITY, Flight, features, packets, rig, room, scene
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from slam_graph.backend.alignment import Motion, align
-from slam_graph.backend.config import BackendConfig, InitializationConfig
+from slam_graph.backend.config import BackendConfig, InitializationConfig, NoiseConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.imu import ImuBuffer, preintegration_params
-from slam_graph.backend.motion_start import StartWindow, guess_states
+from slam_graph.backend.motion_start import StartGuess, StartWindow, guess_states
 from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.start_consensus import static_features
+from slam_graph.backend.tracks import TrackWindow
 from slam_graph.config import load_config
 from slam_graph.datasets.registry import open_dataset
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
 FloatArray = NDArray[np.float64]
 PARAMS = preintegration_params(rig().imu, 9.81)
@@ -76,6 +78,35 @@ def test_alignment_bears_pixel_noise(cameras: int) -> None:
     assert np.linalg.norm(found.gravity) == pytest.approx(9.81)
 
 
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("movers", [60, 130])
+def test_the_imu_tells_the_static_world_from_an_object(cameras: int, movers: int) -> None:
+    """Even where most features are on the object, which moves as the room of another flight."""
+    rng, mounted, window = np.random.default_rng(5), rig(cameras), TrackWindow()
+    flight, other = Flight(), Flight(position_rate=np.array([2.5, -1.2, 1.6]))
+    still, moving = room(400, rng), room(movers * 4, rng)
+    for number, t_s in enumerate(TIMES.tolist()):
+        seen = features(flight, mounted, still, t_s, rng, 0.5)
+        object_seen = features(other, mounted, moving, t_s, rng, 0.5)
+        cameras_seen = (
+            FeatureObservations(
+                np.concatenate([a.ids, b.ids + len(still)]),
+                np.concatenate([a.pixels, b.pixels]),
+                np.concatenate([a.normalized, b.normalized]),
+            )
+            for a, b in zip(seen.cameras, object_seen.cameras, strict=True)
+        )
+        window.add(number, FeatureFrame(seen.stamp_ns, tuple(cameras_seen)))
+    ids, lengths = window.lengths()
+    obs = window.observations(ids[lengths >= 4])
+    motion = exact_motion(flight, TIMES)
+    static = static_features(obs, motion, RigProjection(mounted), 9.81, 3.0 / 458.0, rng)
+    true = obs.ids < len(still)
+    assert (np.sum(~true) > np.sum(true)) == (movers > 100)
+    assert np.mean(static[true]) > 0.95
+    assert np.mean(static[~true]) < 0.05
+
+
 def window_of(
     flight: Flight, points: FloatArray, cameras: int, rng: np.random.Generator | None
 ) -> tuple[StartWindow, ImuBuffer]:
@@ -117,8 +148,9 @@ def test_the_guess_of_all_states(cameras: int) -> None:
     """World upright, origin and heading at the first body."""
     rng, flight = np.random.default_rng(4), Flight(gyro_bias=np.array([0.03, -0.02, 0.05]))
     window, imu = window_of(flight, room(600, rng), cameras, rng)
-    guess = guess_states(window, imu, RigProjection(rig(cameras)), PARAMS, 9.81)
-    assert isinstance(guess, list)
+    found = guess_states(window, imu, RigProjection(rig(cameras)), PARAMS, NoiseConfig(), rng)
+    assert isinstance(found, StartGuess)
+    guess = found.states
     assert [s.stamp_ns for s in guess] == window.stamps_ns
     truth = [flight.nav_state(stamp * 1e-9) for stamp in window.stamps_ns]
     origin = guess[0].world_T_body
@@ -137,7 +169,7 @@ def test_a_guess_says_what_it_lacks() -> None:
     rng = np.random.default_rng(0)
     mounted = RigProjection(rig())
     few, imu = window_of(Flight(), room(6, rng), 1, rng)
-    reason = guess_states(few, imu, mounted, PARAMS, 9.81)
+    reason = guess_states(few, imu, mounted, PARAMS, NoiseConfig(), rng)
     assert isinstance(reason, str)
     assert "features" in reason
 

@@ -175,7 +175,8 @@ def test_motion_blurs_and_standing_still_does_not() -> None:
 def test_what_a_fisheye_sees_beyond_the_camera_model_is_black() -> None:
     flight = images().flight
     rig = Rig((RigCamera(FISHEYE, gtsam.Pose3()),))
-    atlas = paint(flight.world, 0.02, 0)
+    sizes = [panel.size for panel in flight.world.panels]
+    atlas = paint(sizes, [0.02] * len(sizes), 0)
     renderer = Renderer(rig, flight.world, atlas, ImageConfig(noise_sigma=0.0), 0)
     image = renderer.frame(flight.motion, int(flight.exposures_ns[100])).images[0]
     assert image is not None

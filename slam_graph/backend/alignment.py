@@ -90,14 +90,14 @@ def align(
     for _ in range(1 + REWEIGHTINGS):
         A, b = _reduced_equations(obs, motion, rig, weights)
         try:
-            alignment = _constrained_solution(A, b, gravity)
+            alignment = constrained_solution(A, b, gravity)
         except (np.linalg.LinAlgError, ValueError):
             return None
         weights = 1.0 / _depths(obs, motion, rig, alignment, weights)
     return alignment
 
 
-def _equations(
+def alignment_equations(
     obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coefficients of f (N, 2, 3) and of (v₀, g) (N, 2, 6), and right-hand sides (N, 2)."""
@@ -118,7 +118,7 @@ def _reduced_equations(
     obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The equations (rows, 6) and right-hand sides (rows,) that no longer contain the features."""
-    by_point, by_motion, b = _equations(obs, motion, rig, weights)
+    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
     _, eliminated = eliminate_points(obs, by_point, np.concatenate([by_motion, b[:, :, None]], 2))
     rest = eliminated[:, 3:].reshape(-1, 7)
     return rest[:, :6], rest[:, 6]
@@ -128,7 +128,7 @@ def _depths(
     obs: Observations, motion: Motion, rig: RigProjection, found: Alignment, weights: FloatArray
 ) -> FloatArray:
     """Depths (N,) of the features in their cameras under an alignment."""
-    by_point, by_motion, b = _equations(obs, motion, rig, weights)
+    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
     rest = b - by_motion @ np.concatenate([found.velocity, found.gravity])
     R, right = eliminate_points(obs, by_point, rest[:, :, None])
     points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :3])[:, :, 0]
@@ -139,7 +139,7 @@ def _depths(
     return np.asarray(np.maximum(np.abs(depths), MIN_DEPTH_M), dtype=np.float64)
 
 
-def _constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignment:
+def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignment:
     """Least squares under |g| = gravity: a secular equation in the Lagrange multiplier."""
     R = triangularize(np.column_stack([A, b]))
     of_v, of_g, right = R[:3, :3], R[3:6, 3:6], R[3:6, 6]
@@ -153,6 +153,9 @@ def _constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Align
     high = np.linalg.norm(projected) / gravity + values[-1]
     multiplier = brentq(excess, low, high) if excess(low) > 0 else low
     g = vectors @ (projected / (values + multiplier))
-    g *= gravity / np.linalg.norm(g)
+    length = np.linalg.norm(g)
+    if length == 0.0:
+        raise ValueError("the equations do not see gravity")
+    g *= gravity / length
     v = np.linalg.solve(of_v, R[:3, 6] - R[:3, 3:6] @ g)
     return Alignment(v, g)

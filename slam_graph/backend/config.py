@@ -83,7 +83,8 @@ class ZeroVelocityConfig(Settings):
     max_accel_std: float = Field(2.5, gt=0)
     """Largest standard deviation of the specific force, m/s²."""
     max_disparity_px: float = Field(1.0, gt=0)
-    """Largest median motion of the features over the window, and between two frames."""
+    """Largest median motion of the features over the window, and between two frames; or three times
+    that of the third which moves least, as the others may be on something that moves."""
     velocity_sigma: float = Field(0.01, gt=0)
     """How still a still platform is: standard deviation of its velocity, m/s."""
     position_sigma: float = Field(1e-3, gt=0)
@@ -117,7 +118,7 @@ class InitializationConfig(Settings):
     static_window_s: float = Field(1.0, gt=0)
     """How long the platform must stand still for a static start."""
     static_disparity_px: float = Field(1.5, gt=0)
-    """Largest median motion of the features in that time; running motors shake the picture."""
+    """The same for a static start; running motors shake the picture."""
     motion_window_s: float = Field(1.5, gt=0)
     """Length of the visual-inertial alignment of a start in motion."""
     frame_spacing_s: float = Field(0.15, gt=0)

@@ -30,6 +30,9 @@ from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
+MAX_FAILURES = 3
+"""A feature with so many observations that do not fit after the steps is on what moves."""
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -104,6 +107,7 @@ class CostConstruction:
         self.config = config
         self.diagnostics = diagnostics
         self.rejected = np.zeros(0, np.int64)
+        self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
         """The cost now.
@@ -168,6 +172,7 @@ class CostConstruction:
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
         fits = cost.squared_errors(obs, cost.fresh.points) < limit
         self.rejected = np.union1d(self.rejected, obs.ids[obs.feature[~fits]])
+        self._count_failures(window, obs.ids[obs.feature[~fits]])
         window.tracks.forget(obs.rows(~fits))
         rejected = int(np.sum(~fits))
         self.diagnostics.counts["observation_rejected_by_gate"] += rejected
@@ -176,12 +181,26 @@ class CostConstruction:
         )
         cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
 
+    def _count_failures(self, window: Window, ids: IntArray) -> None:
+        """Note features (N,) whose observations failed; each time that one did it is in `ids`."""
+        seen = set(window.tracks.seen.tolist())
+        self._failures = {j: n for j, n in self._failures.items() if j in seen}
+        for j in ids.tolist():
+            self._failures[j] = self._failures.get(j, 0) + 1
+
+    @property
+    def _unfit(self) -> IntArray:
+        """Ids (N,) of the features that failed too often, ascending."""
+        ids = [j for j, n in self._failures.items() if n >= MAX_FAILURES]
+        return np.array(sorted(ids), np.int64)
+
     # --- features --------------------------------------------------------------------------------
 
     def _new_features(
         self, window: Window, leaving_frames: Sequence[int], in_state: int
     ) -> NewFeatures | None:
         """Triangulated features that are in the cost with all of their observations."""
+        window.tracks.consume(self._unfit)
         bound = self.policy.max_state_features
         room = len(window.tracks.seen) if bound is None else bound - in_state
         choice = choose_features(window, leaving_frames, room, self.policy)
@@ -191,12 +210,13 @@ class CostConstruction:
         obs = window.tracks.observations(ids)
         lasting = is_in(ids, choice.lasting)
         points, good = self._points(window, obs, lasting)
-        if self.policy.features == "window":
-            window.tracks.consume(ids[lasting & good])
-        else:  # a lasting one that is not good may yet become so
-            window.tracks.consume(ids[~lasting | good])
-        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(~good & ~lasting))
-        return NewFeatures(obs, points, lasting).subset(good)
+        entering = is_in(ids, choice.entering(ids[good], room))
+        # a lasting one that is not good may yet become so
+        used = is_in(ids, choice.used) & ~entering & (~lasting | good)
+        consumed = entering if self.policy.features == "window" else entering | used
+        window.tracks.consume(ids[consumed])
+        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(used & ~good))
+        return NewFeatures(obs, points, entering).subset(good & (entering | used))
 
     def _points(
         self, window: Window, obs: Observations, lasting: BoolArray

@@ -68,7 +68,7 @@ class Estimator:
     ) -> None:
         self.rig = rig
         self.algorithm = algorithm
-        self.config = config or BackendConfig()
+        self.config = _with_loss(config or BackendConfig(), algorithm)
         self.diagnostics = diagnostics or Diagnostics()
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
@@ -189,6 +189,7 @@ class Estimator:
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
             still = self._standstill.is_still(self._imu, stamp_ns, frame)
+            frame = frame.without(self._standstill.movers)
             if self.window is None:
                 with self._timed("start"):
                     self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
@@ -232,13 +233,21 @@ class Estimator:
         if missing > 0:
             empty = (FeatureObservations.empty(),) * missing
             frame = FeatureFrame(frame.stamp_ns, frame.cameras + empty)
-        good = [np.isfinite(np.hstack([c.pixels, c.normalized])).all(axis=1) for c in frame.cameras]
+        good = [
+            np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in frame.cameras
+        ]
         bad = sum(int(np.sum(~rows)) for rows in good)
         if not bad:
             return frame
         self.diagnostics.warn("feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns")
-        cameras = (
-            FeatureObservations(c.ids[rows], c.pixels[rows], c.normalized[rows])
-            for c, rows in zip(frame.cameras, good, strict=True)
-        )
+        cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
         return FeatureFrame(frame.stamp_ns, tuple(cameras))
+
+
+def _with_loss(config: BackendConfig, algorithm: AlgorithmConfig) -> BackendConfig:
+    """The settings with the robust loss of an algorithm, where it has one of its own."""
+    loss = algorithm.cost.robust_loss
+    if loss is None:
+        return config
+    gating = config.gating.model_copy(update={"robust_loss": loss})
+    return config.model_copy(update={"gating": gating})

@@ -23,13 +23,13 @@ from slam_graph.backend.feature_factors import ReducedFeatures
 from slam_graph.backend.gauss_newton import minimize
 from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate
 from slam_graph.backend.marginalization import LinearizationPoints, marginalize
-from slam_graph.backend.motion_start import StartWindow, guess_states
+from slam_graph.backend.motion_start import OUTLIER_PX, StartGuess, StartWindow, guess_states
 from slam_graph.backend.policies import AlgorithmConfig, GaussNewtonPolicy
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.square_root import Layout, SquareRootInformation
 from slam_graph.backend.state import State, dims_of, imu_state_keys
 from slam_graph.backend.static_start import fix_gauge, prior_covariance, state_at_rest
-from slam_graph.backend.tracks import Observations, TrackWindow, is_in, sorted_unique
+from slam_graph.backend.tracks import Observations, is_in, sorted_unique
 from slam_graph.backend.triangulation import Triangulation, triangulate
 from slam_graph.backend.window import Window
 from slam_graph.backend.zero_velocity import StandstillDetector
@@ -42,8 +42,8 @@ IntArray = NDArray[np.int64]
 BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the window of a start in motion is solved."""
 FINAL = GaussNewtonPolicy(max_steps=1)
-OUTLIER_PX = 3.0
-"""Features with a larger root mean square reprojection error leave the window, in units of σ."""
+SETTLED = 0.1
+"""The last step must not change the cost by more than this share: else it is no minimum."""
 
 
 def start_from(
@@ -110,6 +110,7 @@ class Initializer:
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
+        self._rng = np.random.default_rng(0)
         largest = config.initialization.static_disparity_px
         self._standstill = StandstillDetector(
             config.zero_velocity.model_copy(update={"max_disparity_px": largest, "enabled": True})
@@ -158,31 +159,34 @@ class Initializer:
             return self.waiting_for
         self._tried_ns = stamp_ns
         window = StartWindow.thinned(self._stamps_ns, self._frames, start.frame_spacing_s)
-        guess = guess_states(window, imu, self._rig, self._params, self._config.noise.gravity)
+        guess = guess_states(window, imu, self._rig, self._params, self._config.noise, self._rng)
         return guess if isinstance(guess, str) else self._refined(window, guess, imu)
 
     # --- the batch problem of a start in motion ---------------------------------------------------
 
-    def _refined(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Window | str:
+    def _refined(self, window: StartWindow, guess: StartGuess, imu: ImuBuffer) -> Window | str:
         """Solve the window by the engine and marginalise all but its last state."""
         cost = self._batch_cost(window, guess, imu)
         try:
             minimize(cost, BATCH)
-            if not self._without_outliers(cost):
+            if not self._without_outliers(cost, window):
                 return "features that fit the motion"
             minimize(cost, BATCH)
             features = self._keep_features(cost, window)
-            posterior = minimize(cost, FINAL).posterior
+            final = minimize(cost, FINAL)
+            before, after = final.costs
             normalized_cost = _normalized_cost(cost)
         except np.linalg.LinAlgError:
             return "motion that shows gravity and scale"
+        if not abs(after - before) < SETTLED * max(before, 1.0):
+            return "steps that settle"
         last = len(window.frames) - 1
         keep = [L(j) for j in features.tolist()]
         keep += [*self._calibration.keys, *imu_state_keys(last)]
         points: LinearizationPoints = "current"
         if self._algorithm.marginalization.first_estimates:
             points = "first"
-        prior = marginalize(posterior, cost.state, keep, points)
+        prior = marginalize(final.posterior, cost.state, keep, points)
         start = Window(
             last,
             window.stamps_ns[-1],
@@ -194,50 +198,54 @@ class Initializer:
         covariance = prior.covariance_of(imu_state_keys(last))
         return self._doubt(normalized_cost, covariance) or start
 
-    def _batch_cost(self, window: StartWindow, guess: list[NavState], imu: ImuBuffer) -> Cost:
+    def _batch_cost(self, window: StartWindow, guess: StartGuess, imu: ImuBuffer) -> Cost:
         """All states of the window, a prior on the first, and the features they see."""
         state = State()
         factors: list[gtsam.NonlinearFactor] = []
-        for k, nav in enumerate(guess):
+        for k, nav in enumerate(guess.states):
             state.insert_imu_state(k, nav)
-        bias = gtsam.imuBias.ConstantBias(guess[0].accel_bias, guess[0].gyro_bias)
+        start = guess.states[0]
+        bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         for k, samples in enumerate(window.imu_between(imu)):
             factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
         wide = self._config.initialization.motion_prior
-        first = fix_gauge(replace(guess[0], covariance=prior_covariance(wide)), wide)
+        first = fix_gauge(replace(start, covariance=prior_covariance(wide)), wide)
         factors += _prior_factors(first)
         known = self._calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(window.stamps_ns, window.frames, strict=True)):
             self._calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, imu)
         cost = Cost(state, self._rig, self._config, known, factors)
-        tracks = window.tracks()
-        ids, lengths = tracks.lengths()
-        long = lengths >= 3
-        longest = np.argsort(-lengths[long], kind="stable")[: self._config.initialization.features]
-        cost.fresh = self._triangulated(cost, tracks, np.sort(ids[long][longest]))
+        obs = _lasting(window)
+        result = self._points(cost, obs)
+        self._enter(cost, obs, result, result.good & is_in(obs.ids, guess.static))
         return cost
 
-    def _triangulated(self, cost: Cost, tracks: TrackWindow, ids: IntArray) -> NewFeatures:
-        obs = tracks.observations(ids)
-        result = self._points(cost, obs)
-        fresh = NewFeatures(obs, result.points, np.zeros(len(ids), np.bool_))
-        return fresh.subset(result.good)
+    def _enter(
+        self, cost: Cost, obs: Observations, result: Triangulation, good: NDArray[np.bool_]
+    ) -> None:
+        """Let the good ones (J,) into the cost; if they are too many, the longest tracks."""
+        length = np.where(good, obs.counts, 0)
+        order = np.argsort(-length, kind="stable")[: self._config.initialization.features]
+        chosen = np.zeros(len(good), np.bool_)
+        chosen[order] = good[order]
+        nothing = np.zeros(len(good), np.bool_)
+        cost.fresh = NewFeatures(obs, result.points, nothing).subset(chosen)
 
     def _points(self, cost: Cost, obs: Observations) -> Triangulation:
         rig = self._rig.at(cost.state)
         poses = rig.poses(cost.state.estimate, obs.frames)
         return triangulate(rig.renormalized(obs), rig, *poses, self._config.triangulation)
 
-    def _without_outliers(self, cost: Cost) -> bool:
-        """Triangulate anew and drop what does not fit; whether enough is left."""
-        assert cost.fresh is not None
-        obs = cost.fresh.obs
-        if len(obs.ids) == 0:
-            return False
+    def _without_outliers(self, cost: Cost, window: StartWindow) -> bool:
+        """Triangulate all features anew and take what fits; whether that is most of them.
+
+        Those that did not agree at first count too: a motion that few agree on is none.
+        """
+        obs = _lasting(window)
         result = self._points(cost, obs)
         fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
         good = result.good & fits
-        cost.fresh = NewFeatures(obs, result.points, cost.fresh.in_state).subset(good)
+        self._enter(cost, obs, result, good)
         return bool(np.sum(good) >= max(self._config.initialization.min_features, 0.5 * len(good)))
 
     def _keep_features(self, cost: Cost, window: StartWindow) -> IntArray:
@@ -264,6 +272,13 @@ class Initializer:
         if velocity_sigma > start.max_velocity_sigma:
             return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
         return None
+
+
+def _lasting(window: StartWindow) -> Observations:
+    """The features of a window that show more than the motion between two frames."""
+    tracks = window.tracks()
+    ids, lengths = tracks.lengths()
+    return tracks.observations(ids[lengths >= 3])
 
 
 def _normalized_cost(cost: Cost) -> float:

@@ -15,15 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.backend.alignment import Alignment, Motion, align
+from slam_graph.backend.config import NoiseConfig
 from slam_graph.backend.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.imu import ImuBuffer, preintegrate
 from slam_graph.backend.reprojection import RigProjection
+from slam_graph.backend.start_consensus import static_features
 from slam_graph.backend.static_start import level_rotation
 from slam_graph.backend.tracks import TrackWindow
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+OUTLIER_PX = 3.0
+"""Features with a larger root mean square reprojection error leave the window, in units of σ."""
 
 MIN_FEATURES = 10
 """Fewer features than this that are seen from several frames do not make a start."""
@@ -56,6 +63,10 @@ class StartWindow:
         ends = zip(self.stamps_ns[:-1], self.stamps_ns[1:], strict=True)
         return [imu.between(a, b) for a, b in ends]
 
+    def only(self, ids: IntArray) -> StartWindow:
+        """The same frames with some features alone."""
+        return StartWindow(self.stamps_ns, [frame.only(ids) for frame in self.frames])
+
     def tracks(self) -> TrackWindow:
         """The observations of all frames, numbered from 0."""
         window = TrackWindow()
@@ -64,31 +75,67 @@ class StartWindow:
         return window
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StartGuess:
+    """What a window says of itself before it is solved as a whole.
+
+    Attributes:
+        states: of all its frames; the world has its origin and zero yaw at the first body.
+        static: ids (J,) of the features that last and stand still, ascending.
+    """
+
+    states: list[NavState]
+    static: IntArray
+
+
 def guess_states(
     window: StartWindow,
     imu: ImuBuffer,
     rig: RigProjection,
     params: gtsam.PreintegrationCombinedParams,
-    gravity: float,
-) -> list[NavState] | str:
+    config: NoiseConfig,
+    rng: np.random.Generator,
+) -> StartGuess | str:
     """States of all frames of a window, or the reason why there is no guess.
 
-    The world has its origin and zero yaw at the first body.
+    Args:
+        window: at least two frames with features in common.
+        imu: samples over the window.
+        rig: mounting of the cameras.
+        params: of the preintegration.
+        config: gravity and the noise of the features.
+        rng: draws samples of features that may stand still.
     """
     samples = window.imu_between(imu)
-    gyro_bias = estimate_gyro_bias(window.frames, samples, rig, params)
-    if gyro_bias is None:
-        return "features in common between frames"
-    motion = _integrate(window, samples, gyro_bias, params)
     tracks = window.tracks()
     ids, lengths = tracks.lengths()
     ids = ids[lengths >= max(3, len(window.frames) // 3)]
     if len(ids) < MIN_FEATURES:
         return f"more features that last ({len(ids)} so far)"
-    alignment = align(tracks.observations(ids), motion, rig, gravity)
+    obs = tracks.observations(ids)
+    tolerance = OUTLIER_PX * config.pixel_sigma / rig.cameras[0].fx
+
+    def agreed(seen: StartWindow) -> tuple[FloatArray, Motion, BoolArray] | None:
+        gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params)
+        if gyro_bias is None:
+            return None
+        motion = _integrate(window, samples, gyro_bias, params)
+        static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
+        return gyro_bias, motion, static
+
+    found = agreed(window)
+    if found is not None and not found[2].all():
+        # what moves by itself has spoilt the bias, and so what agrees
+        found = agreed(window.only(ids[found[2]]))
+    if found is None:
+        return "features in common between frames"
+    gyro_bias, motion, static = found
+    if np.sum(static) < MIN_FEATURES:
+        return "features that agree on a motion"
+    alignment = align(obs.subset(static), motion, rig, config.gravity)
     if alignment is None:
         return "motion that shows gravity and scale"
-    return _states(window, motion, alignment, gyro_bias)
+    return StartGuess(_states(window, motion, alignment, gyro_bias), ids[static])
 
 
 def _integrate(

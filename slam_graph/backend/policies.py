@@ -43,6 +43,9 @@ class CostPolicy(Settings):
     """How wrong features outside the state are found. prediction: before the steps, by the χ² test
     of their whole tracks against the predicted covariance. residual: after the steps, by that of
     the residual of each observation; one that fails is never used again."""
+    robust_loss: Literal["none", "huber", "cauchy"] | None = None
+    """Loss on reprojection residuals, instead of that of `backend.gating`: where nothing is tested
+    before the steps, the weight of what moves by itself must be able to vanish."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
     keyframe_parallax_rad: float = Field(0.05, ge=0)

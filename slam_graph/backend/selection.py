@@ -22,6 +22,9 @@ from slam_graph.backend.window import Window
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
+RETRY_FRAMES = 4
+"""Lasting features that are not the longest tracks are looked at on one frame out of so many."""
+
 MIN_FRAMES = 2
 """A feature must be seen in this many frames to be used."""
 
@@ -31,12 +34,21 @@ class FeatureChoice:
     """Features that are in the cost, ascending ids.
 
     Attributes:
-        used: (J,) those that stay outside the state.
-        lasting: (K,) long-lived ones that may become variables of the state.
+        used: (J,) those whose observations are due.
+        lasting: (K,) long-lived ones that may become variables of the state: more than there is
+            room for, because only their positions tell which are worth it. An object that moves may
+            have the longest tracks, and must not stand in the way of others.
+        frames: (K,) number of frames that see each lasting one.
     """
 
     used: IntArray
     lasting: IntArray
+    frames: IntArray
+
+    def entering(self, worthy: IntArray, room: int) -> IntArray:
+        """New variables: the longest tracks of the lasting ones that are worthy (ascending ids)."""
+        rows = is_in(self.lasting, worthy)
+        return _longest(self.lasting[rows], self.frames[rows], room)
 
 
 def choose_features(
@@ -53,7 +65,10 @@ def choose_features(
     ids, lengths = window.tracks.lengths()
     live = is_in(ids, window.tracks.seen)
     lasting = live & (lengths >= policy.state_feature_frames)
-    chosen = _longest(ids[lasting], lengths[lasting], max(room, 0))
+    lasting &= room > 0
+    lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
+        (ids + window.frame) % RETRY_FRAMES == 0
+    )
     if policy.features == "state":
         due = np.zeros(len(ids), np.bool_)
         window.tracks.consume(ids[~live])
@@ -63,8 +78,9 @@ def choose_features(
         due = ~live
         if window.past and window.past[0] in leaving_frames:
             due |= is_in(ids, window.tracks.ids_in(window.past[0]))
-    due &= (lengths >= MIN_FRAMES) & ~is_in(ids, chosen)
-    return FeatureChoice(_longest(ids[due], lengths[due], policy.max_features_per_step), chosen)
+    due &= lengths >= MIN_FRAMES
+    used = _longest(ids[due], lengths[due], policy.max_features_per_step)
+    return FeatureChoice(used, ids[lasting], lengths[lasting])
 
 
 def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:

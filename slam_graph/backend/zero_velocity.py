@@ -16,10 +16,18 @@ from collections import deque
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
+from numpy.typing import NDArray
 
 from slam_graph.backend.config import ZeroVelocityConfig
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
+
+OWN_MOTION = 3.0
+"""What moves by more than so many times what standing still allows, moves by itself, if others
+move by so many times less."""
+
+STILL_SHARE = 1.0 / 3.0
+"""So many of the features must stand still, the others may be on something that moves by itself."""
 
 MIN_FEATURES = 5
 """Fewer common features than this say nothing about the motion of the image."""
@@ -30,11 +38,14 @@ class StandstillDetector:
 
     Attributes:
         since_ns: stamp of the first frame of the current standstill, None while moving.
+        movers: ids (N,) of features that moved while the platform did not, ascending: as long as
+            they are tracked, they are no part of the world that stands still.
     """
 
     def __init__(self, config: ZeroVelocityConfig) -> None:
         self.config = config
         self.since_ns: int | None = None
+        self.movers = np.zeros(0, np.int64)
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
 
     def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
@@ -55,6 +66,9 @@ class StandstillDetector:
             and self._images_are_still()
             and self._imu_is_calm(imu, start_ns, stamp_ns)
         )
+        self.movers = np.intersect1d(self.movers, frame.cameras[0].ids)
+        if still:
+            self._note_movers()
         if not still:
             self.since_ns = None
         elif self.since_ns is None:
@@ -64,7 +78,28 @@ class StandstillDetector:
     def _images_are_still(self) -> bool:
         now = self._recent[-1][1]
         references = (self._recent[0][1], self._recent[-2][1])
-        return all(_median_motion_px(r, now) < self.config.max_disparity_px for r in references)
+        now = now.select(~np.isin(now.ids, self.movers))
+        return all(self._is_still_between(before, now) for before in references)
+
+    def _is_still_between(self, before: FeatureObservations, now: FeatureObservations) -> bool:
+        """Whether most features stand still, or many while the others are on something that moves.
+
+        When the platform moves slowly, those that move least do so nearly as much as the median.
+        """
+        ids, motion = _common_motion_px(before, now)
+        if len(ids) < MIN_FEATURES:
+            return False
+        least, median = np.quantile(np.linalg.norm(motion, axis=1), [STILL_SHARE, 0.5])
+        limit_px = self.config.max_disparity_px
+        return bool(median < limit_px or least < limit_px / OWN_MOTION)
+
+    def _note_movers(self) -> None:
+        now = self._recent[-1][1]
+        for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
+            ids, motion = _common_motion_px(before, now)
+            own = np.linalg.norm(motion, axis=1)
+            limit_px = OWN_MOTION * self.config.max_disparity_px
+            self.movers = np.union1d(self.movers, ids[own > limit_px])
 
     def _imu_is_calm(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
         if not imu.covers(start_ns):
@@ -76,12 +111,12 @@ class StandstillDetector:
         )
 
 
-def _median_motion_px(before: FeatureObservations, after: FeatureObservations) -> float:
-    """Median distance that common features moved, infinite if there are too few."""
-    _, i, j = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
-    if len(i) < MIN_FEATURES:
-        return float("inf")
-    return float(np.median(np.linalg.norm(after.pixels[j] - before.pixels[i], axis=1)))
+def _common_motion_px(
+    before: FeatureObservations, after: FeatureObservations
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Ids (N,) of common features, and how they moved (N, 2)."""
+    ids, i, j = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
+    return ids, after.pixels[j] - before.pixels[i]
 
 
 def zero_velocity_factors(

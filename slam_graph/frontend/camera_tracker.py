@@ -13,6 +13,7 @@ from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor
 from slam_graph.frontend.outliers import (
     MIN_POINTS,
+    coherent_groups,
     direction_inliers,
     eight_point,
     epipolar_distance,
@@ -23,6 +24,9 @@ from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.frontend.stats import FrameStats
 from slam_graph.frontend.tracks import Image, Mask, Tracks
 from slam_graph.sensors.rig import RigCamera
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 class CameraTracker:
@@ -56,6 +60,7 @@ class CameraTracker:
         self._config = config
         self._stats = stats
         self._rng = rng
+        self._groups: list[IntArray] = []
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
         """The features of the image before in the next one.
@@ -76,7 +81,10 @@ class CameraTracker:
         with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(match.points[keep].astype(np.float64))
             after = Tracks.of(image, stamp_ns, before.ids[keep], match.points[keep], normalized)
-            inlier = self._rigid(before.normalized[keep], normalized)
+            groups = self._rigid(before.normalized[keep], normalized)
+            self._groups = [after.ids[rows] for rows in groups]
+            inlier = np.zeros(len(after), np.bool_)
+            inlier[np.concatenate(groups)] = True
             in_map = np.ones(len(after), np.bool_)
             in_map[inlier] = self._on_the_map(after.select(inlier), stamp_ns, feedback)
             self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
@@ -105,9 +113,8 @@ class CameraTracker:
             drift = np.full((len(points), 2), np.nan)
             if births.origins is not None:
                 origins = self._camera.undistort(births.origins.astype(np.float64))
-                F = eight_point(before.normalized[there], after.normalized[here])
-                distance_px = epipolar_distance(F, origins, normalized) * self._camera.fx
-                good = distance_px < births.share * self._config.epipolar_px
+                motions = self._motions(before.select(there), after.select(here))
+                good = self._born(origins, normalized, births.share, motions)
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
                 drift = self._predictor.drift(origins, normalized, seconds)
             self._stats.count(rejected_new=~good, new=good)
@@ -121,18 +128,53 @@ class CameraTracker:
         """Do not look for some features any more."""
         self._associator.forget(ids)
 
-    def _rigid(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> Mask:
-        """Which matches (N, 2) fit a rigid motion."""
-        config = self._config
-        if config.outliers == "none":
-            return np.ones(len(before), np.bool_)
+    def _rigid(self, before: FloatArray, after: FloatArray) -> list[IntArray]:
+        """Rows of the matches (N, 2) that fit a rigid motion, for each that is there."""
+        everything = np.arange(len(before))
+        if self._config.outliers == "none":
+            return [everything]
+
+        def inliers(rows: IntArray) -> Mask:
+            return self._inliers(before[rows], after[rows])
+
+        largest = inliers(everything)
+        return [
+            everything[largest],
+            *coherent_groups(inliers, everything[~largest], len(before)),
+        ]
+
+    def _inliers(self, before: FloatArray, after: FloatArray, share: float = 1.0) -> Mask:
+        """Which matches (N, 2) fit the motion of most of them, within a share of the threshold."""
+        config, focal_px = self._config, self._camera.fx
         if config.outliers == "gyroscope" and self._predictor.rotation_known:
             R = self._predictor.camera_R
-            return direction_inliers(before, after, R, self._camera.fx, config, self._rng)
+            return direction_inliers(before, after, R, focal_px, config, self._rng, share)
         order = self._rng.permutation(len(before))
         inlier = np.empty(len(before), np.bool_)
-        inlier[order] = fundamental_inliers(before[order], after[order], self._camera.fx, config)
+        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, config, share)
         return inlier
+
+    def _born(
+        self, origins: FloatArray, points: FloatArray, share: float, motions: list[FloatArray]
+    ) -> Mask:
+        """Which candidates (M, 2) for new features move as others do, or as one of their own."""
+        limit_px = share * self._config.epipolar_px
+        distances = [epipolar_distance(F, origins, points) for F in motions]
+        good: Mask = np.min(distances, axis=0) * self._camera.fx < limit_px
+
+        def inliers(rows: IntArray) -> Mask:
+            return self._inliers(origins[rows], points[rows], share)
+
+        for group in coherent_groups(inliers, np.flatnonzero(~good), len(good)):
+            good[group] = True
+        return good
+
+    def _motions(self, before: Tracks, after: Tracks) -> list[FloatArray]:
+        """The epipolar matrix (3, 3) of each motion that features common to two images have."""
+        others = [np.isin(after.ids, ids) for ids in self._groups[1:]]
+        groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
+        matches = ((before.normalized[rows], after.normalized[rows]) for rows in groups)
+        return [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
 
     def _on_the_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> Mask:
         """Which features (N,) fit the map of the back end; those that are not in it do."""

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import gtsam
 import numpy as np
@@ -12,10 +14,15 @@ from numpy.typing import NDArray
 from slam_graph.frontend.config import FrontendConfig
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
+
+GROUP_SHARE = 0.1
+GROUP_POINTS = 16
+"""What moves otherwise than most matches is an object, not a few errors, if so many agree."""
 
 MAX_ITERATIONS = 1000
 """Most samples that RANSAC draws."""
@@ -24,8 +31,39 @@ DIRECTION_SAMPLES = 64
 """Samples of two points: with half of the matches wrong, one in four is good."""
 
 
+def coherent_groups(
+    inliers: Callable[[IntArray], Mask], rest: IntArray, count: int
+) -> list[IntArray]:
+    """What else moves as one, among matches that do not fit the motion of the others.
+
+    Images alone cannot say which of two motions is that of the camera before a world that stands
+    still: an object that is near or rich in texture has more features. What fits none is an error.
+
+    Args:
+        inliers: which of the matches, given by their rows (N,), fit the motion of most of them.
+        rest: (M,) rows of the matches to look at.
+        count: number of all matches.
+
+    Returns:
+        Rows of each group, ascending.
+    """
+    needed = max(GROUP_POINTS, GROUP_SHARE * count)
+    groups: list[IntArray] = []
+    while len(rest) >= needed:
+        group = rest[inliers(rest)]
+        if len(group) < needed:
+            break
+        groups.append(group)
+        rest = np.setdiff1d(rest, group, assume_unique=True)
+    return groups
+
+
 def fundamental_inliers(
-    before: FloatArray, after: FloatArray, focal_px: float, config: FrontendConfig
+    before: FloatArray,
+    after: FloatArray,
+    focal_px: float,
+    config: FrontendConfig,
+    share: float = 1.0,
 ) -> Mask:
     """Which matches between two frames of one camera fit a single rigid motion.
 
@@ -34,13 +72,15 @@ def fundamental_inliers(
         after: (N, 2) the same points in the later frame.
         focal_px: focal length, which turns the threshold in pixels into one on the plane z = 1.
         config: method, threshold and confidence.
+        share: of the threshold that is allowed.
 
     Returns:
         (N,) True for inliers.
     """
     if len(before) < MIN_POINTS:
         return np.ones(len(before), np.bool_)
-    result = _sampled(before, after, focal_px, config)
+    tolerance_px = share * config.epipolar_px
+    result = _sampled(before, after, focal_px, config, tolerance_px)
     if result is None:
         return np.ones(len(before), np.bool_)
     # A sample of a few noisy points fits some others badly; all that agree fit them better
@@ -48,7 +88,7 @@ def fundamental_inliers(
         if np.count_nonzero(result) < MIN_POINTS:
             break
         F = eight_point(before[result], after[result])
-        refined: Mask = epipolar_distance(F, before, after) * focal_px < config.epipolar_px
+        refined: Mask = epipolar_distance(F, before, after) * focal_px < tolerance_px
         if np.count_nonzero(refined) <= np.count_nonzero(result):
             break
         result = refined
@@ -56,7 +96,11 @@ def fundamental_inliers(
 
 
 def _sampled(
-    before: FloatArray, after: FloatArray, focal_px: float, config: FrontendConfig
+    before: FloatArray,
+    after: FloatArray,
+    focal_px: float,
+    config: FrontendConfig,
+    tolerance_px: float,
 ) -> Mask | None:
     """The inliers (N,) of the best sample that OpenCV finds; None if it finds none."""
     if config.outliers == "essential":
@@ -67,7 +111,7 @@ def _sampled(
             np.eye(3),
             cv2.RANSAC,
             config.ransac_confidence,
-            config.epipolar_px / focal_px,
+            tolerance_px / focal_px,
             MAX_ITERATIONS,
         )
     else:
@@ -76,7 +120,7 @@ def _sampled(
             before * focal_px,
             after * focal_px,
             cv2.USAC_MAGSAC if config.outliers == "magsac" else cv2.FM_RANSAC,
-            config.epipolar_px,
+            tolerance_px,
             config.ransac_confidence,
             MAX_ITERATIONS,
         )
@@ -93,6 +137,7 @@ def direction_inliers(
     focal_px: float,
     config: FrontendConfig,
     rng: np.random.Generator,
+    share: float = 1.0,
 ) -> Mask:
     """Which matches fit a motion whose rotation is known, by 2-point RANSAC.
 
@@ -107,6 +152,7 @@ def direction_inliers(
         focal_px: focal length.
         config: threshold.
         rng: draws the samples.
+        share: of the threshold that is allowed.
 
     Returns:
         (N,) True for inliers.
@@ -123,7 +169,7 @@ def direction_inliers(
     length = np.linalg.norm(directions, axis=1)
     directions = directions[length > 0] / length[length > 0, None]
     # m'ᵀ [t]× R m = t · n, and its gradients by m and m' are of the length |t × m|, first two rows
-    tolerance = config.epipolar_px / focal_px
+    tolerance = share * config.epipolar_px / focal_px
     if len(directions) == 0:
         return np.ones(n, np.bool_)
     best = _within(directions, normals, turned, seen, tolerance)

@@ -93,6 +93,11 @@ class FeatureObservations:
         """No features."""
         return FeatureObservations(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
 
+    def select(self, rows: NDArray[np.bool_]) -> FeatureObservations:
+        """Those where `rows` (N,) holds."""
+        look = None if self.descriptors is None else self.descriptors[rows]
+        return FeatureObservations(self.ids[rows], self.pixels[rows], self.normalized[rows], look)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureFrame:
@@ -106,6 +111,18 @@ class FeatureFrame:
 
     stamp_ns: int
     cameras: tuple[FeatureObservations, ...]
+
+    def only(self, ids: IntArray) -> FeatureFrame:
+        """The frame with some features alone."""
+        cameras = (c.select(np.isin(c.ids, ids)) for c in self.cameras)
+        return FeatureFrame(self.stamp_ns, tuple(cameras))
+
+    def without(self, ids: IntArray) -> FeatureFrame:
+        """The frame without some features."""
+        if len(ids) == 0:
+            return self
+        cameras = (c.select(~np.isin(c.ids, ids)) for c in self.cameras)
+        return FeatureFrame(self.stamp_ns, tuple(cameras))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -107,6 +107,28 @@ class ImageConfig(Settings):
     """How many sharp images are averaged to a blurred one."""
 
 
+class MovingObjectConfig(Settings):
+    """A textured board that moves before the cameras and hides what is behind it.
+
+    By default it covers a third of the view of EuRoC's cameras.
+    """
+
+    width_m: float = Field(0.85, gt=0)
+    """Its width."""
+    height_m: float = Field(2.4, gt=0)
+    """Its height."""
+    texel_m: float = Field(0.002, gt=0)
+    """Size of a texel: finer than that of the walls by default, as it is nearer than they are."""
+    distance_m: float = Field(1.5, gt=0)
+    """How far it keeps ahead of the first camera, whose path it follows smoothly."""
+    sway_m: float = Field(0.4, gt=0)
+    """How far it goes to either side on its way."""
+    speed: float = Field(0.5, gt=0)
+    """Largest speed to the side, m/s."""
+    since_s: float = Field(0.0, ge=0)
+    """When it has come in from the side; by default it is there in the first frame."""
+
+
 class StartConfig(Settings):
     """The start state that comes with the data, and how well it is said to be known."""
 
@@ -161,6 +183,8 @@ class SimulationConfig(Settings):
     """The simulated front end."""
     images: ImageConfig = ImageConfig()
     """The rendered images."""
+    moving_object: MovingObjectConfig | None = None
+    """A board that moves before the cameras, in rendered images; none if not said."""
     start: StartConfig | None = None
     """The start state that comes with the data; with a real IMU it is less certain by default."""
 

@@ -15,6 +15,7 @@ from slam_graph.sensors.measurements import CameraFrame
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.config import ImageConfig, random_stream
 from slam_graph.simulation.motion import FloatArray, Motion
+from slam_graph.simulation.moving_object import MovingBoard
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
 
@@ -32,13 +33,21 @@ class Renderer:
         atlas: their textures.
         config: noise, exposure, blur.
         seed: of the simulation.
+        board: what moves before the cameras; its texture is the last one of the atlas.
     """
 
     def __init__(
-        self, rig: Rig, world: World, atlas: Atlas, config: ImageConfig, seed: int
+        self,
+        rig: Rig,
+        world: World,
+        atlas: Atlas,
+        config: ImageConfig,
+        seed: int,
+        board: MovingBoard | None = None,
     ) -> None:
         self._cameras = [_RayCamera(mounted) for mounted in rig.cameras]
         self._world = world
+        self._board = board
         self._atlas = atlas
         self._config = config
         self._seed = seed
@@ -57,8 +66,10 @@ class Renderer:
         rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
         gain = self._gain(exposure_ns - motion.start_ns)
         images = []
+        worlds = [self._world_at(stamp_ns) for stamp_ns in stamps.tolist()]
+        instants = list(zip(worlds, rotations, positions, strict=True))
         for number, camera in enumerate(self._cameras):
-            sharp = [self.radiance(number, R, p) for R, p in zip(rotations, positions, strict=True)]
+            sharp = [self.radiance(number, *instant) for instant in instants]
             values = gain * np.mean(sharp, axis=0)
             if self._config.noise_sigma > 0:
                 since_ns = exposure_ns - motion.start_ns
@@ -69,19 +80,26 @@ class Renderer:
             images.append(image.reshape(camera.height, camera.width))
         return CameraFrame(exposure_ns - offset_ns, tuple(images))
 
-    def radiance(self, camera: int, world_R_body: FloatArray, position: FloatArray) -> Grey:
+    def radiance(
+        self, camera: int, world: World, world_R_body: FloatArray, position: FloatArray
+    ) -> Grey:
         """What each pixel of a camera sees, (height · width,), for a pose of the body."""
         lens = self._cameras[camera]
         R = world_R_body @ lens.body_R_camera
         eye = position + world_R_body @ lens.position
         rays = lens.rays @ R.T.astype(np.float32)
-        hit = cast(self._world, eye, rays)
+        hit = cast(world, eye, rays)
         # a pixel covers distance / focal length, and more on a wall that is seen at an angle
         footprint = hit.distance * lens.stretch / (lens.focal_px * np.sqrt(hit.slant))
-        level = np.log2(footprint * np.float32(1.0 / self._atlas.texel_m))
-        shade = np.array([_shade(panel) for panel in self._world.panels], np.float32)
-        grey = shade[hit.panel] * self._atlas.sample(hit.panel, level, hit.a, hit.b)
+        shade = np.array([_shade(panel) for panel in world.panels], np.float32)
+        grey = shade[hit.panel] * self._atlas.sample(hit.panel, footprint, hit.a, hit.b)
         return np.where(lens.lit, grey, np.float32(0.0))
+
+    def _world_at(self, stamp_ns: int) -> World:
+        """The walls, and where the board is at a time."""
+        if self._board is None:
+            return self._world
+        return World((*self._world.panels, self._board.at(stamp_ns)))
 
     def _instants(self, motion: Motion, exposure_ns: int) -> NDArray[np.int64]:
         """Times of the sharp images of which a blurred one is the mean."""

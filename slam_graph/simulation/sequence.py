@@ -22,6 +22,7 @@ from slam_graph.simulation.config import SimulationConfig, random_stream
 from slam_graph.simulation.imu import ImuSource
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import IntArray, Motion
+from slam_graph.simulation.moving_object import MovingBoard
 from slam_graph.simulation.rendering import Renderer
 from slam_graph.simulation.textures import paint
 from slam_graph.simulation.tracks import TrackSimulator
@@ -163,8 +164,24 @@ class SimulatedImages(SimulatedSequence):
     def renderer(self) -> Renderer:
         """Takes the images; the walls are painted when it is first asked for."""
         flight, config = self.flight, self.config
-        atlas = paint(flight.world, config.images.texel_m, config.seed)
-        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed)
+        board = self.board
+        sizes = [panel.size for panel in flight.world.panels]
+        texels_m = [config.images.texel_m] * len(sizes)
+        if board is not None:
+            sizes.append(board.size)
+            texels_m.append(board.config.texel_m)
+        atlas = paint(sizes, texels_m, config.seed)
+        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board)
+
+    @cached_property
+    def board(self) -> MovingBoard | None:
+        """What moves before the cameras, if anything."""
+        flight, config = self.flight, self.config.moving_object
+        if config is None:
+            return None
+        mounting = flight.rig.cameras[0].body_T_camera.matrix()
+        began_ns = int(flight.exposures_ns[0])
+        return MovingBoard.ahead_of(config, flight.motion, mounting, began_ns, self.config.seed)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """Frames of images."""

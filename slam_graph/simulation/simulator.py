@@ -48,6 +48,8 @@ def simulate(config: SimulationConfig, diagnostics: Diagnostics | None = None) -
         raise ConfigError(
             f"real_imu and start_s are for recorded trajectories, '{config.trajectory}' is made up"
         )
+    if config.moving_object is not None and config.kind != "images":
+        raise ConfigError("moving_object is for images; tracks have landmarks.moving_points")
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
     flight = _flight(config, diagnostics)
     source = config.trajectory if config.recorded is None else _name(config.recorded)

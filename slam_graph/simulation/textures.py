@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.simulation.config import random_stream
-from slam_graph.simulation.world import World
 
 Grey = NDArray[np.float32]
 
@@ -36,27 +36,28 @@ class Atlas:
         texels: (T,) uint8, all levels of all panels, row by row.
         offsets: (P * LEVELS,) where each level of each panel begins.
         widths, heights: (P * LEVELS,) of each level, in texels.
-        texel_m: size of a texel of the finest level, m.
+        texels_m: (P,) sizes of a texel of the finest level of each panel, m.
     """
 
     texels: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     widths: NDArray[np.int64]
     heights: NDArray[np.int64]
-    texel_m: float
+    texels_m: Grey
 
-    def sample(self, panel: NDArray[np.intp], level: Grey, a: Grey, b: Grey) -> Grey:
+    def sample(self, panel: NDArray[np.intp], footprint: Grey, a: Grey, b: Grey) -> Grey:
         """Grey values, interpolated linearly between texels and between levels.
 
         Args:
             panel: (N,) numbers of the panels.
-            level: (N,) of the pyramid; what is outside is clipped.
+            footprint: (N,) what a pixel covers there, m.
             a: (N,) places on the panel, across, m.
             b: (N,) along, m.
         """
-        level = np.clip(level, 0.0, LEVELS - 1.001)
+        texel_m = self.texels_m[panel]
+        level = np.clip(np.log2(footprint / texel_m), 0.0, LEVELS - 1.001)
         fine = level.astype(np.intp)
-        x, y = a / np.float32(self.texel_m) - 0.5, b / np.float32(self.texel_m) - 0.5
+        x, y = a / texel_m - 0.5, b / texel_m - 0.5
         lower = self._within(panel * LEVELS + fine, fine, x, y)
         upper = self._within(panel * LEVELS + fine + 1, fine + 1, x, y)
         mixed: Grey = lower + (level - fine).astype(np.float32) * (upper - lower)
@@ -86,27 +87,27 @@ def _mix(a: NDArray[np.uint8] | Grey, b: NDArray[np.uint8] | Grey, weight: Grey)
     return mixed
 
 
-def paint(world: World, texel_m: float, seed: int) -> Atlas:
+def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed: int) -> Atlas:
     """Textures for all panels of a world, so different that places can be told apart.
 
     Args:
-        world: its panels.
-        texel_m: size of a texel, m.
+        sizes: of P panels, m.
+        texels_m: size of a texel of each of them, m.
         seed: of the simulation.
     """
     images: list[NDArray[np.uint8]] = []
-    for index, panel in enumerate(world.panels):
+    for index, (size, texel_m) in enumerate(zip(sizes, texels_m, strict=True)):
         rng = np.random.default_rng(random_stream(seed, "texture", index))
-        width, height = (max(round(side / texel_m), 2) for side in panel.size)
+        width, height = (max(round(side / texel_m), 2) for side in size)
         images += _pyramid(_noise(width, height, texel_m, rng))
-    sizes = np.array([image.shape for image in images], np.int64)
-    ends = np.cumsum(sizes[:, 0] * sizes[:, 1])
+    shapes = np.array([image.shape for image in images], np.int64)
+    ends = np.cumsum(shapes[:, 0] * shapes[:, 1])
     return Atlas(
         texels=np.concatenate([image.ravel() for image in images]),
         offsets=np.concatenate([[0], ends[:-1]]),
-        widths=sizes[:, 1],
-        heights=sizes[:, 0],
-        texel_m=texel_m,
+        widths=shapes[:, 1],
+        heights=shapes[:, 0],
+        texels_m=np.array(texels_m, np.float32),
     )
 
 

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rendered flights with a textured object that moves through a third of the view."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.metric import Metric
+from benchmarks.running import Run
+from benchmarks.suite import Benchmark, Outcome
+from slam_graph.simulation.config import SimulationConfig
+from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.writers import write
+
+DURATION_S = 10.0
+
+FLIGHTS: dict[str, dict[str, Any]] = {
+    "in_motion": {"seed": 1, "flight": {"hover_s": 0.0}},
+    "at_rest": {"seed": 3, "flight": {"hover_s": 1.5}},
+}
+"""One that begins in motion, and one that begins at rest while the object moves already."""
+
+OBJECTS: dict[str, dict[str, float]] = {
+    "always": {},
+    "later": {"since_s": 4.0},
+    "fast": {"speed": 1.0, "sway_m": 0.5},
+}
+"""There from the first frame on, or later; by default its speed to the side is up to 0.5 m/s."""
+
+ALGORITHMS = ("msckf", "swf", "okvis")
+JUDGED = ("msckf", "swf")
+"""The others are only shown."""
+GROWTH_BAR = 2.0
+DELAY_BAR_S = 0.5
+
+
+def measure(data: Path) -> Outcome:
+    """How much the ATE grows beside the same flight without the object, and the start is delayed.
+
+    Nothing is read from `data`.
+    """
+    outcome = Outcome()
+    for flight, settings in FLIGHTS.items():
+        clean = _runs(settings, None)
+        for name, moving_object in OBJECTS.items():
+            for variant, run in _runs(settings, moving_object).items():
+                without = clean[variant]
+                ate, ate_without = (r.errors("se3").position_m for r in (run, without))
+                delay_s = run.seconds_to_start - without.seconds_to_start
+                figures = [
+                    Metric("growth", ate / ate_without, "× ATE", "lower", GROWTH_BAR),
+                    Metric("ate", ate, "m", "lower"),
+                    Metric("delay", delay_s, "s", "lower", DELAY_BAR_S, None),
+                ]
+                judged = variant.endswith(JUDGED)
+                outcome.add(f"{flight}.{name}.{variant}", figures, judged)
+                outcome.notes += run.notes()
+        for variant, run in clean.items():
+            figure = Metric("ate", run.errors("se3").position_m, "m", "lower")
+            outcome.add(f"{flight}.without.{variant}", [figure])
+    return outcome
+
+
+def _runs(settings: dict[str, Any], moving_object: dict[str, float] | None) -> dict[str, Run]:
+    """Runs of all algorithms with one camera and with two, on images that are rendered once."""
+    config = SimulationConfig.model_validate(
+        {
+            "kind": "images",
+            "duration_s": DURATION_S,
+            "moving_object": moving_object,
+            **settings,
+        }
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        images = Path(folder) / "images"
+        write(simulate(config), images)
+        return {
+            f"{word}.{algorithm}": Run(images, algorithm, cameras)
+            for word, cameras in (("mono", 1), ("stereo", 2))
+            for algorithm in ALGORITHMS
+        }
+
+
+BENCHMARKS = {
+    "moving_object": Benchmark(
+        "Rendered flights, an object moving through a third of the view: growth of ATE, start",
+        (),
+        measure,
+    )
+}
