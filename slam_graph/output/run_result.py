@@ -22,7 +22,9 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.final_adjustment import FinalBa
 from slam_graph.mapping.loop_closure import LoopClosures
 from slam_graph.output.calibration_log import CalibrationLog
+from slam_graph.mapping.map_model import SlamMap
 from slam_graph.output.innovations import InnovationLog
+from slam_graph.output.localization import LocalizationLog
 from slam_graph.output.point_map import PointMap
 from slam_graph.output.steps import StepLog
 from slam_graph.output.timing import TimingLog
@@ -75,6 +77,8 @@ class RunResult:
     history: StateHistory = field(default_factory=StateHistory)
     final_ba: FinalBa | None = None
     loops: LoopClosures | None = None
+    slam_map: SlamMap | None = None
+    localization: LocalizationLog | None = None
     points: PointMap = field(default_factory=PointMap)
     timing: TimingLog = field(default_factory=TimingLog)
     steps: StepLog = field(default_factory=StepLog)
