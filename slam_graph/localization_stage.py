@@ -68,13 +68,9 @@ class LocalizationStage:
         self, known: SlamMap, rig: Rig, config: RunConfig, name: str, diagnostics: Diagnostics
     ) -> None:
         loops, settings = config.loop_closure, config.localization
-        self._places = MapPlaces(
-            known, rig, loops.places, loops.verification, settings.neighbours
-        )
+        self._places = MapPlaces(known, rig, loops.places, loops.verification, settings.neighbours)
         self._localizer = MapLocalizer(self._places, settings)
-        self._describer = KeyframeDescriber(
-            rig.cameras[0].camera, loops.keyframes.further_corners
-        )
+        self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
         self._name, self._diagnostics = name, diagnostics
         self._log = LocalizationLog(known)
 

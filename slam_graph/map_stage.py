@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -14,7 +13,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping.loop_closure import correct_by
 from slam_graph.mapping.loop_keyframes import Keyframe
 from slam_graph.mapping.loop_pose_graph import stacked
 from slam_graph.mapping.map_building import build_map

@@ -97,9 +97,7 @@ class LoopVerifier:
             return None
         covariance = self._covariance(points[inliers], pose)
         agreeing = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
-        return Loop(
-            first, second, pose, covariance, int(inliers.sum()), len(pairs), agreeing
-        )
+        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), agreeing)
 
     def _pose(
         self, points: FloatArray, rays: FloatArray

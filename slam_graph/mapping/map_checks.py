@@ -66,9 +66,8 @@ def _rows(content: SlamMap) -> Iterator[tuple[str, NDArray[np.bool_], str]]:
     yield "link_ends", _within(links.ends, 0, count), "is no keyframe"
     yield "link_ends", links.ends[:, 0] != links.ends[:, 1], "joins a keyframe with itself"
     covariances = links.covariances
-    symmetric = np.isclose(covariances, covariances.transpose(0, 2, 1)).all(axis=(1, 2))
-    sound = symmetric.copy()
-    sound[symmetric] = np.linalg.eigvalsh(covariances[symmetric])[:, 0] > 0
+    same = np.isclose(covariances, covariances.transpose(0, 2, 1)).reshape(-1, 36)
+    sound = same.all(axis=1) & (np.linalg.eigvalsh(covariances)[:, 0] > 0)
     yield "link_covariances", sound, "is not a covariance"
     yield "word_weights", words.idf >= 0, "is negative"
 

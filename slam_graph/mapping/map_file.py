@@ -24,8 +24,8 @@ from slam_graph.mapping.map_checks import check_map
 from slam_graph.mapping.map_model import Links, MapRecording, PoseSource, SlamMap
 from slam_graph.mapping.place_recognition import Vocabulary
 from slam_graph.mapping.pose_graph import Poses
-from slam_graph.sensors.kalibr import IMU_KEY, chain_cameras, kalibr_table
 from slam_graph.sensors.calibration import read_imu_noise
+from slam_graph.sensors.kalibr import IMU_KEY, chain_cameras, kalibr_table
 from slam_graph.sensors.rig import Rig
 from slam_graph.sensors.yaml_source import parse_yaml
 
@@ -162,9 +162,7 @@ def _quaternions(poses: Poses) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_matrix(poses.rotations).as_quat())
 
 
-def _members(
-    archive: zipfile.ZipFile, size: int, path: Path
-) -> dict[str, zipfile.ZipInfo]:
+def _members(archive: zipfile.ZipFile, size: int, path: Path) -> dict[str, zipfile.ZipInfo]:
     """The members by name, if together they are no larger than the file."""
     members = {info.filename: info for info in archive.infolist()}
     plain = all(
@@ -182,9 +180,7 @@ def _members(
     return members
 
 
-def _header(
-    archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], path: Path
-) -> _Header:
+def _header(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], path: Path) -> _Header:
     """The header, if this version can read the file."""
     if HEADER not in members or members[HEADER].file_size > HEADER_LIMIT:
         raise DataError(f"{path}: not a slam_graph map: it has no {HEADER}, or too large a one")

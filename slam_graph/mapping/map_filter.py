@@ -54,7 +54,7 @@ class MapPoseFilter:
         # without a prior: what the sighting says alone
         H = self._jacobian()
         information = H.T @ np.linalg.inv(self._noise(covariance)) @ H
-        self.covariance: FloatArray = np.linalg.inv(information)
+        self.covariance: FloatArray = np.asarray(np.linalg.inv(information))
 
     @property
     def position_sigma(self) -> float:
@@ -93,9 +93,7 @@ class MapPoseFilter:
         gain = np.linalg.solve(S, H @ self.covariance).T
         δ = gain @ innovation
         rest = np.eye(len(δ)) - gain @ H
-        self.covariance = (
-            rest @ self.covariance @ rest.T + gain @ self._noise(covariance) @ gain.T
-        )
+        self.covariance = rest @ self.covariance @ rest.T + gain @ self._noise(covariance) @ gain.T
         turn = gtsam.Rot3.Expmap(self._axes @ δ[:-3])
         position = self.pose.translation() + δ[-3:]
         self.pose = gtsam.Pose3(turn.compose(self.pose.rotation()), position)
@@ -105,9 +103,7 @@ class MapPoseFilter:
     ) -> tuple[FloatArray, FloatArray]:
         """What a sighting says more (6,), in the tangent of the body, and its covariance (6, 6)."""
         between = self.pose.between(sighting)
-        innovation = np.concatenate(
-            [gtsam.Rot3.Logmap(between.rotation()), between.translation()]
-        )
+        innovation = np.concatenate([gtsam.Rot3.Logmap(between.rotation()), between.translation()])
         H = self._jacobian()
         return innovation, H @ self.covariance @ H.T + self._noise(covariance)
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import gtsam
-import numpy as np
 from scipy.stats import chi2
 
 from slam_graph.mapping.loop_keyframes import Keyframe

@@ -130,7 +130,9 @@ class SlamMap:
 
     def pose(self, number: int) -> gtsam.Pose3:
         """world_T_body of a keyframe."""
-        return gtsam.Pose3(gtsam.Rot3(self.poses.rotations[number]), self.poses.translations[number])
+        return gtsam.Pose3(
+            gtsam.Rot3(self.poses.rotations[number]), self.poses.translations[number]
+        )
 
     def descriptors_of(self, number: int) -> Descriptors:
         """(n, B) what a keyframe sees."""

@@ -21,8 +21,8 @@ from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.final_adjustment import FinalBa
 from slam_graph.mapping.loop_closure import LoopClosures
-from slam_graph.output.calibration_log import CalibrationLog
 from slam_graph.mapping.map_model import SlamMap
+from slam_graph.output.calibration_log import CalibrationLog
 from slam_graph.output.innovations import InnovationLog
 from slam_graph.output.localization import LocalizationLog
 from slam_graph.output.point_map import PointMap
@@ -52,6 +52,8 @@ class RunResult:
         history: the causal estimate of every frame.
         final_ba: the trajectory that comes of the recording as a whole, if one was found.
         loops: what became of places that were seen again, if loops were to be closed.
+        slam_map: the map, if it was asked for.
+        localization: where the run was in a known map, if it was to be located in one.
         points: the map.
         timing: milliseconds of every stage of every frame.
         steps: Gauss-Newton steps of every frame, and the cost before and after.
