@@ -94,7 +94,7 @@ def write_map(path: Path, content: SlamMap) -> None:
     }
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(HEADER), json.dumps(header, indent=1, allow_nan=False))
-        for name, array in _arrays(content).items():
+        for name, array in arrays_of(content).items():
             with archive.open(zipfile.ZipInfo(_member(name)), "w", force_zip64=True) as file:
                 dtype = ARRAYS[name][0]
                 np.lib.format.write_array(
@@ -132,8 +132,8 @@ def _member(name: str) -> str:
     return f"{name}.npy"
 
 
-def _arrays(content: SlamMap) -> dict[str, NDArray[Any]]:
-    """All arrays of a map by name."""
+def arrays_of(content: SlamMap) -> dict[str, NDArray[Any]]:
+    """All arrays of a map by name, as the file has them."""
     links = content.links
     return {
         "recording_of": content.recording_of,

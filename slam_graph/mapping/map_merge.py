@@ -12,24 +12,21 @@ GNC decides once more which of the links are false. Features that are matched be
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.mapping.loop_config import LoopClosureConfig
 from slam_graph.mapping.loop_pose_graph import corrected, loop_graph
 from slam_graph.mapping.loop_verification import Loop
+from slam_graph.mapping.map_alignment import Recognised, agreement, names, recognised
 from slam_graph.mapping.map_building import links_of, together, trained, with_features
 from slam_graph.mapping.map_config import LocalizationConfig
-from slam_graph.mapping.map_filter import MapPoseFilter, upright
 from slam_graph.mapping.map_model import NO_FEATURE, FloatArray, IntArray, Links, SlamMap
-from slam_graph.mapping.map_places import MapPlaces, Sighting
 from slam_graph.mapping.pose_graph import Poses
 from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
 from slam_graph.mapping.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
@@ -37,9 +34,6 @@ from slam_graph.version import __version__
 
 MIN_LINKS = 5
 """So many keyframes of one map must be recognised in the other, and agree."""
-
-HYPOTHESES = 50
-"""How many sightings are tried as what all others should agree with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +67,6 @@ class MergedMaps:
     summary: MergeSummary
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """A keyframe of the second map that was located in the first."""
-
-    number: int
-    sighting: Sighting
-
-
 def merge_maps(
     first: SlamMap,
     second: SlamMap,
@@ -102,11 +88,11 @@ def merge_maps(
         EstimationError: if they share no place.
     """
     level = first.gravity_aligned and second.gravity_aligned
-    seen = list(_located(first, second, loops, localization, level))
-    agreeing, first_T_second = _agreement(first, second, seen, localization, level)
+    seen = list(recognised(first, second, loops, localization, level))
+    agreeing, first_T_second = agreement(first, second, seen, localization, level)
     if len(agreeing) < MIN_LINKS:
         raise EstimationError(
-            f"the maps of {_names(first)} and {_names(second)} share no place: {len(seen)} of "
+            f"the maps of {names(first)} and {names(second)} share no place: {len(seen)} of "
             f"{len(second)} keyframes were recognised, of which {len(agreeing)} agree, and "
             f"{MIN_LINKS} must; are they of the same place, seen by cameras held alike?"
         )
@@ -116,7 +102,7 @@ def merge_maps(
     accepted = [one for one, good in zip(agreeing, held, strict=True) if good]
     if len(accepted) < MIN_LINKS:
         raise EstimationError(
-            f"the maps of {_names(first)} and {_names(second)} cannot be laid on each other: only "
+            f"the maps of {names(first)} and {names(second)} cannot be laid on each other: only "
             f"{len(accepted)} of {len(agreeing)} links between them hold"
         )
     body_points = _body_points(joined)
@@ -147,78 +133,7 @@ def merge_maps(
     )
 
 
-def _names(content: SlamMap) -> str:
-    return " + ".join(recording.name for recording in content.recordings)
-
-
-def _located(
-    first: SlamMap,
-    second: SlamMap,
-    loops: LoopClosureConfig,
-    localization: LocalizationConfig,
-    level: bool,
-) -> Iterator[_Seen]:
-    """Keyframes of the second map that show places of the first."""
-    for number, recording in enumerate(second.recordings):
-        places = MapPlaces(
-            first, recording.rig, loops.places, loops.verification, localization.neighbours
-        )
-        places.check(second.descriptors, _names(second))
-        for row in np.flatnonzero(second.recording_of == number).tolist():
-            view = second.keyframe(row)
-            found = [
-                sighting
-                for place in places.alike(view.descriptors, localization.candidates).tolist()
-                if (sighting := places.locate(view, place, level)) is not None
-            ]
-            if found:
-                yield _Seen(row, max(found, key=lambda sighting: sighting.loop.inliers))
-
-
-def _agreement(
-    first: SlamMap,
-    second: SlamMap,
-    seen: list[_Seen],
-    config: LocalizationConfig,
-    level: bool,
-) -> tuple[list[_Seen], gtsam.Pose3]:
-    """The largest group of sightings that agree with one of them, and what that one says.
-
-    Two agree if the ways between them in both maps are the same, up to the drift on these ways.
-    """
-    bound = float(chi2.ppf(config.confidence, 6))
-    best: list[_Seen] = []
-    alignment = gtsam.Pose3()
-    step = max(len(seen) / HYPOTHESES, 1.0)
-    for row in np.arange(0, len(seen), step).astype(int).tolist():
-        trial = seen[row]
-        body = second.pose(trial.number)
-        group = []
-        for other in seen:
-            filter_ = MapPoseFilter(
-                config, level, body, trial.sighting.world_T_body, trial.sighting.covariance, 0
-            )
-            filter_.move(_apart_ns(first, second, trial, other), second.pose(other.number))
-            if filter_.distance(other.sighting.world_T_body, other.sighting.covariance) < bound:
-                group.append(other)
-        if len(group) > len(best):
-            best = group
-            placed = trial.sighting.world_T_body
-            placed = upright(placed, body) if level else placed
-            alignment = placed.compose(body.inverse())
-    return best, alignment
-
-
-def _apart_ns(first: SlamMap, second: SlamMap, one: _Seen, other: _Seen) -> int:
-    """How much time odometry had to drift between two sightings, in both maps."""
-    ways = (
-        (first, one.sighting.place, other.sighting.place),
-        (second, one.number, other.number),
-    )
-    return sum(abs(int(content.stamps_ns[a]) - int(content.stamps_ns[b])) for content, a, b in ways)
-
-
-def _link(one: _Seen, offset: int) -> Loop:
+def _link(one: Recognised, offset: int) -> Loop:
     """The sighting as a loop closure of the joined map."""
     return replace(one.sighting.loop, first=one.sighting.place, second=offset + one.number)
 
@@ -313,7 +228,7 @@ def _body_points(content: SlamMap) -> FloatArray:
     return points
 
 
-def _fused(first: SlamMap, second: SlamMap, accepted: list[_Seen]) -> tuple[IntArray, int]:
+def _fused(first: SlamMap, second: SlamMap, accepted: list[Recognised]) -> tuple[IntArray, int]:
     """(N,) feature of each observation of both maps, and how many of the second's were fused."""
     offset = len(first.points)
     other = second.features.copy()
