@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -13,8 +14,10 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.mapping.loop_closure import correct_by
 from slam_graph.mapping.loop_keyframes import Keyframe
 from slam_graph.mapping.loop_pose_graph import stacked
+from slam_graph.mapping.loop_verification import Loop
 from slam_graph.mapping.map_building import build_map
 from slam_graph.mapping.map_model import MapRecording, PoseSource, SlamMap
 from slam_graph.mapping.pose_graph import Poses
@@ -28,8 +31,8 @@ def map_of(
 ) -> SlamMap | None:
     """The map of a run, or None if there is nothing to recognise places by.
 
-    Its poses are those with loops closed if there were any, else those of the bundle adjustment of
-    the whole recording, else the causal ones.
+    Its poses are those of the bundle adjustment of the whole recording, else the causal ones; if
+    there were loops, closed on these.
 
     Args:
         result: of the run, whose loops are closed.
@@ -41,10 +44,12 @@ def map_of(
         diagnostics.warn("map_impossible", message)
         return None
     config = result.config.loop_closure
-    source, poses = best_poses(result, keyframes)
-    loops = result.loops
-    held = [] if loops is None else np.array(loops.loops, dtype=object)[loops.accepted].tolist()
+    held: list[Loop] = []
+    if result.loops is not None:
+        pairs = zip(result.loops.loops, result.loops.accepted.tolist(), strict=True)
+        held = [loop for loop, accepted in pairs if accepted]
     try:
+        source, poses = best_poses(result, keyframes, held)
         made = build_map(
             keyframes,
             poses,
@@ -62,13 +67,24 @@ def map_of(
     return made
 
 
-def best_poses(result: RunResult, keyframes: list[Keyframe]) -> tuple[PoseSource, Poses]:
-    """The best world_T_body of all keyframes, and where they come from."""
-    if result.loops is not None and result.loops.accepted.any():
-        return "loop_closed", result.loops.poses
+def best_poses(
+    result: RunResult, keyframes: list[Keyframe], held: list[Loop]
+) -> tuple[PoseSource, Poses]:
+    """The best world_T_body of all keyframes, and where they come from.
+
+    Args:
+        result: of the run.
+        keyframes: with causal poses.
+        held: loop closures that are true.
+    """
+    source: PoseSource = "causal"
+    poses = [k.world_T_body for k in keyframes]
     if result.final_ba is not None:
-        return "smoothed", stacked(_posed(keyframes, result.final_ba.trajectory))
-    return "causal", stacked([k.world_T_body for k in keyframes])
+        source, poses = "smoothed", _posed(keyframes, result.final_ba.trajectory)
+    if not held:
+        return source, stacked(poses)
+    posed = [replace(k, world_T_body=pose) for k, pose in zip(keyframes, poses, strict=True)]
+    return "loop_closed", correct_by(posed, held, result.config.loop_closure).poses
 
 
 def _posed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[gtsam.Pose3]:

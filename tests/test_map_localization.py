@@ -114,8 +114,8 @@ def fly(world: World, located: MapLocalizer, number: int, steps: range) -> list[
         if located.wants(view.stamp_ns):
             located.see(view)
         if located.located and located.filter is not None:
-            truth = world.pose(number + step)
-            errors.append(float(np.linalg.norm(truth.translation() - located.filter.pose.translation())))
+            away = located.filter.pose.translation() - world.pose(number + step).translation()
+            errors.append(float(np.linalg.norm(away)))
     return errors
 
 
@@ -182,6 +182,22 @@ def test_who_has_been_carried_off_is_found_again(world: World) -> None:
     assert max(errors[2:]) < 0.01
 
 
+def test_odometry_that_makes_no_sense_leaves_it_lost(world: World) -> None:
+    """A run that has diverged contradicts every sighting, and the sightings each other."""
+    located = localizer(world)
+    fly(world, located, 0, range(3))
+    assert located.located
+    rng = np.random.default_rng(0)
+    for step in range(8):
+        view = world.view(step % 5)
+        pose = gtsam.Pose3(ODOM_T_MAP.compose(world.pose(step % 5)).rotation(), rng.normal(size=3))
+        stamp_ns = (10 + step) * 10**9
+        located.move(stamp_ns, pose)
+        located.see(replace(view, world_T_body=pose, stamp_ns=stamp_ns))
+    assert not located.located
+    assert located.restarts == 1
+
+
 def test_it_is_lost_when_nothing_has_been_seen_for_long(world: World) -> None:
     located = localizer(world, odometry_position_sigma=0.1)
     fly(world, located, 0, range(3))
@@ -193,5 +209,5 @@ def test_it_is_lost_when_nothing_has_been_seen_for_long(world: World) -> None:
 
 def test_descriptors_of_another_kind_are_refused(world: World) -> None:
     places = MapPlaces(world.map(), world.rig, PLACES, VerificationConfig(), 10)
-    with pytest.raises(DataError, match="flight.*512 bits.*256"):
+    with pytest.raises(DataError, match=r"flight.*512 bits.*256"):
         places.check(np.zeros((3, 64), np.uint8), "flight")

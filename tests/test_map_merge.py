@@ -66,9 +66,7 @@ def test_without_gravity_the_whole_pose_is_found(world: World) -> None:
     second = in_another_world(world.map(range(8)), tilted)
     content = merge_maps(first, second, LOOPS, LOCALIZATION).content
     assert not content.gravity_aligned
-    np.testing.assert_allclose(
-        content.poses.translations[8:], first.poses.translations, atol=2e-3
-    )
+    np.testing.assert_allclose(content.poses.translations[8:], first.poses.translations, atol=2e-3)
 
 
 def test_maps_of_different_places_are_refused(world: World) -> None:

@@ -28,6 +28,8 @@ class LocalizationConfig(Settings):
     agreeing: int = Field(3, ge=1)
     """So many comparisons must agree with each other before they are believed: at the start, and
     where they contradict the estimate."""
+    patience: int = Field(6, ge=1)
+    """After so many comparisons in a row that contradict the estimate the run counts as lost."""
     memory: int = Field(30, ge=1)
     """How many recent comparisons are held until enough of them agree."""
     confidence: float = Field(0.999, gt=0, lt=1)

@@ -7,7 +7,8 @@
 Sightings are believed once several agree with each other by the run's own motion between them:
 then a filter starts. From then on frames are compared with the places around where they are
 thought to be. A sighting that contradicts the filter is left out, and if several contradict it that
-agree with each other, the filter starts anew with these.
+agree with each other, the filter starts anew with these. If
+they contradict each other too, the run is lost.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class MapLocalizer:
         config: when a sighting is believed.
 
     Attributes:
-        filter: the pose in the map at the last frame, or None before the first one was found.
+        filter: the pose in the map at the last frame, or None where nothing is known of it.
         queries: how many frames were compared with the map.
         sightings: in how many of them a place of the map was seen.
         believed: how many of these corrected the pose.
@@ -56,6 +57,7 @@ class MapLocalizer:
         self._level = places.map.gravity_aligned
         self._bound = float(chi2.ppf(config.confidence, 6))
         self._doubtful: list[_Measured] = []
+        self._contradictions = 0
         self._queried_ns: int | None = None
 
     @property
@@ -91,8 +93,12 @@ class MapLocalizer:
         if self.filter is not None and self._agrees(measured):
             self.filter.correct(measured.map_T_body, measured.covariance)
             self.believed += 1
+            self._contradictions = 0
             self._doubtful.clear()
             return
+        self._contradictions += 1
+        if self._contradictions >= self._config.patience:
+            self.filter = None
         self._doubtful = [*self._doubtful[1 - self._config.memory :], measured]
         agreeing = self._agreeing()
         if len(agreeing) >= self._config.agreeing:
@@ -140,6 +146,7 @@ class MapLocalizer:
             self.filter.move(measured.stamp_ns, measured.odom_T_body)
             self.filter.correct(measured.map_T_body, measured.covariance)
         self._doubtful.clear()
+        self._contradictions = 0
         self.restarts += 1
         self.believed += len(agreeing)
 
