@@ -70,7 +70,7 @@ class World:
         )
 
 
-def rooms(seed: int, duration_s: float, rate_hz: float = 4.0) -> SimulatedSequence:
+def rooms(seed: int, duration_s: float, rate_hz: float = 5.0) -> SimulatedSequence:
     """A tour through three rooms, of which each lap takes 40 s."""
     return simulate(
         SimulationConfig(
