@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.metric import Metric, info
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.config import load_config
+from slam_graph.datasets.registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.mapping.map_merge import merge_maps
 from slam_graph.mapping.map_model import SlamMap
@@ -29,7 +30,9 @@ from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
 
 SEEDS, HALF_S, RATE_HZ = 5, 60.0, 10.0
-IMAGES_SEED, IMAGES_HALF_S = 1, 45.0
+IMAGES_SEED, IMAGES_HALF_S, IMAGES_RATE_HZ = 1, 45.0, 10.0
+
+MH01, MH01_HALF_S = "euroc/MH_01_easy_17s", 8.5
 
 WITHIN_M, WITHIN_DEG = 0.05, 2.0
 SHARE_BAR = 0.95
@@ -48,7 +51,7 @@ def flight(seed: int, cameras: int, images: bool) -> SimulatedSequence:
             kind="images" if images else "tracks",
             trajectory="rooms",
             duration_s=2 * half_s,
-            rate_hz=RATE_HZ,
+            rate_hz=IMAGES_RATE_HZ if images else RATE_HZ,
             seed=seed,
             cameras=cameras,
             landmarks=LandmarkConfig(density=4.0),
@@ -95,6 +98,29 @@ def located(seeds: range, cameras: int, images: bool, judged: bool, folder: Path
             info("p95_m", float(np.percentile(pooled, 95)), "m"),
             info("first_fix_s", float(np.mean(first)), "s"),
         ]
+    return outcome
+
+
+def real(folder: Path) -> Outcome:
+    """The second half of a real flight in the map of the first; it comes back in part only."""
+    outcome, path = Outcome(), folder / MH01
+    spacing = [f"loop_closure.keyframes.{key}=0.1" for key in ("distance_m", "angle_rad")]
+    settings = ["map.enabled=true", *spacing]
+    known = run(open_dataset(str(path)), load_config(None, settings, duration_s=MH01_HALF_S))
+    if known.slam_map is None or known.truth is None:
+        return Outcome(failure=known.message or "no map")
+    config = load_config(None, ["final_ba.enabled=false"], start_s=MH01_HALF_S)
+    result = run(open_dataset(str(path)), config, known_map=known.slam_map)
+    log = result.localization
+    if log is None or not log.located.any():
+        return Outcome(failure="never located")
+    similarity = map_alignment(known.truth, known.slam_map)
+    metres, degrees = errors_in_map(known.truth, log.trajectory(), similarity)
+    outcome.metrics += [
+        Metric("rmse_m", float(np.sqrt(np.mean(metres**2))), "m", "lower", WITHIN_M),
+        Metric("rmse_deg", float(np.sqrt(np.mean(degrees**2))), "deg", "lower", WITHIN_DEG),
+        info("located_share", float(log.located.sum()) / result.frames, ""),
+    ]
     return outcome
 
 
@@ -155,5 +181,6 @@ BENCHMARKS = {
         (),
         partial(located, range(IMAGES_SEED, IMAGES_SEED + 1), 2, True, True),
     ),
+    "map_mh01": Benchmark("The second half of MH_01 in the map of the first", (MH01,), real),
     "map_merge": Benchmark("Maps of both halves of flights made one", (), merged),
 }

@@ -40,7 +40,7 @@ class LocalizationConfig(Settings):
     """Drift of its position in a second, m/√s."""
     map_rotation_sigma: float = Field(5e-3, gt=0)
     """How far the orientation of places in the map may be wrong, rad."""
-    map_position_sigma: float = Field(0.03, gt=0)
+    map_position_sigma: float = Field(0.02, gt=0)
     """How far places in the map may be wrong, m."""
     tilt_sigma: float = Field(5e-3, gt=0)
     """How far roll and pitch of the run may be wrong, rad; not used if the map is not level."""

@@ -135,7 +135,7 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
         except DataError:
             continue
     if sum(len(true) for true, _ in pairs) < LEAST_SHARED:
-        raise DataError("the truth does not cover the keyframes of the map")
+        raise DataError(f"the truth covers fewer than {LEAST_SHARED} keyframes of the map")
     true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
     return align_yaw(true, own) if known.gravity_aligned else umeyama(true, own)
 
