@@ -30,7 +30,7 @@ from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
 
 SEEDS, HALF_S, RATE_HZ = 5, 60.0, 10.0
-IMAGES_SEED, IMAGES_HALF_S, IMAGES_RATE_HZ = 1, 45.0, 10.0
+IMAGES_SEED, IMAGES_HALF_S, IMAGES_RATE_HZ = 1, 60.0, 5.0
 
 MH01, MH01_HALF_S = "euroc/MH_01_easy_17s", 8.5
 

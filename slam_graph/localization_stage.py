@@ -126,7 +126,7 @@ class LocalizationStage:
             believed=localizer.believed,
             starts=localizer.restarts,
         )
-        if localizer.queries == 0:
+        if len(log.located) and localizer.queries == 0:
             self._diagnostics.warn(
                 "localization_impossible",
                 "nothing to recognise places by: no images, and tracks without descriptors",

@@ -7,6 +7,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+import cv2
 import gtsam
 import numpy as np
 
@@ -60,8 +61,11 @@ def map_of(
             config.degrees_of_freedom == 4,
             result.config.seed,
         )
-    except (RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
+    except (cv2.error, RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
         diagnostics.warn("map_failed", " ".join(str(error).split())[:200])
+        return None
+    except KeyboardInterrupt:
+        diagnostics.warn("map_failed", "interrupted")
         return None
     logger.info("map: %d keyframes, %d features", len(made), len(made.points))
     return made

@@ -20,6 +20,9 @@ from slam_graph.sensors.rig import Rig
 HALF_TURN_M = 4.0
 """How far a keyframe that looks the opposite way counts as being away."""
 
+HELD_PLACES = 200
+"""How many places are held ready, about 0.1 MB each; the one made first makes room."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
@@ -121,6 +124,8 @@ class MapPlaces:
     def _place(self, number: int) -> Keyframe:
         """A keyframe that sees all features of its neighbours too."""
         if number not in self._places:
+            if len(self._places) == HELD_PLACES:
+                del self._places[next(iter(self._places))]
             content, keyframe = self.map, self.map.keyframe(number)
             common = (self._shared @ self._shared[number].T).toarray()[:, 0]
             common[number] = 0
