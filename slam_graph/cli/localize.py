@@ -92,8 +92,14 @@ def localize(
         )
         result, folder, files = execute(sequence, settings, output, rerun, progress, log, known)
     report(result, folder, files, as_json)
-    if result.localization is not None and not result.localization.located.any():
+    if result.localization is None or result.localization.located.any():
+        return
+    if result.localization.counts["queries"] == 0:
         raise EstimationError(
-            f"{result.info.name}: no frame was recognised in {path}; is it of the same place, seen "
-            "by a camera held alike? The trajectory in a world of its own is written"
+            f"{result.info.name}: has neither images nor tracks with descriptors, so that no place "
+            "can be recognised; the trajectory in a world of its own is written"
         )
+    raise EstimationError(
+        f"{result.info.name}: no frame was recognised in {path}; is it of the same place, seen "
+        "by a camera held alike? The trajectory in a world of its own is written"
+    )
