@@ -13,6 +13,7 @@ from benchmarks import (
     final_ba,
     frontend,
     loop_closure,
+    maps,
     memory,
     mh01,
     monte_carlo,
@@ -40,4 +41,5 @@ BENCHMARKS: dict[str, Benchmark] = {
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,
     **loop_closure.BENCHMARKS,
+    **maps.BENCHMARKS,
 }

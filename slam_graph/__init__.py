@@ -26,10 +26,13 @@ if TYPE_CHECKING:
     from slam_graph.mapping.bal_adjustment import adjust_bundle
     from slam_graph.mapping.bal_file import read_bal
     from slam_graph.mapping.bal_policy import BalPolicy
+    from slam_graph.mapping.map_merge import merge_maps
+    from slam_graph.mapping.map_model import SlamMap
     from slam_graph.mapping.pose_graph_certificate import certify
     from slam_graph.mapping.pose_graph_file import read_pose_graph
     from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
     from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
+    from slam_graph.output.map_output import load_map, save_map
     from slam_graph.pipeline import RunResult, run
 
 __all__ = [
@@ -40,6 +43,7 @@ __all__ = [
     "RunConfig",
     "RunResult",
     "SlamGraphError",
+    "SlamMap",
     "Trajectory",
     "__version__",
     "adjust_bundle",
@@ -47,6 +51,8 @@ __all__ = [
     "build_estimator",
     "certify",
     "load_config",
+    "load_map",
+    "merge_maps",
     "open_dataset",
     "optimize_pose_graph",
     "read_bal",
@@ -54,6 +60,7 @@ __all__ = [
     "read_pose_graph",
     "rpe",
     "run",
+    "save_map",
 ]
 
 _HOME = {
@@ -64,12 +71,15 @@ _HOME = {
     "RunConfig": "slam_graph.config",
     "RunResult": "slam_graph.pipeline",
     "SlamGraphError": "slam_graph.errors",
+    "SlamMap": "slam_graph.mapping.map_model",
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.mapping.bal_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "build_estimator": "slam_graph.backend.build",
     "certify": "slam_graph.mapping.pose_graph_certificate",
     "load_config": "slam_graph.config",
+    "load_map": "slam_graph.output.map_output",
+    "merge_maps": "slam_graph.mapping.map_merge",
     "open_dataset": "slam_graph.datasets.registry",
     "optimize_pose_graph": "slam_graph.mapping.pose_graph_optimization",
     "read_bal": "slam_graph.mapping.bal_file",
@@ -77,6 +87,7 @@ _HOME = {
     "read_pose_graph": "slam_graph.mapping.pose_graph_file",
     "rpe": "slam_graph.evaluation.rpe",
     "run": "slam_graph.pipeline",
+    "save_map": "slam_graph.output.map_output",
 }
 
 

@@ -21,6 +21,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.config import FrontendConfig
 from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.loop_config import LoopClosureConfig
+from slam_graph.mapping.map_config import LocalizationConfig, MapConfig
 
 DEFAULT_ALGORITHM = "msckf"
 
@@ -118,6 +119,10 @@ class RunConfig(Settings):
     """The bundle adjustment of the whole recording at the end of a run."""
     loop_closure: LoopClosureConfig = LoopClosureConfig()
     """What takes the drift out at the end, where places are seen again."""
+    map: MapConfig = MapConfig()
+    """Whether the map is saved at the end."""
+    localization: LocalizationConfig = LocalizationConfig()
+    """How the run is located in a map that was saved before."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 

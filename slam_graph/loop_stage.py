@@ -18,7 +18,7 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.mapping.loop_closure import LoopClosures, close_loops
 from slam_graph.mapping.loop_config import LoopClosureConfig
-from slam_graph.mapping.loop_keyframes import KeyframeLog
+from slam_graph.mapping.loop_keyframes import Keyframe, KeyframeLog
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
 
@@ -34,14 +34,22 @@ class LoopStage:
         seed: of the training of the vocabulary.
         diagnostics: counts what goes wrong.
 
+        collect: whether keyframes are collected although no loops are to be closed.
+
     Attributes:
         seconds: what collecting and closing took.
     """
 
     def __init__(
-        self, rig: Rig, config: LoopClosureConfig, seed: int, diagnostics: Diagnostics
+        self,
+        rig: Rig,
+        config: LoopClosureConfig,
+        seed: int,
+        diagnostics: Diagnostics,
+        collect: bool = False,
     ) -> None:
         self.seconds = 0.0
+        self._collect = collect or config.enabled
         self._rig, self._config, self._seed = rig, config, seed
         self._diagnostics = diagnostics
         self._log = KeyframeLog(rig, config.keyframes)
@@ -50,13 +58,18 @@ class LoopStage:
         self, frame: CameraFrame | FeatureFrame, features: FeatureFrame, state: NavState
     ) -> None:
         """Take a frame with what was found in it, and the causal estimate then."""
-        if not self._config.enabled:
+        if not self._collect:
             return
         start = time.perf_counter()
         image = frame.images[0] if isinstance(frame, CameraFrame) else None
         # the time of the estimate is that of the IMU's clock, also where the offset is estimated
         self._log.add(FeatureFrame(state.stamp_ns, features.cameras), state.world_T_body, image)
         self.seconds += time.perf_counter() - start
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """All keyframes so far."""
+        return self._log.keyframes
 
     def finish(self) -> LoopClosures | None:
         """Close the loops, if there is anything to find them by."""

@@ -16,7 +16,10 @@ from slam_graph.final_stage import FinalStage
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.registry import build_frontend
 from slam_graph.known_start import KnownStart
+from slam_graph.localization_stage import Localization, LocalizationStage, NoLocalization
 from slam_graph.loop_stage import LoopStage
+from slam_graph.map_stage import map_of
+from slam_graph.mapping.map_model import SlamMap
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
@@ -73,6 +76,7 @@ def run(
     viewer: Viewer | None = None,
     progress: Progress | None = None,
     recorder: Recorder | None = None,
+    known_map: SlamMap | None = None,
 ) -> RunResult:
     """Estimate the trajectory of a recorded sequence.
 
@@ -86,6 +90,7 @@ def run(
         viewer: watches the run.
         progress: is told how far the run is.
         recorder: takes the front end's output, for a replay.
+        known_map: a map to locate every frame in, beside the estimate in the run's own world.
 
     Raises:
         DataError: if the sequence has not what the settings ask for.
@@ -100,7 +105,14 @@ def run(
     )
     estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
-    loops = LoopStage(result.rig, config.loop_closure, config.seed, sequence.diagnostics)
+    loops = LoopStage(
+        result.rig, config.loop_closure, config.seed, sequence.diagnostics, config.map.enabled
+    )
+    localization: Localization = NoLocalization()
+    if known_map is not None:
+        localization = LocalizationStage(
+            known_map, result.rig, config, result.info.name, sequence.diagnostics
+        )
 
     tracking = Tracking(_packets(sequence, result), frontend, config.overlap)
     with FinalStage(result, sequence.diagnostics) as final:
@@ -126,6 +138,7 @@ def run(
                     result.history.append(state)
                     result.points.update(ids, points)
                     loops.keep(packet.frame, features, state)
+                    localization.keep(packet.frame, features, state)
                 if state is not None and estimator.calibration is not None:
                     result.calibration.append(estimator.calibration)
                 result.count_frame(features.stamp_ns, clock.milliseconds, tracked.frame_stats)
@@ -135,9 +148,12 @@ def run(
                 viewer.show(packet.frame, features, state, points)
                 frame_done()
         final.finish(progress.adjusting)
+    result.localization = localization.finish()
     if result.status in CORRECTED:
         result.loops = loops.finish()
-        result.warnings = +sequence.diagnostics.counts
+        if config.map.enabled:
+            result.slam_map = map_of(result, loops.keyframes, sequence.diagnostics)
+    result.warnings = +sequence.diagnostics.counts
     return result
 
 

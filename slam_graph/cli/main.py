@@ -15,7 +15,18 @@ from typing import Annotated
 
 import typer
 
-from slam_graph.cli import compare, config, data, evaluate, frontend, optimize, run, simulate
+from slam_graph.cli import (
+    compare,
+    config,
+    data,
+    evaluate,
+    frontend,
+    localize,
+    map,
+    optimize,
+    run,
+    simulate,
+)
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
 
@@ -31,6 +42,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run.run)
+app.command("localize")(localize.localize)
+app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
 app.command("rpe")(evaluate.rpe)
 app.command("compare")(compare.compare)

@@ -30,9 +30,29 @@ if TYPE_CHECKING:
 
     from slam_graph.config import RunConfig
     from slam_graph.datasets.base import Sequence
+    from slam_graph.mapping.map_model import SlamMap
     from slam_graph.output.run_result import RunResult
 
 RerunMode = Literal["off", "save", "spawn", "connect"]
+Cameras = Annotated[
+    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
+]
+Start = Annotated[
+    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+]
+Duration = Annotated[
+    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
+]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")]
+Output = Annotated[
+    Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
+]
+Rerun = Annotated[
+    RerunMode, typer.Option("--rerun", help="Show the run in Rerun, or save it for Rerun.")
+]
+Progress = Annotated[
+    bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
+]
 
 INTERRUPTED = 130
 
@@ -42,25 +62,13 @@ def run(
     algorithm: Algorithm = None,
     config: ConfigFile = None,
     set_: Overrides = None,
-    cameras: Annotated[
-        str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
-    ] = None,
-    start: Annotated[
-        float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")] = None,
-    output: Annotated[
-        Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
-    ] = Path("results"),
-    rerun: Annotated[
-        RerunMode, typer.Option("--rerun", help="Show the run in Rerun, or save it for Rerun.")
-    ] = "off",
-    progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
-    ] = True,
+    cameras: Cameras = None,
+    start: Start = None,
+    duration: Duration = None,
+    seed: Seed = None,
+    output: Output = Path("results"),
+    rerun: Rerun = "off",
+    progress: Progress = True,
     final_ba: Annotated[
         bool | None,
         typer.Option(
@@ -74,6 +82,14 @@ def run(
         typer.Option(
             "--loop-closure/--no-loop-closure",
             help="Take the drift out at the end where places are seen again (off by default).",
+            show_default=False,
+        ),
+    ] = None,
+    save_map: Annotated[
+        bool | None,
+        typer.Option(
+            "--save-map/--no-save-map",
+            help="Save a map for `slam-graph localize` at the end (off by default).",
             show_default=False,
         ),
     ] = None,
@@ -100,6 +116,8 @@ def run(
         said["final_ba"] = {"enabled": final_ba}
     if loop_closure is not None:
         said["loop_closure"] = {"enabled": loop_closure}
+    if save_map is not None:
+        said["map"] = {"enabled": save_map}
     settings = load_config(config, set_ or (), **said, seed=seed)
     with collected_log() as log:
         sequence = open_dataset(
@@ -110,22 +128,31 @@ def run(
             groundtruth=groundtruth,
             sources=sources_from(sources),
         )
-        result, folder, files = _execute(sequence, settings, output, rerun, progress, log)
+        result, folder, files = execute(sequence, settings, output, rerun, progress, log)
+    report(result, folder, files, as_json)
+
+
+def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) -> None:
+    """Print what a run reached, and end with the exit code that fits how it ended."""
     if as_json:
         names = [str(path) for path in files]
         echo_json({**result.metrics, "folder": str(folder), "files": names})
     else:
         echo_summary(result, folder, files)
-    _leave(result)
+    if result.status == "interrupted":
+        typer.echo(f"{result.message}; what was done so far is written", err=True)
+        raise typer.Exit(INTERRUPTED)
+    result.check()
 
 
-def _execute(
+def execute(
     sequence: Sequence,
     settings: RunConfig,
     output: Path,
     rerun: RerunMode,
     progress: bool,
     log: list[str],
+    known_map: SlamMap | None = None,
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write whatever came of it."""
     from slam_graph.output.files import create_run_folder, link_latest, write_text
@@ -135,7 +162,9 @@ def _execute(
     try:
         viewer = _viewer(rerun, folder, sequence.info().name)
         with _progress(sequence, settings, progress) as bar:
-            result = run_pipeline(sequence, settings, viewer=viewer, progress=bar)
+            result = run_pipeline(
+                sequence, settings, viewer=viewer, progress=bar, known_map=known_map
+            )
         files = result.save(folder)
         if rerun == "save":
             files.append(folder / "recording.rrd")
@@ -169,11 +198,3 @@ def _progress(
     if settings.duration_s is not None:
         end_ns = min(end_ns, start_ns + round(settings.duration_s * 1e9))
     return ProgressBar(start_ns, end_ns)
-
-
-def _leave(result: RunResult) -> None:
-    """End with the exit code that fits how the run ended."""
-    if result.status == "interrupted":
-        typer.echo(f"{result.message}; what was done so far is written", err=True)
-        raise typer.Exit(INTERRUPTED)
-    result.check()

@@ -31,6 +31,9 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["loop_closure"] and metrics["loop_closure"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["loop_closure"]["accuracy"], "loops closed"))
+    if metrics["localization"] and metrics["localization"]["accuracy"]:
+        typer.echo("")
+        echo_table(_accuracy(metrics["localization"]["accuracy"], "in the map"))
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
@@ -73,6 +76,11 @@ def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
         table = metrics["loop_closure"]
         found = f"{table['accepted']} accepted of {table['verified']} verified"
         yield "loop closures", f"{found}, {table['keyframes']} keyframes"
+    if metrics["slam_map"]:
+        table = metrics["slam_map"]
+        yield "map", f"{table['keyframes']} keyframes, {table['features']} features"
+    if metrics["localization"]:
+        yield "located", _located(metrics["localization"])
     if metrics["warnings"]:
         yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
 
@@ -83,6 +91,18 @@ def _final_ba(table: Table) -> str:
         f"{table['frames']} frames, {table['keyframes']} keyframes, {table['features']} features, "
         f"{table['iterations']} steps in {table['seconds']:.1f} s, "
         f"cost {table['cost_before']:.3g} to {table['cost_after']:.3g}"
+    )
+
+
+def _located(table: Table) -> str:
+    """How much of the run was located in a map."""
+    if table["first_s"] is None:
+        return f"never, in {table['queries']} comparisons with the map"
+    return (
+        f"{table['located']} frames, {table['located_share']:.1%} of all, from "
+        f"{table['first_s']:.2f} s on; {table['believed']} sightings believed of "
+        f"{table['sightings']} in {table['queries']} comparisons, "
+        f"{table['ms_per_frame']:.1f} ms a frame"
     )
 
 

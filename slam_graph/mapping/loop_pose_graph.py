@@ -31,7 +31,11 @@ LEVEL_SIGMA_RAD = 1e-4
 
 
 def loop_graph(
-    stamps_ns: IntArray, poses: Poses, loops: list[Loop], config: LoopClosureConfig
+    stamps_ns: IntArray,
+    poses: Poses,
+    loops: list[Loop],
+    config: LoopClosureConfig,
+    recording_of: IntArray | None = None,
 ) -> PoseGraph:
     """Keyframes, the odometry between each and the next, and loop closures.
 
@@ -40,14 +44,18 @@ def loop_graph(
         poses: their causal estimates world_T_body.
         loops: between them.
         config: degrees of freedom, and how much odometry drifts.
+        recording_of: (N,) number of the recording of each keyframe, if there are several: there is
+            no odometry from one to another.
 
     Returns:
         A graph of level frames if there are four degrees of freedom, else of bodies.
     """
     count = len(stamps_ns)
     before = np.arange(count - 1)
+    if recording_of is not None:
+        before = np.flatnonzero(np.diff(recording_of) == 0)
     odometry = poses.select(before).inverse().compose(poses.select(before + 1))
-    seconds = np.diff(stamps_ns) * 1e-9
+    seconds = np.diff(stamps_ns)[before] * 1e-9
     sigmas = [config.odometry_position_sigma] * 3 + [config.odometry_rotation_sigma] * 3
     edges = np.column_stack([before, before + 1])
     covariances = seconds[:, None, None] * np.diag(np.square(sigmas))

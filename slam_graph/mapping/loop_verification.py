@@ -35,6 +35,7 @@ class Loop:
         first_T_second: relative pose of the bodies.
         covariance: (6, 6) of it in GTSAM's tangent: rotation (rad), translation (m).
         inliers, matches: how many matches agree with it, of how many.
+        pairs: (inliers, 2) rows of what matches and agrees, in the first and the second.
     """
 
     first: int
@@ -43,6 +44,7 @@ class Loop:
     covariance: FloatArray
     inliers: int
     matches: int
+    pairs: IntArray
 
 
 def match(first: Descriptors, second: Descriptors, max_bits: int) -> IntArray:
@@ -94,7 +96,8 @@ class LoopVerifier:
         if gravity and tilt(a.world_T_body, b.world_T_body, pose) > config.max_tilt_rad:
             return None
         covariance = self._covariance(points[inliers], pose)
-        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs))
+        agreeing = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
+        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), agreeing)
 
     def _pose(
         self, points: FloatArray, rays: FloatArray

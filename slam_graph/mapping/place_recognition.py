@@ -83,7 +83,7 @@ class Vocabulary:
         bits = np.unpackbits(pool, axis=1).astype(np.int32)
         for _ in range(iterations):
             nearest = Vocabulary(centres, np.zeros(len(centres))).quantize(pool)
-            centres = _majority(bits, nearest, centres)
+            centres = majority(bits, nearest, centres)
         unweighted = Vocabulary(centres, np.zeros(len(centres)))
         present = np.zeros(len(centres))
         for document in documents:
@@ -92,7 +92,7 @@ class Vocabulary:
         return Vocabulary(centres, np.log((len(documents) + 1) / np.maximum(present, 1.0)))
 
 
-def _majority(bits: NDArray[np.int32], nearest: IntArray, centres: Descriptors) -> Descriptors:
+def majority(bits: NDArray[np.int32], nearest: IntArray, centres: Descriptors) -> Descriptors:
     """New centres: the bits of most of each cluster; empty clusters stay."""
     order = np.argsort(nearest, kind="stable")
     used, first, sizes = np.unique(nearest[order], return_index=True, return_counts=True)

@@ -22,12 +22,10 @@ from slam_graph.mapping.bal_policy import BalPolicy, BalSolution
 from slam_graph.mapping.bal_problem import BalEstimates, FloatArray
 from slam_graph.output.files import appearing, write_text
 from slam_graph.output.metrics import finite, versions
+from slam_graph.output.point_map import write_ply
 
 SCHEMA_VERSION = 1
 """Counts up whenever a key changes its name or meaning."""
-
-POINT_COLOUR = (200, 200, 200)
-CAMERA_COLOUR = (220, 30, 30)
 
 Table = dict[str, Any]
 
@@ -118,7 +116,7 @@ class BalResult:
         }
         for name, lines in texts.items():
             write_text(folder / name, lines)
-        write_scene_ply(folder / "scene.ply", self.after)
+        write_ply(folder / "scene.ply", self.after.points, self.after.centres())
         self._draw(folder / "bundle_adjustment.png")
         return [folder / name for name in (*texts, "scene.ply", "bundle_adjustment.png")]
 
@@ -141,25 +139,3 @@ class BalResult:
         title = f"{self.name}: {part.cameras} cameras, {part.points} points"
         with appearing(path) as partial:
             plot_bundle(partial, title, self.after.points, self.after.centres(), self.errors_px)
-
-
-def write_scene_ply(path: Path, estimates: BalEstimates) -> None:
-    """Write points in grey and the centres of cameras in red as one binary PLY point cloud."""
-    places = np.concatenate([estimates.points, estimates.centres()])
-    colours = np.repeat(
-        np.array([POINT_COLOUR, CAMERA_COLOUR], np.uint8),
-        (len(estimates.points), len(estimates.rotations)),
-        axis=0,
-    )
-    vertices = np.empty(len(places), [("place", "<f8", 3), ("colour", "u1", 3)])
-    vertices["place"], vertices["colour"] = places, colours
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-        "end_header",
-    ]
-    with appearing(path) as partial:
-        partial.write_bytes("\n".join(lines).encode("ascii") + b"\n" + vertices.tobytes())

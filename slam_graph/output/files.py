@@ -32,6 +32,18 @@ def appearing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def refuse_to_replace(path: Path, force: bool) -> None:
+    """Make sure that nothing is overwritten unless that is asked for.
+
+    Raises:
+        DataError: if the path exists, and `force` is not said or it is a folder.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; name a file")
+    if path.exists() and not force:
+        raise DataError(f"{path}: exists already; choose another name, or replace it by --force")
+
+
 def write_text(path: Path, lines: Iterable[str]) -> None:
     """Write lines (with their line ends) as a whole file."""
     with appearing(path) as partial, partial.open("w", encoding="utf-8") as file:

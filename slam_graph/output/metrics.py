@@ -42,6 +42,8 @@ def metrics_table(result: RunResult) -> Table:
             "accuracy": _accuracy(result),
             "final_ba": _final_ba(result),
             "loop_closure": _loop_closure(result),
+            "slam_map": None if result.slam_map is None else result.slam_map.summary(),
+            "localization": _localization(result),
             "nees": _nees(result),
             "nis": innovation_report(result.innovations.columns()),
             "calibration": result.calibration.table(),
@@ -122,6 +124,13 @@ def _loop_closure(result: RunResult) -> Table | None:
         "accepted": int(loops.accepted.sum()),
         "accuracy": None if truth is None else accuracy_report(truth, corrected),
     }
+
+
+def _localization(result: RunResult) -> Table | None:
+    """Where the run was in a known map, if it was to be located in one."""
+    if result.localization is None:
+        return None
+    return result.localization.table(result.start_ns, result.frames, result.truth)
 
 
 def _nees(result: RunResult) -> Table | None:

@@ -14,6 +14,8 @@ from slam_graph.output.files import appearing
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+POINT_COLOUR = (200, 200, 200)
+CAMERA_COLOUR = (220, 30, 30)
 
 RECENT = 10_000
 """How many features are held where they can be replaced at once, before they are packed."""
@@ -52,13 +54,32 @@ class PointMap:
         self._recent = {}
 
 
-def write_ply(path: Path, points: FloatArray) -> None:
-    """Write points (N, 3) as a binary PLY point cloud; points that are not finite are left out."""
+def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None) -> None:
+    """Write points (N, 3) as a binary PLY point cloud; points that are not finite are left out.
+
+    Args:
+        path: of the file.
+        points: of the world.
+        centres: (M, 3) of cameras, if they are to be shown: then points are grey and these red.
+    """
     finite = points[np.isfinite(points).all(axis=1)]
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(finite)}\n"
-        "property double x\nproperty double y\nproperty double z\nend_header\n"
-    )
+    fields: list[tuple[str, str, int]] = [("place", "<f8", 3)]
+    lines = [f"property double {axis}" for axis in "xyz"]
+    if centres is not None:
+        fields.append(("colour", "u1", 3))
+        lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    places = finite if centres is None else np.concatenate([finite, centres])
+    vertices = np.empty(len(places), fields)
+    vertices["place"] = places
+    if centres is not None:
+        vertices["colour"][: len(finite)] = POINT_COLOUR
+        vertices["colour"][len(finite) :] = CAMERA_COLOUR
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *lines,
+        "end_header",
+    ]
     with appearing(path) as partial:
-        partial.write_bytes(header.encode("ascii") + finite.astype("<f8").tobytes())
+        partial.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())

@@ -21,8 +21,10 @@ from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.final_adjustment import FinalBa
 from slam_graph.mapping.loop_closure import LoopClosures
+from slam_graph.mapping.map_model import SlamMap
 from slam_graph.output.calibration_log import CalibrationLog
 from slam_graph.output.innovations import InnovationLog
+from slam_graph.output.localization import LocalizationLog
 from slam_graph.output.point_map import PointMap
 from slam_graph.output.steps import StepLog
 from slam_graph.output.timing import TimingLog
@@ -50,6 +52,8 @@ class RunResult:
         history: the causal estimate of every frame.
         final_ba: the trajectory that comes of the recording as a whole, if one was found.
         loops: what became of places that were seen again, if loops were to be closed.
+        slam_map: the map, if it was asked for.
+        localization: where the run was in a known map, if it was to be located in one.
         points: the map.
         timing: milliseconds of every stage of every frame.
         steps: Gauss-Newton steps of every frame, and the cost before and after.
@@ -75,6 +79,8 @@ class RunResult:
     history: StateHistory = field(default_factory=StateHistory)
     final_ba: FinalBa | None = None
     loops: LoopClosures | None = None
+    slam_map: SlamMap | None = None
+    localization: LocalizationLog | None = None
     points: PointMap = field(default_factory=PointMap)
     timing: TimingLog = field(default_factory=TimingLog)
     steps: StepLog = field(default_factory=StepLog)

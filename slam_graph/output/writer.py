@@ -20,6 +20,7 @@ from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.tum import tum_lines
 from slam_graph.output.files import appearing, write_text
+from slam_graph.output.map_output import MAP_NAME, save_map
 from slam_graph.output.point_map import write_ply
 from slam_graph.sensors.kalibr import write_kalibr
 
@@ -56,6 +57,10 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
         write_text(files[-3], tum_lines(result.loops.correct(result.trajectory)))
         write_text(files[-2], result.loops.csv_lines())
         write_ply(files[-1], result.loops.points())
+    if result.localization is not None:
+        files += [folder / "trajectory_map.tum", folder / "localization.csv"]
+        write_text(files[-2], tum_lines(result.localization.trajectory()))
+        write_text(files[-1], result.localization.csv_lines())
     truth = result.truth_of_run()
     if truth is not None:
         files.append(folder / "groundtruth.tum")
@@ -75,6 +80,9 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
         write_text(files[-1], result.calibration.csv_lines())
     if truth is not None and write_picture(result, truth, folder / "trajectory.png"):
         files.append(folder / "trajectory.png")
+    if result.slam_map is not None:  # last, as it is what a full disk is too small for
+        files.append(folder / MAP_NAME)
+        save_map(result.slam_map, files[-1], force=True)
     return files
 
 

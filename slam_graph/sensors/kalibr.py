@@ -51,6 +51,15 @@ def read_kalibr(
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
     chain = read_yaml(path)
+    return Rig(chain_cameras(chain, needs_imu), _read_imu(path, chain, imu_path, fallback))
+
+
+def chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
+    """The cameras of a camera chain (see `read_kalibr`).
+
+    Raises:
+        DataError: if a key is missing, or a value makes no sense.
+    """
     entries = {
         int(found[1]): value
         for name, value in chain.items()
@@ -58,12 +67,12 @@ def read_kalibr(
     }
     if not entries:
         raise DataError(
-            f"{path}: no camera (key 'cam0') in this file; is it a Kalibr camera chain?"
+            f"{chain.path}: no camera (key 'cam0') in this file; is it a Kalibr camera chain?"
         )
     cameras: list[RigCamera] = []
     for index in sorted(entries):
         cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None, needs_imu))
-    return Rig(tuple(cameras), _read_imu(path, chain, imu_path, fallback))
+    return tuple(cameras)
 
 
 def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
@@ -110,6 +119,16 @@ def _read_imu(
 
 def write_kalibr(rig: Rig, path: Path) -> None:
     """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    text = "# Kalibr camera chain: T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu\n"
+    beside.write_text(
+        text + yaml.safe_dump(kalibr_table(rig), sort_keys=False, default_flow_style=None)
+    )
+    beside.replace(path)
+
+
+def kalibr_table(rig: Rig) -> dict[str, Any]:
+    """The content of a Kalibr file with cameras and IMU."""
     content: dict[str, Any] = {
         f"cam{index}": _camera_entry(mounted) for index, mounted in enumerate(rig.cameras)
     }
@@ -120,10 +139,7 @@ def write_kalibr(rig: Rig, path: Path) -> None:
         "accelerometer_random_walk": float(rig.imu.accel_random_walk),
         "update_rate": float(rig.imu.rate_hz),
     }
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    text = "# Kalibr camera chain: T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu\n"
-    beside.write_text(text + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-    beside.replace(path)
+    return content
 
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:

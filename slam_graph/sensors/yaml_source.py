@@ -109,6 +109,19 @@ def read_yaml(path: Path) -> YamlValue:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise DataError(f"{path}: calibration cannot be read ({reason})") from None
+    return parse_yaml(text, path)
+
+
+def parse_yaml(text: str, path: Path) -> YamlValue:
+    """Read the text of a YAML file.
+
+    Args:
+        text: its content.
+        path: where it stands, for messages.
+
+    Raises:
+        DataError: if it is not YAML, or not a mapping.
+    """
     if text.startswith("%YAML"):
         text = "#" + text
     try:

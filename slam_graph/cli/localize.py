@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph localize`: a recording in the world of a map that was saved before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
+from slam_graph.cli.data import (
+    Calibration,
+    Data,
+    Format,
+    Groundtruth,
+    Json,
+    Sources,
+    sources_from,
+)
+from slam_graph.cli.logs import collected_log
+from slam_graph.cli.run import (
+    Cameras,
+    Duration,
+    Output,
+    Progress,
+    Rerun,
+    Seed,
+    Start,
+    execute,
+    report,
+)
+
+
+def localize(
+    data: Data,
+    map_: Annotated[
+        Path,
+        typer.Option("--map", metavar="MAP", help="Map file, or the folder of a run with one."),
+    ],
+    algorithm: Algorithm = None,
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    cameras: Cameras = None,
+    start: Start = None,
+    duration: Duration = None,
+    seed: Seed = None,
+    output: Output = Path("results"),
+    rerun: Rerun = "off",
+    progress: Progress = True,
+    final_ba: Annotated[
+        bool,
+        typer.Option(
+            "--final-ba/--no-final-ba", help="Solve the recording as a whole at the end, too."
+        ),
+    ] = False,
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    sources: Sources = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate the trajectory of a recording in the world of a map.
+
+    It is a run as by `slam-graph run`, which also writes the causal pose of every frame in the map
+    to trajectory_map.tum, as soon as the place is recognised. The exit code is 3 if it never is.
+    """
+    from slam_graph.config import load_config
+    from slam_graph.datasets.registry import open_dataset
+    from slam_graph.errors import EstimationError
+    from slam_graph.output.map_output import find_map, load_map
+
+    said: dict[str, Any] = {
+        "algorithm": algorithm,
+        "cameras": cameras,
+        "start_s": start,
+        "duration_s": duration,
+        "final_ba": {"enabled": final_ba},
+    }
+    settings = load_config(config, set_ or (), **said, seed=seed)
+    path = find_map(map_)
+    known = load_map(path)
+    with collected_log() as log:
+        sequence = open_dataset(
+            data,
+            format=format_,
+            cameras=settings.cameras,
+            calibration=calibration,
+            groundtruth=groundtruth,
+            sources=sources_from(sources),
+        )
+        result, folder, files = execute(sequence, settings, output, rerun, progress, log, known)
+    report(result, folder, files, as_json)
+    if result.localization is None or result.localization.located.any():
+        return
+    if result.localization.counts["queries"] == 0:
+        raise EstimationError(
+            f"{result.info.name}: has neither images nor tracks with descriptors, so that no place "
+            "can be recognised; the trajectory in a world of its own is written"
+        )
+    raise EstimationError(
+        f"{result.info.name}: no frame was recognised in {path}; is it of the same place, seen "
+        "by a camera held alike? The trajectory in a world of its own is written"
+    )

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph map`: what a map holds, its export, and two maps made one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from slam_graph.cli.config import ConfigFile, Overrides
+from slam_graph.cli.data import Json
+from slam_graph.cli.output import echo_json, echo_table
+
+if TYPE_CHECKING:
+    from slam_graph.mapping.map_model import MapRecording, SlamMap
+
+app = typer.Typer(
+    help="Look at maps, export and merge them.", no_args_is_help=True, rich_markup_mode=None
+)
+
+MapPath = Annotated[
+    Path, typer.Argument(metavar="MAP", help="Map file, or the folder of a run with one.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+
+
+@app.command()
+def info(path: MapPath, as_json: Json = False) -> None:
+    """Show what a map holds."""
+    from slam_graph.output.map_output import find_map, load_map
+
+    file = find_map(path)
+    table = _describe(load_map(file), file)
+    if as_json:
+        echo_json(table)
+        return
+    recordings = table.pop("recordings")
+    table["extent_m"] = " x ".join(f"{length:.2f}" for length in table["extent_m"])
+    table["path_m"] = f"{table['path_m']:.2f}"
+    table["size_mb"] = f"{table['size_mb']:.2f}"
+    echo_table((name, str(value)) for name, value in table.items())
+    for recording in recordings:
+        typer.echo("")
+        cameras = recording.pop("cameras")
+        echo_table((name, str(value)) for name, value in recording.items())
+        for name, camera in cameras.items():
+            echo_table([(name, ", ".join(f"{key} {value}" for key, value in camera.items()))])
+
+
+@app.command()
+def export(
+    path: MapPath,
+    ply: Annotated[
+        Path | None, typer.Option("--ply", help="Points, and keyframes in red, as a point cloud.")
+    ] = None,
+    tum: Annotated[
+        Path | None,
+        typer.Option("--tum", help="Poses of the keyframes; one file for each recording."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a map in formats of other programs."""
+    from slam_graph.errors import ConfigError
+    from slam_graph.output.files import refuse_to_replace
+    from slam_graph.output.map_output import export_ply, export_tum, load_map
+
+    if ply is None and tum is None:
+        raise ConfigError("nothing to write: say --ply FILE, --tum FILE, or both")
+    content = load_map(path)
+    if ply is not None and tum is not None:
+        refuse_to_replace(tum, force)
+    if ply is not None:
+        export_ply(content, ply, force)
+        typer.echo(str(ply))
+    if tum is not None:
+        for file in export_tum(content, tum, force):
+            typer.echo(str(file))
+
+
+@app.command()
+def merge(
+    first: Annotated[Path, typer.Argument(metavar="MAP", help="Its world is that of the result.")],
+    second: Annotated[Path, typer.Argument(metavar="OTHER", help="Map of the same place.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Make one map of two of the same place; nothing is written if they share none."""
+    from dataclasses import asdict
+
+    from slam_graph.config import load_config
+    from slam_graph.mapping.map_merge import merge_maps
+    from slam_graph.output.files import refuse_to_replace
+    from slam_graph.output.map_output import load_map, save_map
+
+    settings = load_config(config, set_ or ())
+    refuse_to_replace(output, force)
+    merged = merge_maps(
+        load_map(first), load_map(second), settings.loop_closure, settings.localization
+    )
+    save_map(merged.content, output, force)
+    table = {**asdict(merged.summary), **merged.content.summary(), "file": str(output)}
+    if as_json:
+        echo_json(table)
+        return
+    summary = merged.summary
+    rows = {
+        "file": str(output),
+        "map": f"{table['keyframes']} keyframes, {table['features']} features",
+        "links": f"{summary.accepted} accepted of {summary.verified} verified between the maps",
+        "fused": f"{summary.fused} features that both maps had",
+        "fit": f"{summary.link_rmse_m:.3f} m, {summary.link_rmse_deg:.2f} deg rmse of the links",
+        "moved": f"keyframes of the first map by {summary.first_moved_m:.3f} m on average",
+    }
+    echo_table(rows.items())
+
+
+def _describe(content: SlamMap, file: Path) -> dict[str, Any]:
+    """A map as a table."""
+    import numpy as np
+
+    table: dict[str, Any] = {"file": str(file), "size_mb": file.stat().st_size * 1e-6}
+    table |= content.summary()
+    counts = np.bincount(content.recording_of, minlength=len(content.recordings)).tolist()
+    table["recordings"] = [
+        _recording(recording, count)
+        for recording, count in zip(content.recordings, counts, strict=True)
+    ]
+    return table
+
+
+def _recording(recording: MapRecording, keyframes: int) -> dict[str, Any]:
+    """A recording as a table."""
+    return {
+        "recording": recording.name,
+        "keyframes": keyframes,
+        "poses": recording.poses,
+        "cameras": {
+            mounted.name or f"cam{index}": {
+                "width": mounted.camera.width,
+                "height": mounted.camera.height,
+                "fx": mounted.camera.fx,
+                "fy": mounted.camera.fy,
+                "distortion": mounted.camera.distortion,
+            }
+            for index, mounted in enumerate(recording.rig.cameras)
+        },
+    }

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Two maps of the same place made one.
+
+    keyframes of the second → places of the first → sightings → agreement → pose graph → features
+
+The keyframes of the second map are located in the first one as views of a run are. The largest
+group of sightings that agree says how the second map lies in the first. A pose graph over the
+keyframes of both, with odometry, the links of each map and those between them, then moves both, and
+GNC decides once more which of the links are false. Features that are matched become one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import gtsam
+import numpy as np
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import EstimationError
+from slam_graph.mapping.loop_config import LoopClosureConfig
+from slam_graph.mapping.loop_pose_graph import corrected, loop_graph
+from slam_graph.mapping.loop_verification import Loop
+from slam_graph.mapping.map_alignment import Recognised, agreement, names, recognised
+from slam_graph.mapping.map_building import links_of, together, trained, with_features
+from slam_graph.mapping.map_config import LocalizationConfig
+from slam_graph.mapping.map_model import NO_FEATURE, FloatArray, IntArray, Links, SlamMap
+from slam_graph.mapping.pose_graph import Poses
+from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
+from slam_graph.mapping.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
+from slam_graph.version import __version__
+
+MIN_LINKS = 5
+"""So many keyframes of one map must be recognised in the other, and agree."""
+
+
+@dataclass(frozen=True, slots=True)
+class MergeSummary:
+    """How two maps fitted.
+
+    Attributes:
+        verified: keyframes of the second map that were located in the first.
+        agreeing: how many of these agree with each other.
+        accepted: how many of these the pose graph did not reject.
+        fused: features of the second map that are now one with some of the first.
+        link_rmse_m: root mean square of what is left of the links between the maps.
+        link_rmse_deg: the same of their orientation.
+        first_moved_m: how far keyframes of the first map were moved, on average.
+    """
+
+    verified: int
+    agreeing: int
+    accepted: int
+    fused: int
+    link_rmse_m: float
+    link_rmse_deg: float
+    first_moved_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMaps:
+    """The map that came of two, in the world of the first, and how they fitted."""
+
+    content: SlamMap
+    summary: MergeSummary
+
+
+def merge_maps(
+    first: SlamMap,
+    second: SlamMap,
+    loops: LoopClosureConfig,
+    localization: LocalizationConfig,
+    seed: int = 0,
+) -> MergedMaps:
+    """One map of two.
+
+    Args:
+        first: its first keyframe stays where it is.
+        second: of the same place; its world may be any other.
+        loops: how places are verified, and how much odometry drifts.
+        localization: how many candidates are tried, and when sightings agree.
+        seed: of the training of the new vocabulary.
+
+    Raises:
+        DataError: if descriptors are of different kinds.
+        EstimationError: if they share no place.
+    """
+    level = first.gravity_aligned and second.gravity_aligned
+    seen = list(recognised(first, second, loops, localization, level))
+    agreeing, first_T_second = agreement(first, second, seen, localization, level)
+    if len(agreeing) < MIN_LINKS:
+        raise EstimationError(
+            f"the maps of {names(first)} and {names(second)} share no place: {len(seen)} of "
+            f"{len(second)} keyframes were recognised, of which {len(agreeing)} agree, and "
+            f"{MIN_LINKS} must; are they of the same place, seen by cameras held alike?"
+        )
+    joined = _side_by_side(first, second, first_T_second, level)
+    links = [_link(one, len(first)) for one in agreeing]
+    poses, held = _solved(joined, links, loops, level)
+    accepted = [one for one, good in zip(agreeing, held, strict=True) if good]
+    if len(accepted) < MIN_LINKS:
+        raise EstimationError(
+            f"the maps of {names(first)} and {names(second)} cannot be laid on each other: only "
+            f"{len(accepted)} of {len(agreeing)} links between them hold"
+        )
+    body_points = _body_points(joined)
+    features, fused = _fused(first, second, accepted)
+    moved = replace(
+        joined,
+        poses=poses,
+        links=_chained(joined.links, links_of([_link(one, len(first)) for one in accepted])),
+        vocabulary=trained(
+            [joined.descriptors_of(n) for n in range(len(joined))], loops.places, seed
+        ),
+    )
+    error_px = 2.0 * loops.verification.max_error_px  # the maps do not fit as well as one does
+    content = with_features(moved, features, body_points, error_px)
+    rmse_m, rmse_deg = _left(content, len(accepted))
+    shift = poses.translations[: len(first)] - first.poses.translations
+    return MergedMaps(
+        content,
+        MergeSummary(
+            len(seen),
+            len(agreeing),
+            len(accepted),
+            fused,
+            rmse_m,
+            rmse_deg,
+            float(np.linalg.norm(shift, axis=1).mean()),
+        ),
+    )
+
+
+def _link(one: Recognised, offset: int) -> Loop:
+    """The sighting as a loop closure of the joined map."""
+    return replace(one.sighting.loop, first=one.sighting.place, second=offset + one.number)
+
+
+def _side_by_side(
+    first: SlamMap, second: SlamMap, first_T_second: gtsam.Pose3, level: bool
+) -> SlamMap:
+    """Both in one map, none of the features fused."""
+    R, t = first_T_second.rotation().matrix(), first_T_second.translation()
+    turned = Poses(
+        R @ second.poses.rotations,
+        second.poses.translations @ R.T + t,
+    )
+    features = second.features + np.where(second.features >= 0, len(first.points), 0)
+    links = replace(second.links, ends=second.links.ends + len(first))
+
+    def both(name: str) -> FloatArray:
+        return np.concatenate([getattr(first, name), getattr(second, name)])
+
+    return SlamMap(
+        first.recordings + second.recordings,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        __version__,
+        level,
+        np.concatenate([first.recording_of, second.recording_of + len(first.recordings)]),
+        np.concatenate([first.stamps_ns, second.stamps_ns]),
+        _stacked(first.poses, turned),
+        np.concatenate([first.points, second.points @ R.T + t]),
+        np.concatenate([first.feature_descriptors, second.feature_descriptors]),
+        np.concatenate([first.offsets, second.offsets[1:] + first.offsets[-1]]),
+        np.concatenate([first.features, features]),
+        both("normalized"),
+        np.concatenate([first.descriptors, second.descriptors]),
+        _chained(first.links, links),
+        first.vocabulary,
+    )
+
+
+def _stacked(first: Poses, second: Poses) -> Poses:
+    """Poses behind one another."""
+    return Poses(
+        np.concatenate([first.rotations, second.rotations]),
+        np.concatenate([first.translations, second.translations]),
+    )
+
+
+def _chained(first: Links, second: Links) -> Links:
+    """Links behind one another."""
+    return Links(
+        np.concatenate([first.ends, second.ends]),
+        _stacked(first.measured, second.measured),
+        np.concatenate([first.covariances, second.covariances]),
+    )
+
+
+def _solved(
+    joined: SlamMap, between: list[Loop], config: LoopClosureConfig, level: bool
+) -> tuple[Poses, list[bool]]:
+    """Poses of all keyframes, and whether each link between the maps holds."""
+    own, none = joined.links, np.zeros((0, 2), np.int64)
+    inner = [
+        Loop(
+            int(ends[0]),
+            int(ends[1]),
+            gtsam.Pose3(gtsam.Rot3(own.measured.rotations[n]), own.measured.translations[n]),
+            own.covariances[n],
+            0,
+            0,
+            none,
+        )
+        for n, ends in enumerate(own.ends)
+    ]
+    # an edge to the next number counts as odometry, which is above suspicion
+    usable = [abs(loop.first - loop.second) > 1 for loop in between]
+    loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
+    settings = config.model_copy(update={"degrees_of_freedom": 4 if level else 6})
+    graph = loop_graph(joined.stamps_ns, joined.poses, loops, settings, joined.recording_of)
+    policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc", initialization="file"))
+    solution = optimize_pose_graph(replace(graph, name="merged maps"), policy, Diagnostics())
+    poses = corrected(graph, solution.poses, joined.poses, settings.degrees_of_freedom)
+    weights = iter(solution.weights[len(solution.weights) - sum(usable) :].tolist())
+    return poses, [good and next(weights) > 0.5 for good in usable]
+
+
+def _body_points(content: SlamMap) -> FloatArray:
+    """(N, 3) the feature of each observation in its body frame; NaN where there is none."""
+    points = np.full((len(content.features), 3), np.nan)
+    known = np.flatnonzero(content.features >= 0)
+    at = content.keyframe_of[known]
+    away = content.points[content.features[known]] - content.poses.translations[at]
+    points[known] = np.einsum("nji,nj->ni", content.poses.rotations[at], away)
+    return points
+
+
+def _fused(first: SlamMap, second: SlamMap, accepted: list[Recognised]) -> tuple[IntArray, int]:
+    """(N,) feature of each observation of both maps, and how many of the second's were fused."""
+    offset = len(first.points)
+    other = second.features.copy()
+    other[other >= 0] += offset
+    pairs = []
+    for one in accepted:
+        rows = second.offsets[one.number] + one.sighting.loop.pairs[:, 1]
+        unknown = other[rows] == NO_FEATURE
+        other[rows[unknown]] = one.sighting.features[unknown]
+        pairs.append(np.column_stack([one.sighting.features, other[rows]]))
+    same = np.concatenate(pairs)
+    groups = together(offset + len(second.points), same)
+    features = np.concatenate([first.features, other])
+    known = features >= 0
+    features[known] = groups[features[known]]
+    fused = np.unique(same[:, 1][same[:, 1] >= offset])
+    return features, len(fused)
+
+
+def _left(content: SlamMap, count: int) -> tuple[float, float]:
+    """Root mean square of what the last links leave: metres and degrees."""
+    links = content.links
+    i, j = links.ends[-count:].T
+    found = content.poses.select(i).inverse().compose(content.poses.select(j))
+    rows = np.arange(len(links) - count, len(links))
+    off = links.measured.select(rows).inverse().compose(found)
+    metres = np.linalg.norm(off.translations, axis=1)
+    return (
+        float(np.sqrt(np.mean(metres**2))),
+        float(np.degrees(np.sqrt(np.mean(off.angles() ** 2)))),
+    )

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Merged maps: the worlds agree, features that are the same become one, strangers are refused."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from map_flights import PLACES, World
+
+from slam_graph.errors import EstimationError
+from slam_graph.mapping.loop_config import LoopClosureConfig
+from slam_graph.mapping.map_config import LocalizationConfig
+from slam_graph.mapping.map_merge import MIN_LINKS, merge_maps
+from slam_graph.mapping.map_model import SlamMap
+from slam_graph.mapping.pose_graph import Poses
+
+LOOPS, LOCALIZATION = LoopClosureConfig(places=PLACES), LocalizationConfig()
+MOVE = gtsam.Pose3(gtsam.Rot3.Rz(2.5), np.array([20.0, -5.0, 1.0]))
+
+
+def in_another_world(content: SlamMap, move: gtsam.Pose3 = MOVE) -> SlamMap:
+    R, t = move.rotation().matrix(), move.translation()
+    poses = Poses(R @ content.poses.rotations, content.poses.translations @ R.T + t)
+    return replace(content, poses=poses, points=content.points @ R.T + t)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World()
+
+
+def test_maps_of_one_place_become_one(world: World) -> None:
+    first, second = world.map(range(8)), in_another_world(world.map(range(3, 11)))
+    merged = merge_maps(first, second, LOOPS, LOCALIZATION)
+    content, summary = merged.content, merged.summary
+    truth = np.array([world.pose(n).translation() for n in [*range(8), *range(3, 11)]])
+    np.testing.assert_allclose(content.poses.translations, truth, atol=2e-3)
+    assert summary.accepted >= MIN_LINKS
+    assert summary.first_moved_m < 1e-3
+    assert summary.link_rmse_m < 2e-3
+    # every feature of the wall is there once, where it is
+    assert len(content.points) <= len(world.points)
+    assert summary.fused == len(first.points) + len(second.points) - len(content.points)
+    away = np.linalg.norm(content.points[:, None] - world.points, axis=2).min(axis=1)
+    assert away.max() < 5e-3
+    np.testing.assert_array_equal(content.recording_of, [0] * 8 + [1] * 8)
+
+
+def test_a_third_map_is_merged_with_two(world: World) -> None:
+    """Links of the maps are kept, and the whole still fits."""
+    maps = [world.map(range(6)), in_another_world(world.map(range(2, 8)))]
+    two = merge_maps(*maps, LOOPS, LOCALIZATION).content
+    third = in_another_world(world.map(range(1, 8)), MOVE.inverse())
+    for order in ((two, third), (third, two)):
+        merged = merge_maps(*order, LOOPS, LOCALIZATION).content
+        assert len(merged.recordings) == 3
+        assert len(merged.links) > len(two.links)
+        assert len(merged.points) <= len(world.points)
+
+
+def test_without_gravity_the_whole_pose_is_found(world: World) -> None:
+    tilted = gtsam.Pose3(gtsam.Rot3.Ypr(1.0, 0.5, -0.7), np.array([1.0, 2.0, 3.0]))
+    first = replace(world.map(range(8)), gravity_aligned=False)
+    second = in_another_world(world.map(range(8)), tilted)
+    content = merge_maps(first, second, LOOPS, LOCALIZATION).content
+    assert not content.gravity_aligned
+    np.testing.assert_allclose(content.poses.translations[8:], first.poses.translations, atol=2e-3)
+
+
+def test_maps_of_different_places_are_refused(world: World) -> None:
+    with pytest.raises(EstimationError, match="share no place: 0 of 8") as caught:
+        merge_maps(world.map(range(8)), World(1).map(range(8)), LOOPS, LOCALIZATION)
+    assert "\n" not in str(caught.value)
+
+
+def test_too_small_an_overlap_is_refused(world: World) -> None:
+    with pytest.raises(EstimationError, match="share no place"):
+        merge_maps(world.map(range(8)), world.map(range(MIN_LINKS - 1)), LOOPS, LOCALIZATION)

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps from the command line: a flight makes one, another is located in it, two become one."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from map_flights import rooms
+from typer.testing import CliRunner, Result
+
+from slam_graph.cli.main import app
+from slam_graph.config import load_config
+from slam_graph.errors import DataError, EstimationError
+from slam_graph.output.map_output import load_map, save_map
+from slam_graph.pipeline import run
+from slam_graph.simulation.config import SimulationConfig, TrackConfig
+from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.writers import write
+
+HALF_S = 48.0
+WITHIN_M, WITHIN_DEG = 0.05, 2.0
+
+
+@pytest.fixture(scope="module")
+def tour(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of two laps in `tour`, and a run with a map of the first one in `a`."""
+    folder = tmp_path_factory.mktemp("maps")
+    write(rooms(seed=1, duration_s=2 * HALF_S), folder / "tour")
+    done = call(
+        "run", folder / "tour", "--duration", HALF_S, "--save-map", "--output", folder / "a"
+    )
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def known(tour: Path) -> Path:
+    """The folder of the run that made the map."""
+    (folder,) = (tour / "a").iterdir()
+    return folder
+
+
+def call(*arguments: object) -> Result:
+    words = [str(word) for word in arguments]
+    if words[0] in ("run", "localize"):
+        words += ["--no-progress", "--json"]
+    return CliRunner().invoke(app, words)
+
+
+@pytest.fixture(scope="module")
+def second(tour: Path, known: Path) -> Path:
+    """The folder of the run over the second lap, located in the map of the first, with its own."""
+    options = ("--start", HALF_S, "--set", "map.enabled=true", "--output", tour / "b")
+    done = call("localize", tour / "tour", "--map", known, *options)
+    assert done.exit_code == 0, done.output
+    return Path(json.loads(done.stdout)["folder"])
+
+
+def test_the_second_half_is_located_in_the_map_of_the_first(second: Path) -> None:
+    table = json.loads((second / "metrics.json").read_text())
+    found = table["localization"]
+    assert not table["extent"]["start_was_given"]  # nobody says where the second half begins
+    assert found["located_share"] >= 0.95
+    assert found["first_s"] < 2.5
+    rows = np.loadtxt(second / "trajectory_map.tum")
+    assert len(rows) == found["located"]
+    lines = (second / "localization.csv").read_text().splitlines()
+    assert sum(line.split(",")[1] == "1" for line in lines[1:]) == len(rows)
+    # the map has the world of the truth, but for its drift; aligned by its keyframes less is left
+    for alignment in ("none", "map"):
+        ate = found["accuracy"][alignment]["ate"]
+        assert ate["translation_m"]["max"] < WITHIN_M
+        assert ate["rotation_deg"]["max"] < WITHIN_DEG
+
+
+def test_maps_of_both_halves_become_one(tour: Path, known: Path, second: Path) -> None:
+    merged = tour / "merged.slam"
+    arguments = ("map", "merge", known, second, "--output", merged)
+    assert call(*arguments).exit_code == 0
+    assert isinstance(call(*arguments).exception, DataError)  # it exists now
+    done = call(*arguments, "--force", "--json")
+    table = json.loads(done.stdout)
+    one, other = load_map(known), load_map(second)
+    assert table["keyframes"] == len(one) + len(other)
+    assert table["fused"] > 100
+    assert table["features"] < len(one.points) + len(other.points)
+    assert table["accepted"] >= 10
+    truth = rooms(seed=1, duration_s=2 * HALF_S).groundtruth()
+    for keyframes in load_map(merged).trajectories():
+        rows = np.searchsorted(truth.stamps_ns, keyframes.stamps_ns)
+        away = np.linalg.norm(keyframes.positions - truth.positions[rows], axis=1)
+        assert away.max() < WITHIN_M
+
+
+def test_a_map_is_shown_and_exported(tour: Path, known: Path) -> None:
+    done = call("map", "info", known)
+    assert done.exit_code == 0
+    assert "keyframes" in done.output
+    assert "cam1" in done.output
+    table = json.loads(call("map", "info", known, "--json").stdout)
+    assert table["keyframes"] == len(load_map(known))
+    assert table["recordings"][0]["poses"] == "smoothed"
+    ply, tum = tour / "a.ply", tour / "a.tum"
+    assert call("map", "export", known, "--ply", ply, "--tum", tum).exit_code == 0
+    before = ply.read_bytes()
+    for options in (("--ply", ply), ("--tum", tum), ("--ply", tour / "new.ply", "--tum", tum)):
+        done = call("map", "export", known, *options)
+        assert isinstance(done.exception, DataError)
+        assert "--force" in str(done.exception)
+    assert not (tour / "new.ply").exists()
+    assert call("map", "export", known, "--ply", ply, "--force").exit_code == 0
+    assert ply.read_bytes() == before
+    assert "--ply" in str(call("map", "export", known).exception)
+
+
+def test_strangers_are_refused(tour: Path, known: Path) -> None:
+    write(rooms(seed=2, duration_s=6.0), tour / "elsewhere")
+    result = run(rooms(seed=2, duration_s=20.0), load_config(None, ["map.enabled=true"]))
+    assert result.slam_map is not None
+    save_map(result.slam_map, tour / "elsewhere.slam")
+    merged = tour / "no.slam"
+    done = call("map", "merge", known, tour / "elsewhere.slam", "--output", merged)
+    assert isinstance(done.exception, EstimationError)
+    assert "share no place" in str(done.exception)
+    assert not merged.exists()
+    done = call(
+        "localize", tour / "elsewhere", "--map", known, "--output", tour / "d", "--no-final-ba"
+    )
+    assert isinstance(done.exception, EstimationError)
+    assert "no frame was recognised" in str(done.exception)
+    assert json.loads(done.stdout)["localization"]["located"] == 0
+
+
+def test_tracks_without_looks_make_no_map(known: Path) -> None:
+    tracks = TrackConfig(features=30)
+    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
+    result = run(sequence, load_config(None, ["map.enabled=true"]), known_map=load_map(known))
+    assert result.status == "ok"
+    assert result.slam_map is None
+    assert result.warnings["map_impossible"] == 1
+    assert result.warnings["localization_impossible"] == 1
