@@ -133,6 +133,8 @@ class InitializationConfig(Settings):
     """Largest mean squared residual of a start in motion, in squared standard deviations."""
     max_velocity_sigma: float = Field(0.1, gt=0)
     """How well a start in motion must know the velocity, m/s."""
+    max_scale_sigma: float = Field(0.15, gt=0)
+    """How well a start in motion must know the scale, relative to it."""
     prior: PriorConfig = PriorConfig()
     """Uncertainty of the first state of a static start."""
     motion_prior: PriorConfig = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)

@@ -6,6 +6,10 @@ For a pair of frames with relative rotation R, the normals n = f₁ × R f₂ of
 all orthogonal to the translation, so the smallest eigenvalue of Σ n nᵀ vanishes (Kneip & Lynen
 2013). With R integrated from the gyroscope this is a cost in its bias only: no depth, velocity or
 gravity is needed (He, Xu, Ouyang & Li 2023).
+
+Noise adds to that eigenvalue, and for a translation along the optical axis hardly anything. So the
+plain smallest eigenvalue prefers wrong rotations under which the camera seems to go straight ahead.
+The eigenvalue relative to what noise adds has no such preference (Kanatani 1996, renormalization).
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ class _Pairs:
         first, second: (N, 3) bearings in the orientation of the body.
         R: (P, 3, 3) rotation from the second body to the first.
         by_bias: (P, 3, 3) its derivative by the bias.
+        whitening: (P, 3, 3) makes the noise of the sum of n nᵀ the same in all directions.
     """
 
     pair: NDArray[np.intp]
@@ -49,6 +54,7 @@ class _Pairs:
     second: FloatArray
     R: FloatArray
     by_bias: FloatArray
+    whitening: FloatArray
 
 
 def estimate_gyro_bias(
@@ -82,7 +88,8 @@ def _residuals(change: FloatArray, pairs: _Pairs) -> FloatArray:
     R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
     normals = np.cross(pairs.first, np.einsum("nij,nj->ni", R[pairs.pair], pairs.second))
     scatter = np.add.reduceat(normals[:, :, None] * normals[:, None, :], pairs.starts)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, 0], 0.0))
+    white = pairs.whitening @ scatter @ pairs.whitening.transpose(0, 2, 1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(white)[:, 0], 0.0))
 
 
 def _pairs(
@@ -113,7 +120,23 @@ def _pairs(
         np.concatenate(second),
         np.array(rotations),
         np.array(derivatives),
+        np.array([_whitening(*pair) for pair in zip(first, second, rotations, strict=True)]),
     )
+
+
+def _whitening(first: FloatArray, second: FloatArray, R: FloatArray) -> FloatArray:
+    """What (3, 3) makes the noise of the normals of a pair equal in all directions, on the average.
+
+    Noise of σ across a bearing moves n = f₁ × R f₂ across it too, so to Σ n nᵀ the noise of all
+    bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ).
+
+    Args:
+        first, second: (N, 3) bearings.
+        R: (3, 3) rotation from the second body to the first.
+    """
+    turned = second @ R.T
+    noise = 2.0 * np.eye(3) - (first.T @ first + turned.T @ turned) / len(first)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)))
 
 
 def _rotation_by_bias(

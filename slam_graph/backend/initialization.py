@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from slam_graph.backend.calibration import CalibrationVariables
@@ -42,6 +42,8 @@ IntArray = NDArray[np.int64]
 BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the window of a start in motion is solved."""
 FINAL = GaussNewtonPolicy(max_steps=1)
+BEST_KNOWN = 0.1
+"""The share of the features that are taken for the best known ones."""
 SETTLED = 0.1
 """The last step must not change the cost by more than this share: else it is no minimum."""
 
@@ -175,7 +177,10 @@ class Initializer:
             features = self._keep_features(cost, window)
             final = minimize(cost, FINAL)
             before, after = final.costs
-            normalized_cost = _normalized_cost(cost)
+            normalized_cost, scale_sigma = (
+                _normalized_cost(cost),
+                _scale_sigma(cost, final.posterior),
+            )
         except np.linalg.LinAlgError:
             return "motion that shows gravity and scale"
         if not abs(after - before) < SETTLED * max(before, 1.0):
@@ -196,7 +201,7 @@ class Initializer:
             calibration=self._calibration.keys,
         )
         covariance = prior.covariance_of(imu_state_keys(last))
-        return self._doubt(normalized_cost, covariance) or start
+        return self._doubt(normalized_cost, scale_sigma, covariance) or start
 
     def _batch_cost(self, window: StartWindow, guess: StartGuess, imu: ImuBuffer) -> Cost:
         """All states of the window, a prior on the first, and the features they see."""
@@ -263,7 +268,9 @@ class Initializer:
         cost.fresh = replace(fresh, in_state=chosen)
         return fresh.obs.ids[chosen]
 
-    def _doubt(self, normalized_cost: float, covariance: FloatArray) -> str | None:
+    def _doubt(
+        self, normalized_cost: float, scale_sigma: float, covariance: FloatArray
+    ) -> str | None:
         """Why the solution should not be trusted, if so."""
         start = self._config.initialization
         velocity_sigma = float(np.sqrt(np.max(np.diag(covariance)[6:9])))
@@ -271,6 +278,8 @@ class Initializer:
             return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
         if velocity_sigma > start.max_velocity_sigma:
             return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+        if scale_sigma > start.max_scale_sigma:
+            return f"more motion (scale is known to {scale_sigma:.0%} only)"
         return None
 
 
@@ -287,3 +296,28 @@ def _normalized_cost(cost: Cost) -> float:
     if not isinstance(fresh, ReducedFeatures):
         return float("inf")
     return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
+
+
+def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
+    """Standard deviation of the scale: that of the best-known distances, relative to them.
+
+    A distance to a feature is scale times shape, so none is known better than the scale. An absolute
+    error does not show it: where the scale is taken for too small, all errors in metres are too.
+    """
+    fresh, features = cost.linearize().fresh, cost.fresh
+    if not isinstance(fresh, ReducedFeatures) or features is None or not len(features.points):
+        return float("inf")
+    keys = cost.rig.keys_of(features.obs)
+    last = X(features.obs.frames[-1])
+    pose = cost.state.estimate.atPose3(last)
+    away = features.points - pose.translation()
+    distances = np.linalg.norm(away, axis=1)
+    toward = away / distances[:, None]
+    # δf = R_f⁻¹ (r₁ - T δx), and the body moves by R δp
+    by_r_1 = np.linalg.solve(fresh.R_f.transpose(0, 2, 1), toward[:, :, None])[:, :, 0]
+    by_state = -np.einsum("ji,jin->jn", by_r_1, fresh.T)
+    position = Layout(dims_of(keys)).columns[last].start + np.arange(3, 6)
+    by_state[:, position] -= toward @ pose.rotation().matrix()
+    variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)
+    variances += np.sum(by_r_1**2, axis=1)
+    return float(np.quantile(np.sqrt(variances) / distances, BEST_KNOWN))
