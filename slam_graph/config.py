@@ -82,10 +82,14 @@ class LimitsConfig(Settings):
     """Largest sane speed, m/s."""
     max_position_sigma_m: float = Field(default=100.0, gt=0)
     """Largest standard deviation of the position on any axis."""
-    max_gyro_bias: float = Field(default=2.0, gt=0)
-    """Largest sane gyroscope bias, rad/s."""
-    max_accel_bias: float = Field(default=10.0, gt=0)
-    """Largest sane accelerometer bias, m/s²."""
+    max_gyro_bias: float = Field(default=0.5, gt=0)
+    """Largest sane gyroscope bias, rad/s (0.35 is what a data sheet allows the cheapest ones)."""
+    max_accel_bias: float = Field(default=3.0, gt=0)
+    """Largest sane accelerometer bias, m/s² (1.5 is what a data sheet allows the cheapest ones)."""
+    max_rejected_share: float = Field(default=0.6, gt=0, le=1)
+    """Largest sane share of the features that the gate rejects …"""
+    disagreement_s: float = Field(default=3.0, gt=0)
+    """… over so many seconds in which images were tested."""
 
 
 class RunConfig(Settings):

@@ -22,7 +22,13 @@ from slam_graph.map_stage import map_of
 from slam_graph.mapping.map_model import SlamMap
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
-from slam_graph.supervision import check_sane, estimate, interrupts_between_frames, outcome
+from slam_graph.supervision import (
+    Agreement,
+    check_sane,
+    estimate,
+    interrupts_between_frames,
+    outcome,
+)
 from slam_graph.tracking import Tracking
 from slam_graph.visualization.viewer import NullViewer, Viewer
 
@@ -114,6 +120,7 @@ def run(
             known_map, result.rig, config, result.info.name, sequence.diagnostics
         )
 
+    agreement = Agreement(config.limits)
     tracking = Tracking(_packets(sequence, result), frontend, config.overlap)
     with FinalStage(result, sequence.diagnostics) as final:
         with (
@@ -135,6 +142,7 @@ def run(
                 tracking.tell(Feedback.of(state, estimator.rejected, ids, points))
                 if state is not None:
                     check_sane(state, config.limits)
+                    agreement.check(features.stamp_ns, estimator.innovations)
                     result.history.append(state)
                     result.points.update(ids, points)
                     loops.keep(packet.frame, features, state)

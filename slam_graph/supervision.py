@@ -8,6 +8,7 @@ import logging
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -15,12 +16,16 @@ from types import FrameType
 import numpy as np
 
 from slam_graph.backend.build import EstimatorLike
+from slam_graph.backend.gating import Innovations
 from slam_graph.config import LimitsConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.output.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame
+
+LONGEST_GAP_S = 0.5
+"""How much of the time between two frames of which features were tested counts at most."""
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +81,49 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
             raise DivergenceError(
                 f"diverged at frame {state.stamp_ns}: {what.format(f'{value:.3g}')} "
                 f"(the limit is {limit:g})"
+            )
+
+
+class Agreement:
+    """Whether the images still agree with the state, by what the gate makes of them.
+
+    If state and covariance are right the χ² gate rejects a few percent of the features. Where it
+    rejects most of them for seconds, the state is wrong and surer of itself than it should be, and
+    nothing will bring it back: the features that would are those that are rejected.
+
+    Time counts as long as images are tested only, and for one gap between two tests little: after a
+    pause, as of blank images, an estimate has its time to recover.
+    """
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
+        self._tests: deque[tuple[float, int, int]] = deque()
+        self._tested_s = 0.0
+        self._last_ns: int | None = None
+
+    def check(self, stamp_ns: int, innovations: Innovations) -> None:
+        """Take what was tested in the next frame.
+
+        Raises:
+            DivergenceError: if too much was rejected for too long.
+        """
+        if innovations.tested == 0:
+            return
+        if self._last_ns is not None:
+            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, LONGEST_GAP_S)
+        self._last_ns = stamp_ns
+        self._tests.append((self._tested_s, innovations.tested, innovations.rejected))
+        begin_s = self._tested_s - self._limits.disagreement_s
+        while len(self._tests) > 1 and self._tests[1][0] <= begin_s:
+            self._tests.popleft()
+        if self._tests[0][0] > begin_s:
+            return
+        tested, rejected = (sum(test[k] for test in self._tests) for k in (1, 2))
+        if rejected > self._limits.max_rejected_share * tested:
+            raise DivergenceError(
+                f"diverged at frame {stamp_ns}: images contradict the state, {rejected / tested:.0%} "
+                f"of what was seen in {self._limits.disagreement_s:g} s was rejected (the limit is "
+                f"{self._limits.max_rejected_share:.0%})"
             )
 
 

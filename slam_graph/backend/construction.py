@@ -132,9 +132,7 @@ class CostConstruction:
         window.tracks.consume(window.features)
         leaving_frames = [i for i in window.past if i not in past]
         cost.fresh = self._new_features(window, leaving_frames, len(seen))
-        linear = cost.linearize(summed=self.policy.gate == "residual")
-        gate = cost.gate(linear, predicted)
-        linear = self._leave_out(window, cost, linear, gate)
+        gate, linear = self._gated(window, cost, predicted)
         leaving = self._leaving(window, cost, leaving_frames)
         if self.policy.features != "window":
             # a pose that no unused observation refers to has nothing more to give
@@ -144,6 +142,20 @@ class CostConstruction:
         constructed = self._constructed(window, cost, linear, past, features, leaving)
         constructed.predicted, constructed.innovations = predicted, gate.innovations
         return constructed
+
+    def _gated(
+        self, window: Window, cost: Cost, predicted: SquareRootInformation
+    ) -> tuple[Gate, Linearization | None]:
+        """Leave out what does not pass; what the gate found, and the cost's linearisation.
+
+        Where the loss lets the weights of outliers vanish, they would pass under it: the test is
+        without, and the steps linearise anew.
+        """
+        tested_twice = self.policy.gate == "both"
+        linear = cost.linearize(self.policy.gate == "residual", robust=not tested_twice)
+        gate = cost.gate(linear, predicted)
+        linear = self._leave_out(window, cost, linear, gate)
+        return gate, None if tested_twice else linear
 
     def _constructed(
         self,
@@ -166,7 +178,7 @@ class CostConstruction:
         Features that too few others see are left out of what becomes part of the prior.
         """
         cost = constructed.cost
-        if self.policy.gate != "residual" or cost.fresh is None:
+        if self.policy.gate == "prediction" or cost.fresh is None:
             return
         obs = cost.fresh.obs
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
@@ -176,8 +188,9 @@ class CostConstruction:
         window.tracks.forget(obs.rows(~fits))
         rejected = int(np.sum(~fits))
         self.diagnostics.counts["observation_rejected_by_gate"] += rejected
+        before = constructed.innovations
         constructed.innovations = replace(
-            constructed.innovations, tested=len(fits), rejected=rejected
+            before, tested=before.tested + len(fits), rejected=before.rejected + rejected
         )
         cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
 

@@ -131,7 +131,8 @@ def _whitening(first: FloatArray, second: FloatArray, R: FloatArray) -> FloatArr
     bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ).
 
     Args:
-        first, second: (N, 3) bearings.
+        first: (N, 3) bearings.
+        second: (N, 3) those of the same features in the second frame.
         R: (3, 3) rotation from the second body to the first.
     """
     turned = second @ R.T

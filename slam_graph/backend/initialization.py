@@ -301,8 +301,8 @@ def _normalized_cost(cost: Cost) -> float:
 def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
     """Standard deviation of the scale: that of the best-known distances, relative to them.
 
-    A distance to a feature is scale times shape, so none is known better than the scale. An absolute
-    error does not show it: where the scale is taken for too small, all errors in metres are too.
+    A distance to a feature is scale times shape, so none is known better than the scale. An error
+    in metres does not show it: where the scale is taken for too small, it is too small as well.
     """
     fresh, features = cost.linearize().fresh, cost.fresh
     if not isinstance(fresh, ReducedFeatures) or features is None or not len(features.points):
