@@ -119,10 +119,11 @@ class Agreement:
         if self._tests[0][0] > begin_s:
             return
         tested, rejected = (sum(test[k] for test in self._tests) for k in (1, 2))
-        if rejected > self._limits.max_rejected_share * tested:
+        share = rejected / tested
+        if share > self._limits.max_rejected_share:
             raise DivergenceError(
-                f"diverged at frame {stamp_ns}: images contradict the state, {rejected / tested:.0%} "
-                f"of what was seen in {self._limits.disagreement_s:g} s was rejected (the limit is "
+                f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
+                f"what was seen in {self._limits.disagreement_s:g} s was rejected (the limit is "
                 f"{self._limits.max_rejected_share:.0%})"
             )
 

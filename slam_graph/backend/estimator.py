@@ -193,6 +193,8 @@ class Estimator:
             if self.window is None:
                 with self._timed("start"):
                     self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
+                if self.window is not None:
+                    self._standstill.know_movers(self._initializer.unfit)
             elif stamp_ns > self.window.stamp_ns:
                 return self._step(self.window, stamp_ns, frame, still)
             elif stamp_ns == self.window.stamp_ns:

@@ -93,6 +93,7 @@ class Initializer:
 
     Attributes:
         waiting_for: why there is no start yet.
+        unfit: ids (N,) of features that do not fit the motion of a start in motion, ascending.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class Initializer:
         calibration: CalibrationVariables,
     ) -> None:
         self.waiting_for = "the first frames"
+        self.unfit = np.zeros(0, np.int64)
         self._rig = rig
         self._params = params
         self._algorithm = algorithm
@@ -250,6 +252,7 @@ class Initializer:
         result = self._points(cost, obs)
         fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
         good = result.good & fits
+        self.unfit = obs.ids[~fits]
         self._enter(cost, obs, result, good)
         return bool(np.sum(good) >= max(self._config.initialization.min_features, 0.5 * len(good)))
 

@@ -39,8 +39,6 @@ class CostPolicy(Settings):
     """… and the standard deviation of its depth, relative to it, must be less than this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
-    min_feature_frames: int = Field(2, ge=2)
-    """A feature outside the state must be seen in so many frames of the window to be in the cost."""
     gate: Literal["prediction", "residual", "both"] = "prediction"
     """How wrong features outside the state are found. prediction: before the steps, by the χ² test
     of their whole tracks against the predicted covariance. residual: after the steps, by that of

@@ -25,6 +25,9 @@ IntArray = NDArray[np.int64]
 RETRY_FRAMES = 4
 """Lasting features that are not the longest tracks are looked at on one frame out of so many."""
 
+MIN_FRAMES = 2
+"""A feature must be seen in this many frames to be used."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureChoice:
@@ -75,7 +78,7 @@ def choose_features(
         due = ~live
         if window.past and window.past[0] in leaving_frames:
             due |= is_in(ids, window.tracks.ids_in(window.past[0]))
-    due &= lengths >= policy.min_feature_frames
+    due &= lengths >= MIN_FRAMES
     used = _longest(ids[due], lengths[due], policy.max_features_per_step)
     return FeatureChoice(used, ids[lasting], lengths[lasting])
 

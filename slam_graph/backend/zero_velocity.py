@@ -22,6 +22,8 @@ from slam_graph.backend.config import ZeroVelocityConfig
 from slam_graph.backend.imu import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
+IntArray = NDArray[np.int64]
+
 OWN_MOTION = 3.0
 """What moves by more than so many times what standing still allows, moves by itself, if others
 move by so many times less."""
@@ -38,8 +40,9 @@ class StandstillDetector:
 
     Attributes:
         since_ns: stamp of the first frame of the current standstill, None while moving.
-        movers: ids (N,) of features that moved while the platform did not, ascending: as long as
-            they are tracked, they are no part of the world that stands still.
+        movers: ids (N,) of features that moved while the platform did not, or that are known to
+            move, ascending: as long as they are tracked, they are no part of the world that stands
+            still.
     """
 
     def __init__(self, config: ZeroVelocityConfig) -> None:
@@ -74,6 +77,10 @@ class StandstillDetector:
         elif self.since_ns is None:
             self.since_ns = self._recent[0][0]
         return still
+
+    def know_movers(self, ids: IntArray) -> None:
+        """Note features (N,) of which it is known otherwise that they move by themselves."""
+        self.movers = np.union1d(self.movers, ids)
 
     def _images_are_still(self) -> bool:
         now = self._recent[-1][1]
@@ -113,7 +120,7 @@ class StandstillDetector:
 
 def _common_motion_px(
     before: FeatureObservations, after: FeatureObservations
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, NDArray[np.float64]]:
     """Ids (N,) of common features, and how they moved (N, 2)."""
     ids, i, j = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
     return ids, after.pixels[j] - before.pixels[i]
