@@ -136,5 +136,6 @@ def test_a_pause_gives_no_time() -> None:
 def test_a_bias_that_no_sensor_has_is_not_sane(part: str) -> None:
     state = NavState(0, gtsam.Pose3(), np.zeros(3), np.zeros(3), np.zeros(3))
     check_sane(state, LIMITS)
+    changed: dict[str, Any] = {part: np.array([0.0, -4.0, 0.0])}
     with pytest.raises(DivergenceError, match=r"bias of 4"):
-        check_sane(replace(state, **{part: np.array([0.0, -4.0, 0.0])}), LIMITS)
+        check_sane(replace(state, **changed), LIMITS)

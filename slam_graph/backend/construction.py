@@ -25,6 +25,7 @@ from slam_graph.backend.pose_choice import POSE_CHOICES
 from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.selection import choose_features
 from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.state import POINT_DIM
 from slam_graph.backend.tracks import Observations, is_in
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.backend.window import Window
@@ -145,17 +146,25 @@ class CostConstruction:
 
     def _gated(
         self, window: Window, cost: Cost, predicted: SquareRootInformation
-    ) -> tuple[Gate, Linearization | None]:
+    ) -> tuple[Gate, Linearization]:
         """Leave out what does not pass; what the gate found, and the cost's linearisation.
 
-        Where the loss lets the weights of outliers vanish, they would pass under it: the test is
-        without, and the steps linearise anew.
+        Where there is a test after the steps too, this one is for features that enter the cost: one
+        that is in every step would sooner or later fail one of so many tests, whatever it is.
         """
-        tested_twice = self.policy.gate == "both"
-        linear = cost.linearize(self.policy.gate == "residual", robust=not tested_twice)
+        linear = cost.linearize(summed=self.policy.gate == "residual")
         gate = cost.gate(linear, predicted)
-        linear = self._leave_out(window, cost, linear, gate)
-        return gate, None if tested_twice else linear
+        if self.policy.gate == "both" and cost.fresh is not None:
+            entered = is_in(cost.fresh.obs.ids, window.landmarks[0])
+            passed = gate.fresh | entered
+            dof = np.append(2 * cost.fresh.obs.counts[passed] - POINT_DIM, 2 * np.sum(gate.tracked))
+            innovations = replace(
+                Innovations.untested(dof),
+                tested=int(np.sum(~entered)) + len(gate.tracked),
+                rejected=int(np.sum(~passed) + np.sum(~gate.tracked)),
+            )
+            gate = replace(gate, fresh=passed, innovations=innovations)
+        return gate, self._leave_out(window, cost, linear, gate)
 
     def _constructed(
         self,

@@ -153,36 +153,30 @@ class Cost:
 
     # --- linearisation -------------------------------------------------------------------------
 
-    def linearize(self, summed: bool = False, robust: bool = True) -> Linearization:
+    def linearize(self, summed: bool = False) -> Linearization:
         """Linearise all observations.
 
         Args:
             summed: whether new features are summed up; else their rows stay apart, as the gate
                 needs them.
-            robust: whether the robust loss weighs observations down.
         """
         self.state.relinearize()
         tracked = fresh = None
         if self.tracked is not None and len(self.tracked):
-            tracked = self._whitened(self.tracked, None, robust)
+            tracked = self._whitened(self.tracked, None)
         if self.fresh is not None and len(self.fresh.obs):
-            whitened = self._whitened(self.fresh.obs, self.fresh.points, robust)
+            whitened = self._whitened(self.fresh.obs, self.fresh.points)
             reduce = condense_features if summed else reduce_features
             fresh = reduce(self.fresh.obs, whitened)
         return Linearization(tracked, fresh)
 
-    def _whitened(
-        self, obs: Observations, points: FloatArray | None, robust: bool
-    ) -> WhitenedObservations:
+    def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
         rig = self.rig.at(self.state)
         first, estimate = (
             self._geometry(rig, values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
-        gating = self.config.gating
-        if not robust:
-            gating = gating.model_copy(update={"robust_loss": "none"})
-        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, gating)
+        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating)
 
     def _geometry(
         self,

@@ -89,7 +89,7 @@ def _residuals(change: FloatArray, pairs: _Pairs) -> FloatArray:
     normals = np.cross(pairs.first, np.einsum("nij,nj->ni", R[pairs.pair], pairs.second))
     scatter = np.add.reduceat(normals[:, :, None] * normals[:, None, :], pairs.starts)
     white = pairs.whitening @ scatter @ pairs.whitening.transpose(0, 2, 1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(white)[:, 0], 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(white)[:, 0], 0.0)))
 
 
 def _pairs(
