@@ -152,8 +152,9 @@ def _whitened(
 
 
 def _covariances(scene: Scene) -> FloatArray:
-    """Of the points (J, 3, 3), for observations with a standard deviation of one pixel."""
+    """Of the usable points (J, 3, 3), for observations with a standard deviation of one pixel."""
     by_point = scene.projection.jacobians(scene.seen, scene.at)[1]
     starts = np.searchsorted(scene.seen.feature, np.arange(len(scene.seen.ids)))
     information = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_point, starts)
+    information[~scene.usable] = np.eye(3)  # these may be nowhere
     return np.asarray(np.linalg.pinv(information, hermitian=True))
