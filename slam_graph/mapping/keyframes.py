@@ -95,14 +95,14 @@ def read_piece(
     imu = ImuBuffer()
     imu.add(ImuData.concatenate(samples))
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
-    seen = np.concatenate(points)
+    places = np.concatenate(points)
     return Piece(
         np.array(stamps),
         keyframes - first,
         _over_the_flight(log.noise[first:stop], np.array(still)),
         np.array(still),
         imu,
-        _table(ids, frames, cameras, _recalibrated(seen, cameras, log, rig), len(stamps)),
+        _table(ids, frames, cameras, _recalibrated(places, cameras, log, rig), len(stamps)),
     )
 
 

@@ -233,9 +233,7 @@ def _read_arrays(
     return arrays
 
 
-def _array_header(
-    file: IO[bytes], where: str
-) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _array_header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Shape, order and type of an array; `where` is for messages."""
     try:
         if np.lib.format.read_magic(file) == (1, 0):

@@ -120,9 +120,12 @@ def _around(
     inside = np.sum(normalized**2, axis=1) < np.max(np.sum(seen.normalized[rows] ** 2, axis=1))
     others, pixels = others[inside], projection.cameras[camera].distort(normalized[inside])[0]
     rows = rows[scene.usable[seen.feature[rows]]]
-    near = cKDTree(seen.pixels[rows]).sparse_distance_matrix(
-        cKDTree(pixels), around_px, output_type="ndarray"
+    # a single search does not pay for the best of trees
+    seen_at, projected_to = (
+        cKDTree(places, compact_nodes=False, balanced_tree=False)
+        for places in (seen.pixels[rows], pixels)
     )
+    near = seen_at.sparse_distance_matrix(projected_to, around_px, output_type="ndarray")
     rows, hit = rows[near["i"]], near["j"]
     return seen.feature[rows], others[hit], pixels[hit] - seen.pixels[rows]
 
