@@ -33,7 +33,6 @@ class LoopStage:
         config: all settings.
         seed: of the training of the vocabulary.
         diagnostics: counts what goes wrong.
-
         collect: whether keyframes are collected although no loops are to be closed.
 
     Attributes:
