@@ -85,6 +85,8 @@ class LoopClosureConfig(Settings):
     """What makes a loop closure."""
     degrees_of_freedom: Literal[4, 6] = 4
     """4: yaw and position, as gravity shows roll and pitch; 6 without an accelerometer."""
+    learn_drift: bool = True
+    """Whether loop closures, if there are ten, say how much odometry drifts; else what follows."""
     odometry_rotation_sigma: float = Field(1e-3, gt=0)
     """Drift of the orientation in a second, rad/√s."""
     odometry_position_sigma: float = Field(0.01, gt=0)

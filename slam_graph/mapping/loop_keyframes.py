@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,6 +15,8 @@ from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.tracks import TrackWindow
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.frontend.tracks import Image
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.loop_appearance import KeyframeDescriber
 from slam_graph.mapping.loop_config import KeyframeConfig
 from slam_graph.sensors.measurements import FeatureFrame
@@ -143,3 +145,12 @@ class KeyframeLog:
         known = good[place] & (obs.ids[place] == ids)
         points[known] = found.points[place[known]]
         return points
+
+
+def reposed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[Keyframe]:
+    """Keyframes at the poses of a trajectory; those that it does not reach stay."""
+    found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in keyframes]))
+    keyframes = list(keyframes)
+    for row, number in enumerate(np.flatnonzero(valid).tolist()):
+        keyframes[number] = replace(keyframes[number], world_T_body=found.pose(row))
+    return keyframes
