@@ -18,6 +18,8 @@ class KeyframeConfig(Settings):
     """A frame this far from the last keyframe is one."""
     angle_rad: float = Field(0.35, gt=0)
     """A frame turned by this much from the last keyframe is one."""
+    min_common_features: float = Field(0.5, ge=0, le=1)
+    """A frame that still sees less than this part of the last keyframe's features is one."""
     points_from_frames: int = Field(10, ge=1)
     """From how many recent frames the points that a keyframe sees are triangulated."""
     frame_spacing_s: float = Field(0.1, ge=0)

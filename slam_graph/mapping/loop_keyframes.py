@@ -97,7 +97,7 @@ class KeyframeLog:
             world_T_body: causal estimate of the pose then.
             image: of the first camera.
         """
-        wanted = self._is_keyframe(world_T_body)
+        wanted = self._is_keyframe(frame, world_T_body)
         spacing_ns = self._config.frame_spacing_s * 1e9
         if self._recent and frame.stamp_ns - self._recent[-1].frame.stamp_ns < spacing_ns:
             if not wanted:
@@ -118,13 +118,22 @@ class KeyframeLog:
         self.keyframes.append(keyframe)
         return keyframe
 
-    def _is_keyframe(self, world_T_body: gtsam.Pose3) -> bool:
+    def _is_keyframe(self, frame: FeatureFrame, world_T_body: gtsam.Pose3) -> bool:
         if not self.keyframes:
             return True
-        moved = self.keyframes[-1].world_T_body.between(world_T_body)
+        last, config = self.keyframes[-1], self._config
+        moved = last.world_T_body.between(world_T_body)
         turn = float(np.linalg.norm(gtsam.Rot3.Logmap(moved.rotation())))
         way = float(np.linalg.norm(moved.translation()))
-        return way >= self._config.distance_m or turn >= self._config.angle_rad
+        if way >= config.distance_m or turn >= config.angle_rad:
+            return True
+        # what is new is triangulated from frames that the last keyframe did not use
+        since_s = (frame.stamp_ns - last.stamp_ns) * 1e-9
+        if since_s < config.points_from_frames * config.frame_spacing_s:
+            return False
+        tracked = last.ids[last.ids >= 0]
+        common = np.isin(tracked, frame.cameras[0].ids)
+        return len(common) > 0 and bool(np.mean(common) < config.min_common_features)
 
     def _points(self, ids: IntArray) -> FloatArray:
         """Where features (N,) are in the world, (N, 3); NaN where that is not known."""
