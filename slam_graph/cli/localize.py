@@ -43,11 +43,13 @@ def localize(
     rerun: Rerun = "off",
     progress: Progress = True,
     final_ba: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--final-ba/--no-final-ba", help="Solve the recording as a whole at the end, too."
+            "--final-ba/--no-final-ba",
+            help="Solve the recording as a whole at the end, too (off, unless --config says so).",
+            show_default=False,
         ),
-    ] = False,
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -68,8 +70,9 @@ def localize(
         "cameras": cameras,
         "start_s": start,
         "duration_s": duration,
-        "final_ba": {"enabled": final_ba},
     }
+    if final_ba is not None or config is None:
+        said["final_ba"] = {"enabled": bool(final_ba)}
     settings = load_config(config, set_ or (), **said, seed=seed)
     path = find_map(map_)
     known = load_map(path)
