@@ -12,25 +12,18 @@ import typer
 from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
 from slam_graph.cli.data import (
     Calibration,
+    Cameras,
     Data,
+    Duration,
     Format,
     Groundtruth,
     Json,
     Sources,
-    sources_from,
+    Start,
+    open_recording,
 )
 from slam_graph.cli.logs import collected_log
-from slam_graph.cli.run import (
-    Cameras,
-    Duration,
-    Output,
-    Progress,
-    Rerun,
-    Seed,
-    Start,
-    execute,
-    report,
-)
+from slam_graph.cli.run import Output, Progress, Rerun, Seed, execute, report
 
 
 def localize(
@@ -50,11 +43,13 @@ def localize(
     rerun: Rerun = "off",
     progress: Progress = True,
     final_ba: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--final-ba/--no-final-ba", help="Solve the recording as a whole at the end, too."
+            "--final-ba/--no-final-ba",
+            help="Solve the recording as a whole at the end, too (off, unless --config says so).",
+            show_default=False,
         ),
-    ] = False,
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -67,7 +62,6 @@ def localize(
     to trajectory_map.tum, as soon as the place is recognised. The exit code is 3 if it never is.
     """
     from slam_graph.config import load_config
-    from slam_graph.datasets.registry import open_dataset
     from slam_graph.errors import EstimationError
     from slam_graph.output.map_output import find_map, load_map
 
@@ -76,19 +70,15 @@ def localize(
         "cameras": cameras,
         "start_s": start,
         "duration_s": duration,
-        "final_ba": {"enabled": final_ba},
     }
+    if final_ba is not None or config is None:
+        said["final_ba"] = {"enabled": bool(final_ba)}
     settings = load_config(config, set_ or (), **said, seed=seed)
     path = find_map(map_)
     known = load_map(path)
     with collected_log() as log:
-        sequence = open_dataset(
-            data,
-            format=format_,
-            cameras=settings.cameras,
-            calibration=calibration,
-            groundtruth=groundtruth,
-            sources=sources_from(sources),
+        sequence = open_recording(
+            data, format_, calibration, groundtruth, sources, settings.cameras
         )
         result, folder, files = execute(sequence, settings, output, rerun, progress, log, known)
     report(result, folder, files, as_json)

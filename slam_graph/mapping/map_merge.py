@@ -209,7 +209,9 @@ def _solved(
     # an edge to the next number counts as odometry, which is above suspicion
     usable = [abs(loop.first - loop.second) > 1 for loop in between]
     loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
-    settings = config.model_copy(update={"degrees_of_freedom": 4 if level else 6})
+    # two recordings have no common clock, by which a drift could be learned
+    update = {"degrees_of_freedom": 4 if level else 6, "learn_drift": False}
+    settings = config.model_copy(update=update)
     graph = loop_graph(joined.stamps_ns, joined.poses, loops, settings, joined.recording_of)
     policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc", initialization="file"))
     solution = optimize_pose_graph(replace(graph, name="merged maps"), policy, Diagnostics())
