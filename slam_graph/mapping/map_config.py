@@ -62,9 +62,9 @@ class MapCostPolicy(BalCostPolicy):
 class MapPriorPolicy(Settings):
     """How far the visual-inertial estimate may be wrong that a map was made with."""
 
-    rotation_sigma: float = Field(3e-4, gt=0)
+    rotation_sigma: float = Field(1e-4, gt=0)
     """Standard deviation of the orientation of a keyframe about each axis, rad."""
-    position_sigma: float = Field(5e-3, gt=0)
+    position_sigma: float = Field(2e-3, gt=0)
     """Of its position along each axis, m."""
     point_sigma: float = Field(0.03, gt=0)
     """Of the position of a feature along each axis, relative to the distance from which the nearest
