@@ -62,7 +62,7 @@ def long_flight(cameras: int, folder: Path) -> Outcome:
     outcome, result = Outcome(), rooms(LONG_SEED, LONG_S, cameras, 2000)
     if result.loops is None or result.truth is None:
         return Outcome(failure=result.message or "no loops")
-    causal, corrected = result.trajectory, result.loops.correct(result.trajectory)
+    causal, corrected = result.trajectory, result.loops.correct(result.best_trajectory)
     before, after = (
         ape(result.truth, trajectory, "trans_part", "yaw").statistics.rmse
         for trajectory in (causal, corrected)

@@ -15,10 +15,10 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
-from slam_graph.geometry.trajectory import NavState
+from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.mapping.loop_closure import LoopClosures, close_loops
 from slam_graph.mapping.loop_config import LoopClosureConfig
-from slam_graph.mapping.loop_keyframes import Keyframe, KeyframeLog
+from slam_graph.mapping.loop_keyframes import Keyframe, KeyframeLog, reposed
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
 
@@ -33,7 +33,6 @@ class LoopStage:
         config: all settings.
         seed: of the training of the vocabulary.
         diagnostics: counts what goes wrong.
-
         collect: whether keyframes are collected although no loops are to be closed.
 
     Attributes:
@@ -71,8 +70,12 @@ class LoopStage:
         """All keyframes so far."""
         return self._log.keyframes
 
-    def finish(self) -> LoopClosures | None:
-        """Close the loops, if there is anything to find them by."""
+    def finish(self, best: Trajectory) -> LoopClosures | None:
+        """Close the loops, if there is anything to find them by.
+
+        Args:
+            best: the best estimate of the trajectory that there is without loop closures.
+        """
         keyframes = self._log.keyframes
         if not self._config.enabled:
             return None
@@ -83,7 +86,7 @@ class LoopStage:
         start = time.perf_counter()
         try:
             closures = close_loops(
-                keyframes, self._rig, self._config, self._seed, self._diagnostics
+                reposed(keyframes, best), self._rig, self._config, self._seed, self._diagnostics
             )
         except (cv2.error, RuntimeError, np.linalg.LinAlgError, SlamGraphError) as error:
             self._give_up(" ".join(str(error).split())[:200])

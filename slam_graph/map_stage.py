@@ -5,18 +5,13 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import cv2
-import gtsam
 import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping.loop_closure import correct_by
-from slam_graph.mapping.loop_keyframes import Keyframe
+from slam_graph.mapping.loop_keyframes import Keyframe, reposed
 from slam_graph.mapping.loop_pose_graph import stacked
 from slam_graph.mapping.loop_verification import Loop
 from slam_graph.mapping.map_building import build_map
@@ -81,21 +76,9 @@ def best_poses(
         keyframes: with causal poses.
         held: loop closures that are true.
     """
-    source: PoseSource = "causal"
-    poses = [k.world_T_body for k in keyframes]
+    if held and result.loops is not None:
+        return "loop_closed", result.loops.poses
     if result.final_ba is not None:
-        source, poses = "smoothed", _posed(keyframes, result.final_ba.trajectory)
-    if not held:
-        return source, stacked(poses)
-    posed = [replace(k, world_T_body=pose) for k, pose in zip(keyframes, poses, strict=True)]
-    return "loop_closed", correct_by(posed, held, result.config.loop_closure).poses
-
-
-def _posed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[gtsam.Pose3]:
-    """Poses of keyframes by a trajectory; those that it does not reach stay."""
-    stamps_ns = np.array([k.stamp_ns for k in keyframes])
-    found, valid = interpolate(trajectory, stamps_ns)
-    poses = [k.world_T_body for k in keyframes]
-    for row, number in enumerate(np.flatnonzero(valid).tolist()):
-        poses[number] = found.pose(row)
-    return poses
+        smoothed = reposed(keyframes, result.final_ba.trajectory)
+        return "smoothed", stacked([k.world_T_body for k in smoothed])
+    return "causal", stacked([k.world_T_body for k in keyframes])

@@ -150,7 +150,7 @@ def run(
         final.finish(progress.adjusting)
     result.localization = localization.finish()
     if result.status in CORRECTED:
-        result.loops = loops.finish()
+        result.loops = loops.finish(result.best_trajectory)
         if config.map.enabled:
             result.slam_map = map_of(result, loops.keyframes, sequence.diagnostics)
     result.warnings = +sequence.diagnostics.counts

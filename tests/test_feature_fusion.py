@@ -3,7 +3,9 @@
 """Tracks of one point become one feature, others do not, and a drift is taken out by it."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import gtsam
@@ -14,15 +16,18 @@ from slam_graph.backend.config import BackendConfig
 from slam_graph.backend.reprojection import Geometry, RigProjection
 from slam_graph.backend.tracks import Observations
 from slam_graph.datasets.base import Sequence
+from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.mapping import final_adjustment
 from slam_graph.mapping.drift_consensus import agreeing, by_drift
 from slam_graph.mapping.feature_fusion import fused, relabelled
-from slam_graph.mapping.final_adjustment import adjust_recording
+from slam_graph.mapping.final_adjustment import UndeterminedError, adjust_recording
 from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.mapping.keyframes import read_piece, triangulated
 from slam_graph.mapping.projected_matches import Scene
+from slam_graph.sensors.measurements import FeatureObservations
 from slam_graph.simulation.config import (
     FlightConfig,
     LandmarkConfig,
@@ -152,6 +157,68 @@ def test_fusion_takes_out_drift(log: FrameLog, sequence: Sequence) -> None:
 
     with_fusion, without = error_m(FinalBaConfig()), error_m(FinalBaConfig(fuse_features=False))
     assert with_fusion < 0.5 * without
+
+
+def once(seen: FeatureObservations, stamp_ns: int) -> FeatureObservations:
+    """Features that nothing else saw."""
+    return replace(seen, ids=stamp_ns + np.arange(len(seen)))
+
+
+def unseen(seen: FeatureObservations, stamp_ns: int) -> FeatureObservations:
+    return FeatureObservations.empty()
+
+
+@pytest.mark.parametrize("change", [once, unseen])
+def test_without_tracks_there_is_nothing_to_adjust(
+    sequence: Sequence,
+    tmp_path: Path,
+    change: Callable[[FeatureObservations, int], FeatureObservations],
+) -> None:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    with FrameLog.recording(sequence.rig, FinalBaConfig(), tmp_path) as log:
+        for packet in islice(sequence.packets(), 50):
+            frame = packet.frame
+            cameras = tuple(change(seen, frame.stamp_ns) for seen in frame.cameras)
+            log.add(packet.imu, replace(frame, cameras=cameras), (1.0, 1.0))
+    with pytest.raises(UndeterminedError, match="too few"):
+        adjust_recording(
+            log, truth, sequence.rig, BackendConfig(), FinalBaConfig(), lambda *_: None
+        )
+
+
+def test_points_that_are_nowhere_are_left_out(log: FrameLog, sequence: Sequence) -> None:
+    truth = sequence.groundtruth()
+    assert truth is not None
+    scene = scene_of(log, truth)
+    points, usable = scene.at.points.copy(), scene.usable.copy()
+    points[5], usable[5] = np.nan, False
+    label = fused(replace(scene, at=replace(scene.at, points=points), usable=usable), 8.0)
+    assert label[5] == 5
+    assert np.sum(label == 5) == 1
+    assert np.sum(label != np.arange(len(label))) > 100
+
+
+def test_tracks_are_adjusted_as_they_are_if_fusion_fails(
+    log: FrameLog, sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    causal = sequence.groundtruth()
+    assert causal is not None
+
+    def adjusted(config: FinalBaConfig) -> Trajectory:
+        whole = adjust_recording(
+            log, causal, sequence.rig, BackendConfig(), config, lambda *_: None
+        )
+        return whole.trajectory
+
+    def refuse(*_: object) -> None:
+        raise EstimationError("no minimum")
+
+    monkeypatch.setattr(final_adjustment, "with_fused_features", refuse)
+    few = {"max_iterations": 2}
+    found = adjusted(FinalBaConfig(**few))
+    plain = adjusted(FinalBaConfig(fuse_features=False, **few))
+    np.testing.assert_array_equal(found.positions, plain.positions)
 
 
 def test_a_common_drift_is_found_among_wrong_matches() -> None:

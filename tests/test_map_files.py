@@ -207,6 +207,16 @@ BROKEN = {
         lambda m: m.update({"points.npy": npy(np.zeros((3, 3))).replace(b"'<f8'", b"'|O' ", 1)}),
         "points.npy",
     ),
+    "header that is no Python": (
+        lambda m: m.update(
+            {"points.npy": npy(np.zeros((3, 3))).replace(b"'shape'", b"'shape(", 1)}
+        ),
+        "points.npy: damaged",
+    ),
+    "header of no use": (
+        lambda m: m.update({"points.npy": b"\x93NUMPY\x01\x00\x07\x00{[]: 1}"}),
+        "points.npy: damaged",
+    ),
     "other type": (lambda m: m.update({"points.npy": npy(np.zeros((3, 3), "f4"))}), "type"),
     "other shape": (lambda m: m.update({"positions.npy": npy(np.zeros((5, 4)))}), "shape"),
     "keyframes of other number": (

@@ -118,7 +118,7 @@ class InitializationConfig(Settings):
     static_window_s: float = Field(1.0, gt=0)
     """How long the platform must stand still for a static start."""
     static_disparity_px: float = Field(1.5, gt=0)
-    """The same for a static start; running motors shake the picture."""
+    """zero_velocity.max_disparity_px of a static start; running motors shake the picture."""
     motion_window_s: float = Field(1.5, gt=0)
     """Length of the visual-inertial alignment of a start in motion."""
     frame_spacing_s: float = Field(0.15, gt=0)

@@ -47,6 +47,15 @@ Sources = Annotated[
         "rate=30 instead of stamps.",
     ),
 ]
+Cameras = Annotated[
+    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
+]
+Start = Annotated[
+    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+]
+Duration = Annotated[
+    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -60,7 +69,7 @@ def info(
     as_json: Json = False,
 ) -> None:
     """Show what a recording holds, without reading it whole."""
-    sequence = _open(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources)
     table = _describe(sequence)
     if as_json:
         echo_json(table)
@@ -84,7 +93,7 @@ def check(
     """Read a recording and report what is wrong with it; the exit code is 1 if it is unusable."""
     from slam_graph.datasets.checks import check_sequence
 
-    sequence = _open(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources)
     findings = check_sequence(sequence, read_images=images)
     errors = sum(finding.severity == "error" for finding in findings)
     if as_json:
@@ -117,7 +126,7 @@ def convert(
     from slam_graph.datasets.euroc_writer import refuse_existing
 
     refuse_existing(output, force)
-    sequence = _open(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
         told = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
@@ -136,18 +145,21 @@ def sources_from(texts: list[str] | None) -> dict[str, str]:
     return {sensor: where for sensor, _, where in pairs}
 
 
-def _open(
+def open_recording(
     data: str,
     format_: str | None,
     calibration: Path | None,
     groundtruth: Path | None,
     sources: list[str] | None,
+    cameras: int | None = None,
 ) -> RecordedSequence:
+    """The recording that the options of a command mean, with its first `cameras` cameras or all."""
     from slam_graph.datasets.registry import open_dataset
 
     return open_dataset(
         data,
         format=format_,
+        cameras=cameras,
         calibration=calibration,
         groundtruth=groundtruth,
         sources=sources_from(sources),

@@ -12,7 +12,18 @@ import typer
 from typer.core import TyperGroup
 
 from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Calibration, Data, Format, Groundtruth, Json
+from slam_graph.cli.data import (
+    Calibration,
+    Cameras,
+    Data,
+    Duration,
+    Format,
+    Groundtruth,
+    Json,
+    Sources,
+    Start,
+    open_recording,
+)
 from slam_graph.cli.output import echo_json, echo_table, number
 
 if TYPE_CHECKING:
@@ -22,16 +33,6 @@ if TYPE_CHECKING:
     from slam_graph.datasets.base import Sequence
     from slam_graph.experiment.frontends import FrontendReport
     from slam_graph.tracking import TrackedPacket
-
-Cameras = Annotated[
-    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
-]
-Start = Annotated[
-    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
-]
-Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
-]
 
 EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
@@ -74,21 +75,15 @@ def run(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     as_json: Json = False,
 ) -> None:
     """Track a recording, report how good the tracks are, and draw them."""
     from slam_graph.config import load_config
-    from slam_graph.datasets.registry import open_dataset
     from slam_graph.experiment.frontends import track
 
     settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
-    sequence = open_dataset(
-        data,
-        format=format_,
-        cameras=settings.cameras,
-        calibration=calibration,
-        groundtruth=groundtruth,
-    )
+    sequence = open_recording(data, format_, calibration, groundtruth, sources, settings.cameras)
     with ExitStack() as stack:
         watch = _watch(sequence, settings, picture, video, record, stack)
         report = track(sequence, settings, settings.frontend.method, watch)
@@ -119,23 +114,19 @@ def compare(
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
+    sources: Sources = None,
     as_json: Json = False,
 ) -> None:
     """Run several front ends on one recording, and print a table."""
     from slam_graph.config import load_config
-    from slam_graph.datasets.registry import open_dataset
     from slam_graph.experiment.frontends import parse_frontends, track, track_and_estimate
 
     said = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
     for name, changes in parse_frontends(n for n in frontends.split(",") if n).items():
         settings = load_config(config, [*(set_ or ()), *changes], **said)
-        sequence = open_dataset(
-            data,
-            format=format_,
-            cameras=settings.cameras,
-            calibration=calibration,
-            groundtruth=groundtruth,
+        sequence = open_recording(
+            data, format_, calibration, groundtruth, sources, settings.cameras
         )
         go = track if algorithm is None else track_and_estimate
         reports.append(go(sequence, settings, name))

@@ -12,25 +12,18 @@ import typer
 from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
 from slam_graph.cli.data import (
     Calibration,
+    Cameras,
     Data,
+    Duration,
     Format,
     Groundtruth,
     Json,
     Sources,
-    sources_from,
+    Start,
+    open_recording,
 )
 from slam_graph.cli.logs import collected_log
-from slam_graph.cli.run import (
-    Cameras,
-    Duration,
-    Output,
-    Progress,
-    Rerun,
-    Seed,
-    Start,
-    execute,
-    report,
-)
+from slam_graph.cli.run import Output, Progress, Rerun, Seed, execute, report
 
 
 def localize(
@@ -67,7 +60,6 @@ def localize(
     to trajectory_map.tum, as soon as the place is recognised. The exit code is 3 if it never is.
     """
     from slam_graph.config import load_config
-    from slam_graph.datasets.registry import open_dataset
     from slam_graph.errors import EstimationError
     from slam_graph.output.map_output import find_map, load_map
 
@@ -82,13 +74,8 @@ def localize(
     path = find_map(map_)
     known = load_map(path)
     with collected_log() as log:
-        sequence = open_dataset(
-            data,
-            format=format_,
-            cameras=settings.cameras,
-            calibration=calibration,
-            groundtruth=groundtruth,
-            sources=sources_from(sources),
+        sequence = open_recording(
+            data, format_, calibration, groundtruth, sources, settings.cameras
         )
         result, folder, files = execute(sequence, settings, output, rerun, progress, log, known)
     report(result, folder, files, as_json)

@@ -13,12 +13,15 @@ import typer
 from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
 from slam_graph.cli.data import (
     Calibration,
+    Cameras,
     Data,
+    Duration,
     Format,
     Groundtruth,
     Json,
     Sources,
-    sources_from,
+    Start,
+    open_recording,
 )
 from slam_graph.cli.logs import collected_log, remove_if_empty
 from slam_graph.cli.output import echo_json
@@ -34,15 +37,6 @@ if TYPE_CHECKING:
     from slam_graph.output.run_result import RunResult
 
 RerunMode = Literal["off", "save", "spawn", "connect"]
-Cameras = Annotated[
-    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
-]
-Start = Annotated[
-    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
-]
-Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
-]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")]
 Output = Annotated[
     Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
@@ -104,7 +98,6 @@ def run(
     The newest results are also found under OUTPUT/<dataset>/latest.
     """
     from slam_graph.config import load_config
-    from slam_graph.datasets.registry import open_dataset
 
     said: dict[str, Any] = {
         "algorithm": algorithm,
@@ -120,13 +113,8 @@ def run(
         said["map"] = {"enabled": save_map}
     settings = load_config(config, set_ or (), **said, seed=seed)
     with collected_log() as log:
-        sequence = open_dataset(
-            data,
-            format=format_,
-            cameras=settings.cameras,
-            calibration=calibration,
-            groundtruth=groundtruth,
-            sources=sources_from(sources),
+        sequence = open_recording(
+            data, format_, calibration, groundtruth, sources, settings.cameras
         )
         result, folder, files = execute(sequence, settings, output, rerun, progress, log)
     report(result, folder, files, as_json)

@@ -174,7 +174,8 @@ class CameraTracker:
         others = [np.isin(after.ids, ids) for ids in self._groups[1:]]
         groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
         matches = ((before.normalized[rows], after.normalized[rows]) for rows in groups)
-        return [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
+        motions = [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
+        return motions or [eight_point(before.normalized, after.normalized)]
 
     def _on_the_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> Mask:
         """Which features (N,) fit the map of the back end; those that are not in it do."""

@@ -11,7 +11,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.base import Feedback
 from slam_graph.frontend.config import FrontendConfig
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
 
@@ -55,9 +55,7 @@ class ReplayFrontend:
         self._seen = ids
         if not dropped.any():
             return frame
-        return FeatureFrame(
-            frame.stamp_ns, tuple(_without(c, self._dropped) for c in frame.cameras)
-        )
+        return frame.without(self._dropped)
 
     def drop(self, ids: NDArray[np.int64]) -> None:
         """Do not report these features any more."""
@@ -67,14 +65,3 @@ class ReplayFrontend:
         """Drop what the back end rejected, if so configured."""
         if self._drop_rejected and len(feedback.rejected):
             self.drop(feedback.rejected)
-
-
-def _without(features: FeatureObservations, ids: NDArray[np.int64]) -> FeatureObservations:
-    keep = ~np.isin(features.ids, ids)
-    looks = features.descriptors
-    return FeatureObservations(
-        features.ids[keep],
-        features.pixels[keep],
-        features.normalized[keep],
-        None if looks is None else looks[keep],
-    )

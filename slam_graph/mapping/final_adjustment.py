@@ -9,6 +9,7 @@ of what both share: position and yaw, which no piece knows of itself, are taken 
 
 from __future__ import annotations
 
+import logging
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
@@ -28,8 +29,10 @@ from slam_graph.mapping.final_ba_config import FinalBaConfig
 from slam_graph.mapping.frame_log import FrameLog
 from slam_graph.mapping.fused_piece import with_fused_features
 from slam_graph.mapping.keyframe_states import states_at
-from slam_graph.mapping.keyframes import read_piece
+from slam_graph.mapping.keyframes import Piece, read_piece
 from slam_graph.sensors.rig import Rig
+
+logger = logging.getLogger(__name__)
 
 IntArray = NDArray[np.int64]
 
@@ -143,21 +146,44 @@ def adjust_recording(
             parts.append(_trajectory(states[:joint]))
             start = laid_on(start, start[anchor], states[joint])
         steps = sum(part.iterations for part in solved)
-        fusing = 0
         told = _told_of_all(report, first, len(keyframes), steps)
-        if config.fuse_features:
-            fused = with_fused_features(piece, start, anchor, rig, backend, config, told)
-            piece, start, fusing = fused
-        told = _told_of_all(report, first, len(keyframes), steps + fusing)
-        adjusted = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
-        adjusted = replace(adjusted, iterations=adjusted.iterations + fusing)
-        _check(adjusted)
+        adjusted = _adjusted(piece, start, anchor, rig, backend, config, told)
         states = adjusted.states[begin:]
         solved.append(replace(adjusted, states=[]))
     if not solved:
         raise EstimationError("the causal estimate reaches none of the keyframes")
     trajectory = _joined([*parts, _trajectory(states)])
     return FinalBa(trajectory, _summary(solved, len(trajectory), began))
+
+
+def _adjusted(
+    piece: Piece,
+    start: list[NavState],
+    anchor: int,
+    rig: Rig,
+    backend: BackendConfig,
+    config: FinalBaConfig,
+    told: Callable[[int], None],
+) -> Adjustment:
+    """The minimum of a piece: with fused features, or if there is none, with those that it has."""
+    if config.fuse_features:
+        try:
+            fused, states, steps = with_fused_features(
+                piece, start, anchor, rig, backend, config, told
+            )
+            further = BundleAdjustment(
+                fused, states, anchor, rig, backend, config, lambda step: told(steps + step)
+            )
+            solved = further.solve()
+            _check(solved)
+            return replace(solved, iterations=solved.iterations + steps)
+        except UndeterminedError:
+            raise
+        except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
+            logger.warning("no features are fused: %s", " ".join(str(error).split())[:200])
+    solved = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+    _check(solved)
+    return solved
 
 
 def led_back(

@@ -97,6 +97,9 @@ def _labels(
     projection = RigProjection(with_native_cameras(rig))
     seen = piece.seen_by_keyframes()
     often = np.bincount(views(seen)[0], minlength=len(seen.ids)) > 1
+    label = np.arange(len(often))
+    if not often.any():
+        return label
     rows, seen = np.flatnonzero(often), seen.subset(often)
     matrices = np.array([state.world_T_body.matrix() for state in states])
     poses = matrices[:, :3, :3], matrices[:, :3, 3]
@@ -106,6 +109,5 @@ def _labels(
     times_s = np.interp(frames, np.arange(len(states)), piece.keyframe_stamps_ns * 1e-9)
     at = Geometry(*poses, points)
     scene = Scene(seen, at, usable, times_s, projection, backend.noise.pixel_sigma)
-    label = np.arange(len(often))
     label[rows] = rows[fused(scene, reach_px)]
     return label

@@ -95,13 +95,14 @@ def read_piece(
     imu = ImuBuffer()
     imu.add(ImuData.concatenate(samples))
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
+    places = np.concatenate(points)
     return Piece(
         np.array(stamps),
         keyframes - first,
         _over_the_flight(log.noise[first:stop], np.array(still)),
         np.array(still),
         imu,
-        _table(ids, frames, cameras, _recalibrated(np.concatenate(points), cameras, log, rig)),
+        _table(ids, frames, cameras, _recalibrated(places, cameras, log, rig), len(stamps)),
     )
 
 
@@ -148,15 +149,17 @@ def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig
     return points
 
 
-def _table(ids: IntArray, frames: IntArray, cameras: IntArray, points: FloatArray) -> Observations:
-    """The observations that are finite, sorted by feature, then frame, then camera."""
+def _table(
+    ids: IntArray, frames: IntArray, cameras: IntArray, points: FloatArray, count: int
+) -> Observations:
+    """The observations in `count` frames that are finite, by feature, then frame, then camera."""
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     order = finite[np.lexsort((cameras[finite], frames[finite], ids[finite]))]
     features, feature = np.unique(ids[order], return_inverse=True)
     points = points[order]
     return Observations(
         features,
-        tuple(range(int(frames[-1]) + 1)),
+        tuple(range(count)),
         feature,
         frames[order],
         cameras[order],

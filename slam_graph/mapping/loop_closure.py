@@ -33,6 +33,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+PASSES = 3
+"""How often the pose graph is solved at most, until no loop closure is rejected any more: what
+odometry drifts is learned from those that are left."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopClosures:
     """What became of the loops of a run.
@@ -129,11 +134,18 @@ def correct_by(
     if not loops:
         return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal)
     stamps = np.array([k.stamp_ns for k in keyframes])
-    graph = loop_graph(stamps, causal, loops, config)
     policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc"))
-    solution = optimize_pose_graph(graph, policy, diagnostics)
+    accepted = np.ones(len(loops), np.bool_)
+    for _ in range(PASSES):
+        held = np.flatnonzero(accepted)
+        graph = loop_graph(stamps, causal, [loops[k] for k in held], config)
+        solution = optimize_pose_graph(graph, policy, diagnostics)
+        fits = solution.weights[len(solution.weights) - len(held) :] > 0.5
+        accepted[held[~fits]] = False
+        if fits.all():
+            break
     poses = corrected(graph, solution.poses, causal, config.degrees_of_freedom)
-    return LoopClosures(keyframes, loops, solution.weights[-len(loops) :] > 0.5, poses)
+    return LoopClosures(keyframes, loops, accepted, poses)
 
 
 def find_loops(

@@ -18,6 +18,8 @@ class KeyframeConfig(Settings):
     """A frame this far from the last keyframe is one."""
     angle_rad: float = Field(0.35, gt=0)
     """A frame turned by this much from the last keyframe is one."""
+    min_common_features: float = Field(0.5, ge=0, le=1)
+    """A frame that still sees less than this part of the last keyframe's features is one."""
     points_from_frames: int = Field(10, ge=1)
     """From how many recent frames the points that a keyframe sees are triangulated."""
     frame_spacing_s: float = Field(0.1, ge=0)
@@ -85,6 +87,8 @@ class LoopClosureConfig(Settings):
     """What makes a loop closure."""
     degrees_of_freedom: Literal[4, 6] = 4
     """4: yaw and position, as gravity shows roll and pitch; 6 without an accelerometer."""
+    learn_drift: bool = True
+    """Whether loop closures, if there are ten, say how much odometry drifts; else what follows."""
     odometry_rotation_sigma: float = Field(1e-3, gt=0)
     """Drift of the orientation in a second, rad/√s."""
     odometry_position_sigma: float = Field(0.01, gt=0)

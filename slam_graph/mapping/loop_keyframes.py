@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,6 +15,8 @@ from slam_graph.backend.reprojection import RigProjection
 from slam_graph.backend.tracks import TrackWindow
 from slam_graph.backend.triangulation import triangulate
 from slam_graph.frontend.tracks import Image
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.loop_appearance import KeyframeDescriber
 from slam_graph.mapping.loop_config import KeyframeConfig
 from slam_graph.sensors.measurements import FeatureFrame
@@ -95,7 +97,7 @@ class KeyframeLog:
             world_T_body: causal estimate of the pose then.
             image: of the first camera.
         """
-        wanted = self._is_keyframe(world_T_body)
+        wanted = self._is_keyframe(frame, world_T_body)
         spacing_ns = self._config.frame_spacing_s * 1e9
         if self._recent and frame.stamp_ns - self._recent[-1].frame.stamp_ns < spacing_ns:
             if not wanted:
@@ -116,13 +118,22 @@ class KeyframeLog:
         self.keyframes.append(keyframe)
         return keyframe
 
-    def _is_keyframe(self, world_T_body: gtsam.Pose3) -> bool:
+    def _is_keyframe(self, frame: FeatureFrame, world_T_body: gtsam.Pose3) -> bool:
         if not self.keyframes:
             return True
-        moved = self.keyframes[-1].world_T_body.between(world_T_body)
+        last, config = self.keyframes[-1], self._config
+        moved = last.world_T_body.between(world_T_body)
         turn = float(np.linalg.norm(gtsam.Rot3.Logmap(moved.rotation())))
         way = float(np.linalg.norm(moved.translation()))
-        return way >= self._config.distance_m or turn >= self._config.angle_rad
+        if way >= config.distance_m or turn >= config.angle_rad:
+            return True
+        # what is new is triangulated from frames that the last keyframe did not use
+        since_s = (frame.stamp_ns - last.stamp_ns) * 1e-9
+        if since_s < config.points_from_frames * config.frame_spacing_s:
+            return False
+        tracked = last.ids[last.ids >= 0]
+        common = np.isin(tracked, frame.cameras[0].ids)
+        return len(common) > 0 and bool(np.mean(common) < config.min_common_features)
 
     def _points(self, ids: IntArray) -> FloatArray:
         """Where features (N,) are in the world, (N, 3); NaN where that is not known."""
@@ -143,3 +154,12 @@ class KeyframeLog:
         known = good[place] & (obs.ids[place] == ids)
         points[known] = found.points[place[known]]
         return points
+
+
+def reposed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[Keyframe]:
+    """Keyframes at the poses of a trajectory; those that it does not reach stay."""
+    found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in keyframes]))
+    keyframes = list(keyframes)
+    for row, number in enumerate(np.flatnonzero(valid).tolist()):
+        keyframes[number] = replace(keyframes[number], world_T_body=found.pose(row))
+    return keyframes

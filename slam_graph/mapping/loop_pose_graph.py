@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam_graph.mapping.loop_config import LoopClosureConfig
+from slam_graph.mapping.loop_drift import drift_sigmas
 from slam_graph.mapping.loop_verification import Loop
 from slam_graph.mapping.native_pose_graph import ROTATION_FIRST
 from slam_graph.mapping.pose_graph import PoseGraph, Poses
@@ -41,9 +42,9 @@ def loop_graph(
 
     Args:
         stamps_ns: (N,) times of the keyframes.
-        poses: their causal estimates world_T_body.
+        poses: estimates world_T_body that drift.
         loops: between them.
-        config: degrees of freedom, and how much odometry drifts.
+        config: degrees of freedom, and how much odometry drifts if loops do not tell.
         recording_of: (N,) number of the recording of each keyframe, if there are several: there is
             no odometry from one to another.
 
@@ -56,7 +57,9 @@ def loop_graph(
         before = np.flatnonzero(np.diff(recording_of) == 0)
     odometry = poses.select(before).inverse().compose(poses.select(before + 1))
     seconds = np.diff(stamps_ns)[before] * 1e-9
-    sigmas = [config.odometry_position_sigma] * 3 + [config.odometry_rotation_sigma] * 3
+    closures = stacked([x.first_T_second for x in loops])
+    yaw, shift = drift_sigmas(stamps_ns, poses, loops, closures, config)
+    sigmas = [shift] * 3 + [yaw] * 3
     edges = np.column_stack([before, before + 1])
     covariances = seconds[:, None, None] * np.diag(np.square(sigmas))
     graph = PoseGraph(
@@ -66,9 +69,7 @@ def loop_graph(
         back = np.argsort(ROTATION_FIRST)
         covariances = np.array([x.covariance[back[:, None], back] for x in loops])
         ends = np.array([(x.first, x.second) for x in loops], dtype=np.int64)
-        graph = graph.add_edges(
-            ends, stacked([x.first_T_second for x in loops]), np.linalg.inv(covariances)
-        )
+        graph = graph.add_edges(ends, closures, np.linalg.inv(covariances))
     return level(graph) if config.degrees_of_freedom == 4 else graph
 
 

@@ -12,7 +12,7 @@ import json
 import struct
 import zipfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -217,9 +217,7 @@ def _read_arrays(
             raise DataError(f"{where} is missing; take another copy of the map")
         info = members[_member(name)]
         with archive.open(info) as file:
-            if np.lib.format.read_magic(file) != (1, 0):
-                raise DataError(f"{where}: not an array of NumPy's format 1.0")
-            shape, by_column, found = np.lib.format.read_array_header_1_0(file)
+            shape, by_column, found = _array_header(file, where)
             _agree(shape, wanted, sizes, where)
             count = 1
             for size in shape:
@@ -233,6 +231,17 @@ def _read_arrays(
             content = bytearray(file.read())
         arrays[name] = np.frombuffer(content, dtype).reshape(shape)
     return arrays
+
+
+def _array_header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of an array; `where` is for messages."""
+    try:
+        if np.lib.format.read_magic(file) == (1, 0):
+            return np.lib.format.read_array_header_1_0(file)
+    except Exception as error:  # it is parsed as Python: whatever that finds wrong with it
+        reason = " ".join(str(error).split())[:100]
+        raise DataError(f"{where}: damaged ({reason}); take another copy of the map") from None
+    raise DataError(f"{where}: not an array of NumPy's format 1.0")
 
 
 def _agree(shape: tuple[int, ...], wanted: Shape, sizes: dict[str, int], where: str) -> None:

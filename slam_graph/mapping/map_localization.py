@@ -99,7 +99,7 @@ class MapLocalizer:
         self._contradictions += 1
         if self._contradictions >= self._config.patience:
             self.filter = None
-        self._doubtful = [*self._doubtful[1 - self._config.memory :], measured]
+        self._doubtful = [*self._doubtful, measured][-self._config.memory :]
         agreeing = self._agreeing()
         if len(agreeing) >= self._config.agreeing:
             self._start(agreeing)

@@ -120,9 +120,12 @@ def _around(
     inside = np.sum(normalized**2, axis=1) < np.max(np.sum(seen.normalized[rows] ** 2, axis=1))
     others, pixels = others[inside], projection.cameras[camera].distort(normalized[inside])[0]
     rows = rows[scene.usable[seen.feature[rows]]]
-    near = cKDTree(seen.pixels[rows]).sparse_distance_matrix(
-        cKDTree(pixels), around_px, output_type="ndarray"
+    # a single search does not pay for the best of trees
+    seen_at, projected_to = (
+        cKDTree(places, compact_nodes=False, balanced_tree=False)
+        for places in (seen.pixels[rows], pixels)
     )
+    near = seen_at.sparse_distance_matrix(projected_to, around_px, output_type="ndarray")
     rows, hit = rows[near["i"]], near["j"]
     return seen.feature[rows], others[hit], pixels[hit] - seen.pixels[rows]
 
@@ -152,8 +155,9 @@ def _whitened(
 
 
 def _covariances(scene: Scene) -> FloatArray:
-    """Of the points (J, 3, 3), for observations with a standard deviation of one pixel."""
+    """Of the usable points (J, 3, 3), for observations with a standard deviation of one pixel."""
     by_point = scene.projection.jacobians(scene.seen, scene.at)[1]
     starts = np.searchsorted(scene.seen.feature, np.arange(len(scene.seen.ids)))
     information = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_point, starts)
+    information[~scene.usable] = np.eye(3)  # these may be nowhere
     return np.asarray(np.linalg.pinv(information, hermitian=True))

@@ -117,7 +117,7 @@ def _loop_closure(result: RunResult) -> Table | None:
     loops, truth = result.loops, result.truth_of_run()
     if loops is None:
         return None
-    corrected = loops.correct(result.trajectory)
+    corrected = loops.correct(result.best_trajectory)
     return {
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),

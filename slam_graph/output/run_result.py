@@ -99,6 +99,11 @@ class RunResult:
         return self.history.trajectory()
 
     @property
+    def best_trajectory(self) -> Trajectory:
+        """The smoothed trajectory if there is one, else the causal one."""
+        return self.trajectory if self.final_ba is None else self.final_ba.trajectory
+
+    @property
     def recorded_s(self) -> float:
         """Length of the part that was asked for."""
         return (self.end_ns - self.start_ns) * 1e-9

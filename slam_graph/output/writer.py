@@ -54,7 +54,7 @@ def write_run(result: RunResult, folder: Path) -> list[Path]:
         write_text(files[-1], tum_lines(result.final_ba.trajectory))
     if result.loops is not None:
         files += [folder / "trajectory_loop.tum", folder / "loops.csv", folder / "map_loop.ply"]
-        write_text(files[-3], tum_lines(result.loops.correct(result.trajectory)))
+        write_text(files[-3], tum_lines(result.loops.correct(result.best_trajectory)))
         write_text(files[-2], result.loops.csv_lines())
         write_ply(files[-1], result.loops.points())
     if result.localization is not None:
