@@ -81,7 +81,6 @@ def optimize(
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
-    from slam_graph.mapping.bal_file import is_bal
     from slam_graph.mapping.bal_policy import BalPolicy
     from slam_graph.mapping.map_config import MapBalPolicy
     from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
@@ -94,8 +93,7 @@ def optimize(
     of_graphs = {("gauss_newton", "method"): method, ("cost", "initialization"): initialization}
     of_bundles = {("cost", "intrinsics"): intrinsics}
     if kind == "auto":
-        is_map = file.is_dir() or is_zipfile(file)
-        kind = "map" if is_map else "bal" if is_bal(file) else "pose_graph"
+        kind = _seen_format(file)
     if kind == "pose_graph":
         _refuse({"--intrinsics": intrinsics}, "bundle adjustment", file)
         graph_policy = read_policy(PoseGraphPolicy, config, set_ or [], {**loss, **of_graphs})
@@ -113,6 +111,15 @@ def optimize(
     else:
         bundle_policy = read_policy(BalPolicy, config, set_ or [], options)
         optimize_bal(file, bundle_policy, save, output, as_json)
+
+
+def _seen_format(file: Path) -> Format:
+    """What a file is, as its content says; a folder is one of a run with a map."""
+    from slam_graph.mapping.bal_file import is_bal
+
+    if file.is_dir() or is_zipfile(file):
+        return "map"
+    return "bal" if is_bal(file) else "pose_graph"
 
 
 def _refuse(options: Mapping[str, Any], what: str, file: Path) -> None:
