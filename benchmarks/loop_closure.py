@@ -33,7 +33,7 @@ LOOKS = 300
 FALSE_RAD, FALSE_M = 0.1, 0.4
 """A loop closure that is further off than this shows another place."""
 
-SIZES = (50, 500, 5000)
+SIZES = (50, 100, 200, 500, 1000, 2000, 5000)
 DESCRIPTORS, WORDS = 150, 2000
 QUERIES = 50
 QUERY_BAR = 3.0

@@ -11,6 +11,7 @@ from typing import Any
 
 from slam_graph.config import RunConfig, load_config
 from slam_graph.mapping.bal_policy import BalPolicy
+from slam_graph.mapping.map_config import MapBalPolicy
 from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
@@ -61,6 +62,16 @@ slam-graph optimize problem.txt --set cost.robust_width_px=1.5 --set gauss_newto
 ```
 """
 
+MAPS = """\
+## Bundle adjustment of maps
+
+The settings of `slam-graph optimize` for a map:
+
+```sh
+slam-graph optimize results/MONDAY/latest --set prior.position_sigma=0.02
+```
+"""
+
 BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -69,7 +80,11 @@ def page() -> str:
     schema = RunConfig.model_json_schema()
     defaults = load_config().model_dump(mode="json")
     sections = [INTRODUCTION, *_sections(schema, schema["$defs"], defaults, "")]
-    for heading, policy in ((POSE_GRAPHS, PoseGraphPolicy()), (BUNDLES, BalPolicy())):
+    for heading, policy in (
+        (POSE_GRAPHS, PoseGraphPolicy()),
+        (BUNDLES, BalPolicy()),
+        (MAPS, MapBalPolicy()),
+    ):
         schema = policy.model_json_schema()
         defaults = policy.model_dump(mode="json")
         sections += [heading, *_sections(schema, schema["$defs"], defaults, "")]

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from slam_graph.mapping.bal_adjustment import adjust_bundle
     from slam_graph.mapping.bal_file import read_bal
     from slam_graph.mapping.bal_policy import BalPolicy
+    from slam_graph.mapping.map_adjustment import adjust_map
+    from slam_graph.mapping.map_config import MapBalPolicy
     from slam_graph.mapping.map_merge import merge_maps
     from slam_graph.mapping.map_model import SlamMap
     from slam_graph.mapping.pose_graph_certificate import certify
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BalPolicy",
     "Estimator",
+    "MapBalPolicy",
     "NavState",
     "PoseGraphPolicy",
     "RunConfig",
@@ -47,6 +50,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "adjust_bundle",
+    "adjust_map",
     "ape",
     "build_estimator",
     "certify",
@@ -66,6 +70,7 @@ __all__ = [
 _HOME = {
     "BalPolicy": "slam_graph.mapping.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
+    "MapBalPolicy": "slam_graph.mapping.map_config",
     "NavState": "slam_graph.geometry.trajectory",
     "PoseGraphPolicy": "slam_graph.mapping.pose_graph_policy",
     "RunConfig": "slam_graph.config",
@@ -74,6 +79,7 @@ _HOME = {
     "SlamMap": "slam_graph.mapping.map_model",
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.mapping.bal_adjustment",
+    "adjust_map": "slam_graph.mapping.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "build_estimator": "slam_graph.backend.build",
     "certify": "slam_graph.mapping.pose_graph_certificate",

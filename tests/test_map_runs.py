@@ -115,6 +115,24 @@ def test_a_map_is_shown_and_exported(tour: Path, known: Path) -> None:
     assert "--ply" in str(call("map", "export", known).exception)
 
 
+def test_the_map_of_a_run_is_adjusted(tour: Path, known: Path) -> None:
+    done = call("optimize", known, "--output", tour / "adjusted", "--json")
+    assert done.exit_code == 0, done.output
+    table = json.loads(done.stdout)
+    assert table["converged"]
+    assert table["problem"]["used_cameras"] == table["problem"]["cameras"]
+    assert table["cost"]["after"] < 0.7 * table["cost"]["before"]
+    assert table["reprojection_px"]["after"]["rmse"] < 1.3  # the noise of the tracks is 1 px
+    truth = rooms(seed=1, duration_s=2 * HALF_S).groundtruth()
+    before, after = (load_map(path).trajectory() for path in (known, table["folder"]))
+    rows = np.searchsorted(truth.stamps_ns, before.stamps_ns)
+    old, new = (
+        np.linalg.norm(x.positions - truth.positions[rows], axis=1) for x in (before, after)
+    )
+    assert np.sqrt(np.mean(new**2)) < 1.1 * np.sqrt(np.mean(old**2))
+    assert new.max() < WITHIN_M
+
+
 def test_strangers_are_refused(tour: Path, known: Path) -> None:
     write(rooms(seed=2, duration_s=6.0), tour / "elsewhere")
     result = run(rooms(seed=2, duration_s=20.0), load_config(None, ["map.enabled=true"]))

@@ -1,25 +1,26 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph optimize`: a pose graph or a bundle-adjustment problem in, its optimum out."""
+"""`slam-graph optimize`: a pose graph, a bundle-adjustment problem or a map in, its optimum out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zipfile import is_zipfile
 
 import typer
 
 from slam_graph.cli.config import ConfigFile, Overrides
 from slam_graph.cli.data import Json
 from slam_graph.cli.optimization import read_policy
-from slam_graph.cli.optimize_bal import optimize_bal
+from slam_graph.cli.optimize_bal import optimize_bal, optimize_map
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
 from slam_graph.errors import ConfigError, DataError
 
 Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
 Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
-Format = Literal["auto", "pose_graph", "bal"]
+Format = Literal["auto", "pose_graph", "bal", "map"]
 Intrinsics = Literal["per_camera", "shared", "fixed"]
 Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
@@ -29,7 +30,8 @@ def optimize(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Pose graph (g2o or TORO, 2D or 3D) or bundle adjustment (BAL, also as .bz2).",
+            help="Pose graph (g2o or TORO, 2D or 3D), bundle adjustment (BAL, also as .bz2), map, "
+            "or the folder of a run with a map.",
         ),
     ],
     kind: Annotated[
@@ -71,16 +73,16 @@ def optimize(
     config: ConfigFile = None,
     set_: Overrides = None,
     output: Annotated[
-        Path, typer.Option("--output", help="Folder of results: OUTPUT/<graph>/<UTC time>/.")
+        Path, typer.Option("--output", help="Folder of results: OUTPUT/<name>/<UTC time>/.")
     ] = Path("results"),
     as_json: Json = False,
 ) -> None:
-    """Optimise a pose graph, or a bundle-adjustment problem, and write the results.
+    """Optimise a pose graph, a bundle-adjustment problem or a map, and write the results.
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
-    from slam_graph.mapping.bal_file import is_bal
     from slam_graph.mapping.bal_policy import BalPolicy
+    from slam_graph.mapping.map_config import MapBalPolicy
     from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
@@ -90,18 +92,34 @@ def optimize(
     loss = {("cost", "robust"): robust}
     of_graphs = {("gauss_newton", "method"): method, ("cost", "initialization"): initialization}
     of_bundles = {("cost", "intrinsics"): intrinsics}
-    if kind == "bal" or (kind == "auto" and is_bal(file)):
-        flags = {"--certify": certify or None, "--covariances": covariances or None}
-        others = {"--method": method, "--init": initialization, "--information": information}
-        _refuse({**others, **flags}, "pose graphs", file)
-        bundle_policy = read_policy(BalPolicy, config, set_ or [], {**loss, **of_bundles})
-        optimize_bal(file, bundle_policy, save, output, as_json)
-    else:
+    if kind == "auto":
+        kind = _seen_format(file)
+    if kind == "pose_graph":
         _refuse({"--intrinsics": intrinsics}, "bundle adjustment", file)
         graph_policy = read_policy(PoseGraphPolicy, config, set_ or [], {**loss, **of_graphs})
         wanted = Wanted(certify, covariances)
         meaning = information or "angle"
         optimize_pose_graph_file(file, meaning, graph_policy, wanted, save, output, as_json)
+        return
+    flags = {"--certify": certify or None, "--covariances": covariances or None}
+    others = {"--method": method, "--init": initialization, "--information": information}
+    _refuse({**others, **flags}, "pose graphs", file)
+    options = {**loss, **of_bundles}
+    if kind == "map":
+        map_policy = read_policy(MapBalPolicy, config, set_ or [], options)
+        optimize_map(file, map_policy, save, output, as_json)
+    else:
+        bundle_policy = read_policy(BalPolicy, config, set_ or [], options)
+        optimize_bal(file, bundle_policy, save, output, as_json)
+
+
+def _seen_format(file: Path) -> Format:
+    """What a file is, as its content says; a folder is one of a run with a map."""
+    from slam_graph.mapping.bal_file import is_bal
+
+    if file.is_dir() or is_zipfile(file):
+        return "map"
+    return "bal" if is_bal(file) else "pose_graph"
 
 
 def _refuse(options: Mapping[str, Any], what: str, file: Path) -> None:

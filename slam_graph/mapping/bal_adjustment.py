@@ -15,7 +15,7 @@ from slam_graph.mapping.bal_checks import usable
 from slam_graph.mapping.bal_cost import BalCost, construct, first_estimates
 from slam_graph.mapping.bal_gauge import GAUGE_DIM, restored
 from slam_graph.mapping.bal_policy import BalPolicy, BalSolution
-from slam_graph.mapping.bal_problem import BalEstimates, BalPart, BalProblem
+from slam_graph.mapping.bal_problem import POSE_DIM, BalEstimates, BalPart, BalProblem
 from slam_graph.mapping.bal_projection import project
 from slam_graph.mapping.bal_steps import minimize
 
@@ -48,7 +48,8 @@ def adjust_bundle(
         minimum = minimize(cost, start, policy.gauss_newton, diagnostics)
     # 3. Marginalization: none, every pose and feature stays.
 
-    estimates = restored(part, minimum.estimates)
+    held = part.problem.prior is not None  # then there is no gauge to restore
+    estimates = minimum.estimates if held else restored(part, minimum.estimates)
     _check_depths(part, estimates, diagnostics)
     everything = problem.estimates.updated(part.cameras, part.points, estimates)
     return BalSolution(problem, part, minimum, everything)
@@ -58,8 +59,11 @@ def _check_determined(cost: BalCost, diagnostics: Diagnostics) -> None:
     """Count a cost that has fewer residuals than unknowns."""
     part = cost.part
     unknowns = cost.variables.shape[1] + 3 * part.problem.points
-    unknowns -= GAUGE_DIM * (int(part.groups.max()) + 1)
     residuals = 2 * len(part.problem.camera)
+    if part.problem.prior is None:
+        unknowns -= GAUGE_DIM * (int(part.groups.max()) + 1)
+    else:
+        residuals += POSE_DIM * part.problem.cameras
     if residuals < unknowns:
         diagnostics.warn(
             "bal_underdetermined",

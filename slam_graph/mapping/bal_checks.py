@@ -14,7 +14,7 @@ from slam_graph.mapping.bal_problem import BalPart, BalProblem, BoolArray, IntAr
 from slam_graph.mapping.bal_projection import project
 
 FEWEST_VIEWS = 2
-"""Cameras in which a point must have been seen."""
+"""Cameras in which a point must have been seen of which nothing else is known."""
 
 
 def usable(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
@@ -22,14 +22,16 @@ def usable(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
 
     Left out and counted are second observations of a point in a camera, observations of points
     that are not in front of their camera at the start, points that are then seen by fewer than two
-    cameras, and cameras that see none of the others. They keep the estimates that they have.
+    cameras unless there is a prior, and cameras that see none of the others. They keep the
+    estimates that they have.
 
     Raises:
         DataError: if nothing is left.
     """
     kept = _first_of_pair(problem, diagnostics)
     kept = kept[_in_front(problem.keep(kept), diagnostics)]
-    kept = kept[_seen_twice(problem.keep(kept), diagnostics)]
+    if problem.prior is None:
+        kept = kept[_seen_twice(problem.keep(kept), diagnostics)]
     for camera in np.setdiff1d(np.arange(problem.cameras), problem.camera[kept]):
         diagnostics.warn(
             "bal_camera_without_observations",
@@ -83,9 +85,13 @@ def _renumbered(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
     cameras, camera = np.unique(problem.camera, return_inverse=True)
     points, point = np.unique(problem.point, return_inverse=True)
     estimates = problem.estimates.select(cameras, points)
-    part = BalProblem(estimates, camera, point, problem.pixels, problem.name)
+    prior, lenses = problem.prior, problem.lenses
+    prior = None if prior is None else prior.select(cameras, points)
+    lenses = None if lenses is None else np.unique(lenses[cameras], return_inverse=True)[1]
+    part = BalProblem(estimates, camera, point, problem.pixels, problem.name, prior, lenses)
     groups = _groups(part)
-    for group in range(1, int(groups.max()) + 1):
+    apart = range(1, int(groups.max()) + 1) if prior is None else range(0)
+    for group in apart:
         diagnostics.warn(
             "bal_not_connected",
             f"{problem.name}: {np.count_nonzero(groups == group)} cameras have no point in common "

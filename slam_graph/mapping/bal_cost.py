@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.backend.feature_factors import robust_loss, robust_weights
 from slam_graph.mapping.bal_policy import BalCostPolicy, Intrinsics
+from slam_graph.mapping.bal_prior import prior_cost
 from slam_graph.mapping.bal_problem import (
     CAMERA_DIM,
     POSE_DIM,
@@ -45,6 +46,8 @@ class BalCost:
         errors = reprojection_errors(self.part.problem, estimates)
         with np.errstate(all="ignore"):
             cost = float(np.sum(robust_loss(errors, self.policy.loss)))
+            if self.part.problem.prior is not None:
+                cost += prior_cost(self.part.problem.prior, estimates)
         return cost if np.isfinite(cost) else np.inf
 
     def linearized(self, estimates: BalEstimates) -> BalLinearization:
@@ -62,7 +65,7 @@ class BalCost:
 
 def construct(part: BalPart, policy: BalCostPolicy) -> BalCost:
     """The cost of a part."""
-    return BalCost(part, policy, _variables(part.problem.cameras, policy.intrinsics))
+    return BalCost(part, policy, _variables(part.problem, policy.intrinsics))
 
 
 def first_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
@@ -97,15 +100,18 @@ def moved(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) 
     )
 
 
-def _variables(cameras: int, intrinsics: Intrinsics) -> csr_array:
+def _variables(problem: BalProblem, intrinsics: Intrinsics) -> csr_array:
     """(9 C, n): poses, and the intrinsics as they are estimated."""
+    cameras, lenses = problem.cameras, problem.lenses
     tangents = np.arange(CAMERA_DIM * cameras).reshape(cameras, CAMERA_DIM)
-    if intrinsics == "per_camera":
-        columns = tangents
-    else:
-        poses = np.arange(POSE_DIM * cameras).reshape(cameras, POSE_DIM)
-        shared = POSE_DIM * cameras + np.tile(np.arange(3), (cameras, 1))
-        columns = poses if intrinsics == "fixed" else np.hstack([poses, shared])
+    columns = tangents
+    if intrinsics != "per_camera" or lenses is not None:
+        columns = np.arange(POSE_DIM * cameras).reshape(cameras, POSE_DIM)
+    if intrinsics == "shared":
+        lenses = np.zeros(cameras, np.int64)
+    if intrinsics != "fixed" and lenses is not None:
+        lens = POSE_DIM * cameras + 3 * lenses[:, None] + np.arange(3)
+        columns = np.hstack([columns, lens])
     rows = tangents[:, : columns.shape[1]]
     shape = (tangents.size, int(columns.max()) + 1)
     return csr_array((np.ones(rows.size), (rows.ravel(), columns.ravel())), shape=shape)

@@ -17,6 +17,7 @@ from slam_graph.backend.config import GatingConfig, Settings
 from slam_graph.mapping.bal_problem import BalEstimates, BalPart, BalProblem
 
 Intrinsics = Literal["per_camera", "shared", "fixed"]
+Robust = Literal["none", "huber", "cauchy"]
 
 
 class BalCostPolicy(Settings):
@@ -25,7 +26,7 @@ class BalCostPolicy(Settings):
     intrinsics: Intrinsics = "per_camera"
     """Focal length and distortion: estimated for each camera, once for all (from their median), or
     left as they are."""
-    robust: Literal["none", "huber", "cauchy"] = "none"
+    robust: Robust = "none"
     """Loss that weighs down large reprojection errors."""
     robust_width_px: float = Field(2.45, gt=0)
     """Width of the robust loss on the length of a reprojection error (2.45: the 95 % circle of

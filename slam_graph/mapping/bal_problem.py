@@ -75,6 +75,37 @@ class BalEstimates:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BalPrior:
+    """What is known of poses and points beside the images, up to normal errors.
+
+    Attributes:
+        rotations: (C, 3, 3) camera_R_world.
+        centres: (C, 3) of the cameras in the world.
+        points: (P, 3) in the world.
+        rotation_sigma: standard deviation of the rotations about each axis, rad.
+        centre_sigma: of the centres along each axis, in the unit of length of the world.
+        point_sigmas: (P,) of the points.
+    """
+
+    rotations: FloatArray
+    centres: FloatArray
+    points: FloatArray
+    rotation_sigma: float
+    centre_sigma: float
+    point_sigmas: FloatArray
+
+    def select(self, cameras: IntArray, points: IntArray) -> BalPrior:
+        """Only some cameras and points."""
+        return replace(
+            self,
+            rotations=self.rotations[cameras],
+            centres=self.centres[cameras],
+            points=self.points[points],
+            point_sigmas=self.point_sigmas[points],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BalProblem:
     """Cameras, points and observations.
 
@@ -84,6 +115,9 @@ class BalProblem:
         point: (N,) index of its point.
         pixels: (N, 2) from the centre of the image, y up.
         name: of the problem.
+        prior: on poses and points; with one there is no gauge, the world is that of the prior.
+        lenses: (C,) numbers, from 0 on, of what has intrinsics of its own; if there are none, each
+            camera has.
     """
 
     estimates: BalEstimates
@@ -91,6 +125,8 @@ class BalProblem:
     point: IntArray
     pixels: FloatArray
     name: str = "problem"
+    prior: BalPrior | None = None
+    lenses: IntArray | None = None
 
     @property
     def cameras(self) -> int:

@@ -10,6 +10,9 @@ import numpy as np
 
 from slam_graph.mapping.bal_problem import CAMERA_DIM, BalEstimates, FloatArray, IntArray
 
+NEWTON_STEPS = 10
+"""More than enough for the weak distortion that a calibration leaves."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalLinearization:
@@ -83,6 +86,23 @@ def linearize(
         by_camera[:, row, 7] = f * q * uv[row]
         by_camera[:, row, 8] = f * q * q * uv[row]
     return BalLinearization(by_camera, by_point, (f * d * uv).T - pixels)
+
+
+def rays_of(pixels: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    """Where pixels (N, 2) are on the plane at distance 1; (N, 3) intrinsics f, k1, k2.
+
+    The radius ρ of f (1 + k1 ρ² + k2 ρ⁴) ρ is found by Newton's method, from that without
+    distortion.
+    """
+    f, k1, k2 = intrinsics.T
+    plain = np.linalg.norm(pixels, axis=1) / f
+    radius = plain.copy()
+    for _ in range(NEWTON_STEPS):
+        q = radius**2
+        miss = radius * (1.0 + q * (k1 + q * k2)) - plain
+        radius -= miss / (1.0 + q * (3.0 * k1 + q * 5.0 * k2))
+    shrunk = np.divide(radius, plain, out=np.ones_like(plain), where=plain > 0)
+    return np.asarray(pixels * (shrunk / f)[:, None])
 
 
 def _turned(estimates: BalEstimates, camera: IntArray, point: IntArray) -> FloatArray:

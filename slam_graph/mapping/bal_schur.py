@@ -24,8 +24,10 @@ from scipy.sparse import csr_array
 from slam_graph.errors import EstimationError
 from slam_graph.mapping.bal_cost import BalCost
 from slam_graph.mapping.bal_gauge import gauge_directions
+from slam_graph.mapping.bal_prior import linearized_prior
 from slam_graph.mapping.bal_problem import (
     CAMERA_DIM,
+    POSE_DIM,
     BalEstimates,
     BalPart,
     FloatArray,
@@ -156,9 +158,19 @@ def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -
     for camera, (a, b) in enumerate(zip(part.camera_starts, part.camera_starts[1:], strict=False)):
         block = rows[a:b].reshape(-1, CAMERA_DIM + 1)
         squares[camera] = block.T @ block
+    gauge = gauge_directions(estimates, part.groups)
+    if part.problem.prior is not None:
+        gauge = gauge[:, :0]  # the world is that of the prior
+        by_pose, r = linearized_prior(part.problem.prior, estimates)
+        squares[:, :POSE_DIM, :POSE_DIM] += by_pose.transpose(0, 2, 1) @ by_pose
+        squares[:, :POSE_DIM, -1] += np.einsum("cij,ci->cj", by_pose, r)
     rows = np.concatenate([by_point, linear.r[:, :, None]], axis=2)
     products = np.einsum("nai,naj->nij", by_point, rows).reshape(len(rows), -1)
     of_points = (fixed.sum_by_point @ products).reshape(-1, 3, 4)
+    if part.problem.prior is not None:
+        information = part.problem.prior.point_sigmas[:, None] ** -2.0
+        of_points[:, :, :3] += information[:, :, None] * np.eye(3)
+        of_points[:, :, 3] += information * (estimates.points - part.problem.prior.points)
     return NormalEquations(
         by_camera,
         by_point,
@@ -166,7 +178,7 @@ def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -
         squares[:, :-1, -1],
         of_points[:, :, :3],
         of_points[:, :, 3],
-        gauge_directions(estimates, part.groups),
+        gauge,
     )
 
 

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of maps: how one is saved, and how a run is located in one."""
+"""Settings of maps: how one is saved, how a run is located in one, and its bundle adjustment."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
 from slam_graph.backend.config import Settings
+from slam_graph.mapping.bal_policy import BalCostPolicy, BalPolicy, Intrinsics, Robust
 
 
 class MapConfig(Settings):
@@ -46,3 +47,34 @@ class LocalizationConfig(Settings):
     """How far roll and pitch of the run may be wrong, rad; not used if the map is not level."""
     max_position_sigma: float = Field(0.2, gt=0)
     """Beyond this uncertainty of the position on any axis the run counts as lost, m."""
+
+
+class MapCostPolicy(BalCostPolicy):
+    """Module 1: all keyframes, all features, and how a residual counts."""
+
+    intrinsics: Intrinsics = "fixed"
+    """Focal length and distortion, beyond the calibration: as calibrated, estimated for the first
+    camera of each recording, or once for all."""
+    robust: Robust = "huber"
+    """Loss that weighs down large reprojection errors."""
+
+
+class MapPriorPolicy(Settings):
+    """How far the visual-inertial estimate may be wrong that a map was made with."""
+
+    rotation_sigma: float = Field(1e-4, gt=0)
+    """Standard deviation of the orientation of a keyframe about each axis, rad."""
+    position_sigma: float = Field(2e-3, gt=0)
+    """Of its position along each axis, m."""
+    point_sigma: float = Field(0.03, gt=0)
+    """Of the position of a feature along each axis, relative to the distance from which the nearest
+    keyframe sees it."""
+
+
+class MapBalPolicy(BalPolicy):
+    """Bundle adjustment of a map as a row of the table."""
+
+    cost: MapCostPolicy = MapCostPolicy()
+    """Cost construction."""
+    prior: MapPriorPolicy = MapPriorPolicy()
+    """What the visual-inertial estimate says."""

@@ -32,7 +32,7 @@ Descriptors = NDArray[np.uint8]
 NO_FEATURE = -1
 """Feature of an observation whose place is not known."""
 
-PoseSource = Literal["loop_closed", "smoothed", "causal"]
+PoseSource = Literal["adjusted", "loop_closed", "smoothed", "causal"]
 """Which estimate the poses of a recording come from."""
 
 
