@@ -32,7 +32,7 @@ from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
 MAX_FAILURES = 3
-"""A feature with so many observations that do not fit after the steps is on what moves."""
+"""A feature that in so many frames on end does not fit after the steps is on what moves."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -193,7 +193,7 @@ class CostConstruction:
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
         fits = cost.squared_errors(obs, cost.fresh.points) < limit
         self.rejected = np.union1d(self.rejected, obs.ids[obs.feature[~fits]])
-        self._count_failures(window, obs.ids[obs.feature[~fits]])
+        self._count_failures(window, obs, fits)
         window.tracks.forget(obs.rows(~fits))
         rejected = int(np.sum(~fits))
         self.diagnostics.counts["observation_rejected_by_gate"] += rejected
@@ -203,12 +203,15 @@ class CostConstruction:
         )
         cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
 
-    def _count_failures(self, window: Window, ids: IntArray) -> None:
-        """Note features (N,) whose observations failed; each time that one did it is in `ids`."""
+    def _count_failures(self, window: Window, obs: Observations, fits: BoolArray) -> None:
+        """Note in how many frames on end each feature has failed; `fits` (N,) is of `obs`."""
+        latest = np.array(obs.frames)[obs.frame] == window.frame
+        failed = np.unique(obs.ids[obs.feature[latest & ~fits]]).tolist()
+        fitted = set(obs.ids[obs.feature[latest & fits]].tolist())
         seen = set(window.tracks.seen.tolist())
-        self._failures = {j: n for j, n in self._failures.items() if j in seen}
-        for j in ids.tolist():
-            self._failures[j] = self._failures.get(j, 0) + 1
+        before = self._failures
+        self._failures = {j: n for j, n in before.items() if j in seen and j not in fitted}
+        self._failures |= {j: before.get(j, 0) + 1 for j in failed}
 
     @property
     def _unfit(self) -> IntArray:
