@@ -64,7 +64,7 @@ class MapPriorPolicy(Settings):
 
     rotation_sigma: float = Field(1e-4, gt=0)
     """Standard deviation of the orientation of a keyframe about each axis, rad."""
-    position_sigma: float = Field(2e-3, gt=0)
+    position_sigma: float = Field(1e-3, gt=0)
     """Of its position along each axis, m."""
     point_sigma: float = Field(0.03, gt=0)
     """Of the position of a feature along each axis, relative to the distance from which the nearest
