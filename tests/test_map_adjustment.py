@@ -48,13 +48,15 @@ def true() -> SlamMap:
     return World().map(VIEWS)
 
 
-def perturbed(true: SlamMap, seed: int = 0, factor: float = 1.0) -> SlamMap:
+def perturbed(
+    true: SlamMap, seed: int = 0, factor: float = 1.0, prior: MapPriorPolicy = PRIOR
+) -> SlamMap:
     """The map as far off as its prior says."""
     rng = np.random.default_rng(seed)
-    turns = factor * PRIOR.rotation_sigma * rng.standard_normal((len(true), 3))
-    ways = factor * PRIOR.position_sigma * rng.standard_normal((len(true), 3))
+    turns = factor * prior.rotation_sigma * rng.standard_normal((len(true), 3))
+    ways = factor * prior.position_sigma * rng.standard_normal((len(true), 3))
     distance = np.linalg.norm(true.points - true.poses.translations.mean(axis=0), axis=1)
-    off = factor * PRIOR.point_sigma * distance[:, None] * rng.standard_normal(true.points.shape)
+    off = factor * prior.point_sigma * distance[:, None] * rng.standard_normal(true.points.shape)
     rotations = Rotation.from_rotvec(turns).as_matrix() @ true.poses.rotations
     poses = Poses(rotations, true.poses.translations + ways)
     return replace(true, poses=poses, points=true.points + off)
@@ -112,6 +114,16 @@ def test_perturbed_maps_go_back_to_the_truth(true: SlamMap) -> None:
         before.append(off(start, true))
         after.append(off(done.after, true))
     assert np.linalg.norm(after, axis=0)[0] < 0.75 * np.linalg.norm(before, axis=0)[0]
+    assert np.linalg.norm(after, axis=0)[1] < 0.2 * np.linalg.norm(before, axis=0)[1]
+
+
+def test_maps_as_far_off_as_the_default_prior_come_nearer(true: SlamMap) -> None:
+    before, after = [], []
+    for seed in range(5):
+        start = perturbed(true, seed, prior=MapPriorPolicy())
+        before.append(off(start, true))
+        after.append(off(adjust_map(start).after, true))
+    assert np.all(np.array(after)[:, 0] < np.array(before)[:, 0])
     assert np.linalg.norm(after, axis=0)[1] < 0.2 * np.linalg.norm(before, axis=0)[1]
 
 

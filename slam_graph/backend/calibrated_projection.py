@@ -27,6 +27,7 @@ from slam_graph.backend.reprojection import MIN_DEPTH, Geometry, RigProjection
 from slam_graph.backend.square_root import Layout
 from slam_graph.backend.state import State, dims_of, stacked_poses
 from slam_graph.backend.tracks import Observations
+from slam_graph.geometry.skew import skew
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class _Shift:
         back = self.turn.transpose(0, 2, 1)
         derivative = np.zeros((len(back), 6, 6))
         derivative[:, :3, :3] = derivative[:, 3:, 3:] = back
-        derivative[:, 3:, :3] = -back @ _skew(self.move)
+        derivative[:, 3:, :3] = -back @ skew(self.move)
         return derivative
 
 
@@ -150,8 +151,3 @@ def _by_camera_pose(by_camera_point: FloatArray, in_camera: FloatArray) -> Float
     # turning the camera by θ moves the point by p × θ in the camera frame
     by_rotation = np.cross(by_camera_point, in_camera[:, None, :])
     return np.concatenate([by_rotation, -by_camera_point], axis=2)
-
-
-def _skew(v: FloatArray) -> FloatArray:
-    """Matrices (F, 3, 3) of the cross products with vectors (F, 3)."""
-    return np.cross(v[:, None, :], -np.eye(3))

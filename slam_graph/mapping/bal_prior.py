@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam_graph.geometry.skew import skew
 from slam_graph.mapping.bal_problem import POSE_DIM, BalEstimates, BalPrior, FloatArray
 
 
@@ -43,14 +44,9 @@ def linearized_prior(prior: BalPrior, estimates: BalEstimates) -> tuple[FloatArr
     and c changes by -Rᵀ ([t]ₓ δθ + δt).
     """
     r = camera_residuals(prior, estimates)
-    turn, back = _cross(prior.rotation_sigma * r[:, :3]), -estimates.rotations.transpose(0, 2, 1)
+    turn, back = skew(prior.rotation_sigma * r[:, :3]), -estimates.rotations.transpose(0, 2, 1)
     by_pose = np.zeros((len(r), POSE_DIM, POSE_DIM))
     by_pose[:, :3, :3] = (np.eye(3) - turn / 2 + turn @ turn / 12) / prior.rotation_sigma
-    by_pose[:, 3:, :3] = back @ _cross(estimates.translations) / prior.centre_sigma
+    by_pose[:, 3:, :3] = back @ skew(estimates.translations) / prior.centre_sigma
     by_pose[:, 3:, 3:] = back / prior.centre_sigma
     return by_pose, r
-
-
-def _cross(vectors: FloatArray) -> FloatArray:
-    """(C, 3, 3) [v]ₓ of vectors (C, 3): its columns are v × e."""
-    return np.cross(vectors[:, None, :], np.eye(3)).transpose(0, 2, 1)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from slam_graph.mapping.loop_config import LoopClosureConfig
@@ -50,14 +51,12 @@ def drift_sigmas(
     seconds = np.abs(stamps_ns[second] - stamps_ns[first]) * 1e-9
     expected = poses.select(first).inverse().compose(poses.select(second))
     shift = measured.translations - expected.translations
-    world_R_second = poses.rotations[second]
     turn = measured.rotations.transpose(0, 2, 1) @ expected.rotations
-    vee = 0.5 * (turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]])
-    yaw = np.einsum("ni,ni->n", world_R_second[:, 2], vee)
+    # of the turn, in the frame of the second body, the part about the vertical
+    up = poses.rotations[second][:, 2]
+    yaw = np.sum(up * Rotation.from_matrix(turn).as_rotvec(), axis=1)
     covariances = np.array([x.covariance for x in loops])
-    of_yaw = np.einsum(
-        "ni,nij,nj->n", world_R_second[:, 2], covariances[:, :3, :3], world_R_second[:, 2]
-    )
+    of_yaw = np.einsum("ni,nij,nj->n", up, covariances[:, :3, :3], up)
     of_shift = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     return (
         _sigma(yaw**2, of_yaw, seconds, 1, said[0]),

@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.geometry.skew import skew
 from slam_graph.mapping.loop_config import VerificationConfig
 from slam_graph.mapping.loop_keyframes import Descriptors, Keyframe
 from slam_graph.sensors.rig import RigCamera
@@ -137,7 +138,7 @@ class LoopVerifier:
         by_camera = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(
             2, 0, 1
         )
-        turn = np.cross(body[:, None, :], np.eye(3)).transpose(0, 2, 1)
+        turn = skew(body)
         by_pose = np.concatenate([turn, np.tile(-np.eye(3), (len(points), 1, 1))], axis=2)
         J = (by_camera @ camera_R_body @ by_pose).reshape(-1, 6)
         sigma = self._config.sigma_px / self._focal_px

@@ -116,8 +116,6 @@ def read_map(path: Path) -> SlamMap:
             arrays = _read_arrays(archive, members, path)
     except OSError as error:
         raise DataError(f"{path}: map cannot be read ({error.strerror or error})") from None
-    except NotImplementedError:
-        raise DataError(f"{path}: not a slam_graph map") from None
     except BROKEN as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(
