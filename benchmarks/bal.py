@@ -15,11 +15,10 @@ import numpy as np
 from benchmarks.bal_problems import ring
 from benchmarks.metric import Metric, info
 from benchmarks.suite import Benchmark, Outcome
+from slam_graph.bundle_adjustment.bal_file import read_bal
+from slam_graph.bundle_adjustment.bal_problem import BalProblem, usable
+from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.mapping.bal_adjustment import adjust_bundle
-from slam_graph.mapping.bal_checks import usable
-from slam_graph.mapping.bal_file import read_bal
-from slam_graph.mapping.bal_problem import BalProblem
 
 CAMERAS, POINTS = 100, 20_000
 REPETITIONS = 3

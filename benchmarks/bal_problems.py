@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.mapping.bal_cost import moved
-from slam_graph.mapping.bal_problem import CAMERA_DIM, BalEstimates, BalProblem, BoolArray
-from slam_graph.mapping.bal_projection import project
+from slam_graph.arrays import BoolArray
+from slam_graph.bundle_adjustment.bal_cost import moved
+from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem, project
 
 HALF_IMAGE_PX = (640.0, 480.0)
 RING_RADIUS = 10.0

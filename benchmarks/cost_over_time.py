@@ -24,8 +24,8 @@ from benchmarks.experiments import compared, configs_of, folder_of, note_failure
 from benchmarks.metric import TIMING_TOLERANCE, Metric, info
 from benchmarks.suite import GROWING, PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
 from slam_graph.experiment.comparison import Comparison
-from slam_graph.experiment.figures import draw
-from slam_graph.experiment.results import Series, read_series
+from slam_graph.experiment.comparison_figures import draw
+from slam_graph.experiment.comparison_results import Series, read_series
 from slam_graph.experiment.sources import find_sources
 
 DURATION_S = 60.0

@@ -17,8 +17,8 @@ import slam_graph
 from benchmarks.suite import Outcome
 from slam_graph.config import RunConfig, load_config
 from slam_graph.experiment.comparison import Comparison, compare, load_configs
+from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
-from slam_graph.experiment.results import Table, read_result
 from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Task
 

@@ -16,8 +16,8 @@ from benchmarks.real_imu import CAMERA, CAMERAS, FLIGHTS
 from benchmarks.running import Errors, Run
 from benchmarks.suite import Benchmark, Outcome
 from benchmarks.wheel import TRUTH
+from slam_graph.datasets.dataset_registry import DEMO
 from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.datasets.registry import DEMO
 from slam_graph.experiment.sources import find_sources
 
 ALGORITHM = "msckf"

@@ -16,11 +16,11 @@ from benchmarks.suite import Benchmark, Outcome
 from slam_graph.config import load_config
 from slam_graph.evaluation.ape import ape
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping.loop_closure import LoopClosures
-from slam_graph.mapping.place_recognition import PlaceDatabase, Vocabulary
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
-from slam_graph.simulation.config import LandmarkConfig, SimulationConfig, TrackConfig
+from slam_graph.loop_closure.close_loops import LoopClosures
+from slam_graph.loop_closure.place_recognition import PlaceDatabase, Vocabulary
+from slam_graph.pipeline.run import run
+from slam_graph.results.run_result import RunResult
+from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 
 LONG_S, LONG_SEED = 1200.0, 1

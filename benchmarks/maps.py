@@ -12,23 +12,23 @@ import numpy as np
 
 from benchmarks.metric import Metric, info
 from benchmarks.suite import Benchmark, Outcome
+from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
-from slam_graph.mapping.bal_cost import reprojection_errors
-from slam_graph.mapping.map_adjustment import adjust_map
-from slam_graph.mapping.map_merge import merge_maps
-from slam_graph.mapping.map_model import SlamMap
-from slam_graph.output.localization import errors_in_map, map_alignment
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
-from slam_graph.simulation.config import (
+from slam_graph.maps.map_adjustment import adjust_map
+from slam_graph.maps.map_merge import merge_maps
+from slam_graph.maps.map_model import SlamMap
+from slam_graph.pipeline.run import run
+from slam_graph.results.localization_result import errors_in_map, map_alignment
+from slam_graph.results.run_result import RunResult
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import (
     ImageConfig,
     LandmarkConfig,
     SimulationConfig,
     TrackConfig,
 )
-from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
 
 SEEDS, HALF_S, RATE_HZ = 5, 60.0, 10.0

@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.metric import Metric
 from benchmarks.running import Run
 from benchmarks.suite import Benchmark, Outcome
-from slam_graph.simulation.config import SimulationConfig
+from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.writers import write
 

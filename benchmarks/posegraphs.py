@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from benchmarks.metric import Metric, info
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.evaluation.ape import ape
-from slam_graph.mapping.native_pose_graph import (
+from slam_graph.pose_graph.certificate import certify
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_cost import chi2_table
+from slam_graph.pose_graph.graph_files import read_pose_graph
+from slam_graph.pose_graph.gtsam_graph import (
     anchor_factors,
     edge_chi2,
     edge_factors,
     factor_graph,
     values_of,
 )
-from slam_graph.mapping.pose_graph import PoseGraph, Poses
-from slam_graph.mapping.pose_graph_certificate import certify
-from slam_graph.mapping.pose_graph_cost import chi2_table
-from slam_graph.mapping.pose_graph_file import read_pose_graph
-from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
-from slam_graph.mapping.pose_graph_policy import (
+from slam_graph.pose_graph.optimize import optimize_pose_graph
+from slam_graph.pose_graph.pose_graph_policy import (
     PoseGraphCostPolicy,
     PoseGraphPolicy,
     PoseGraphStepsPolicy,

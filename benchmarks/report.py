@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.baseline import Baseline
 from benchmarks.metric import Metric
 from benchmarks.suite import Outcome
-from slam_graph.output.metrics import versions
+from slam_graph.results.metrics import versions
 
 SCHEMA_VERSION = 1
 

@@ -13,15 +13,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slam_graph.config import load_config
-from slam_graph.datasets.base import Sequence
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import select
 from slam_graph.evaluation.choices import PoseRelation
-from slam_graph.geometry.alignment import AlignmentMode
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.pipeline import run
+from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.visualization.viewer import NullViewer
 

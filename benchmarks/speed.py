@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.metric import TIMING_TOLERANCE, Metric, info
 from benchmarks.suite import ALGORITHMS, Benchmark, Outcome
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import EstimationError
 
 RECORDING = "euroc/MH_01_easy_17s"
@@ -40,8 +40,6 @@ ATTEMPTS = 3
 
 ENOUGH_SHARE = 0.95
 """Part of the time that a run must have had its core to count as undisturbed."""
-
-FloatArray = NDArray[np.float64]
 
 
 def measure(data: Path) -> Outcome:

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slam_graph.config import RunConfig, load_config
-from slam_graph.datasets.euroc import EurocSequence
-from slam_graph.datasets.packets import FrameStream
-from slam_graph.datasets.registry import open_dataset
-from slam_graph.pipeline import NullProgress, run
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.formats.euroc import EurocSequence
+from slam_graph.datasets.sequence import FrameStream
+from slam_graph.pipeline.run import NullProgress, run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.visualization.viewer import NullViewer
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.metric import Metric
 from benchmarks.running import Run
 from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
-from slam_graph.datasets.registry import DEMO
+from slam_graph.datasets.dataset_registry import DEMO
 
 TRUTH = "euroc_inertial/V1_01_easy"
 

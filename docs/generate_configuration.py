@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig, load_config
-from slam_graph.mapping.bal_policy import BalPolicy
-from slam_graph.mapping.map_config import MapBalPolicy
-from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
+from slam_graph.maps.map_config import MapBalPolicy
+from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
 

@@ -14,28 +14,28 @@ from typing import TYPE_CHECKING, Any
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
-    from slam_graph.backend.build import build_estimator
+    from slam_graph.backend.build_estimator import build_estimator
     from slam_graph.backend.estimator import Estimator
+    from slam_graph.bundle_adjustment.bal_file import read_bal
+    from slam_graph.bundle_adjustment.bal_policy import BalPolicy
+    from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
     from slam_graph.config import RunConfig, load_config
+    from slam_graph.datasets.dataset_registry import open_dataset
     from slam_graph.datasets.groundtruth import read_groundtruth
-    from slam_graph.datasets.registry import open_dataset
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
-    from slam_graph.mapping.bal_adjustment import adjust_bundle
-    from slam_graph.mapping.bal_file import read_bal
-    from slam_graph.mapping.bal_policy import BalPolicy
-    from slam_graph.mapping.map_adjustment import adjust_map
-    from slam_graph.mapping.map_config import MapBalPolicy
-    from slam_graph.mapping.map_merge import merge_maps
-    from slam_graph.mapping.map_model import SlamMap
-    from slam_graph.mapping.pose_graph_certificate import certify
-    from slam_graph.mapping.pose_graph_file import read_pose_graph
-    from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
-    from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
-    from slam_graph.output.map_output import load_map, save_map
-    from slam_graph.pipeline import RunResult, run
+    from slam_graph.maps.map_adjustment import adjust_map
+    from slam_graph.maps.map_config import MapBalPolicy
+    from slam_graph.maps.map_merge import merge_maps
+    from slam_graph.maps.map_model import SlamMap
+    from slam_graph.pipeline.run import RunResult, run
+    from slam_graph.pose_graph.certificate import certify
+    from slam_graph.pose_graph.graph_files import read_pose_graph
+    from slam_graph.pose_graph.optimize import optimize_pose_graph
+    from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
+    from slam_graph.results.map_output import load_map, save_map
 
 __all__ = [
     "BalPolicy",
@@ -68,32 +68,32 @@ __all__ = [
 ]
 
 _HOME = {
-    "BalPolicy": "slam_graph.mapping.bal_policy",
+    "BalPolicy": "slam_graph.bundle_adjustment.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
-    "MapBalPolicy": "slam_graph.mapping.map_config",
+    "MapBalPolicy": "slam_graph.maps.map_config",
     "NavState": "slam_graph.geometry.trajectory",
-    "PoseGraphPolicy": "slam_graph.mapping.pose_graph_policy",
+    "PoseGraphPolicy": "slam_graph.pose_graph.pose_graph_policy",
     "RunConfig": "slam_graph.config",
-    "RunResult": "slam_graph.pipeline",
+    "RunResult": "slam_graph.pipeline.run",
     "SlamGraphError": "slam_graph.errors",
-    "SlamMap": "slam_graph.mapping.map_model",
+    "SlamMap": "slam_graph.maps.map_model",
     "Trajectory": "slam_graph.geometry.trajectory",
-    "adjust_bundle": "slam_graph.mapping.bal_adjustment",
-    "adjust_map": "slam_graph.mapping.map_adjustment",
+    "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
+    "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
-    "build_estimator": "slam_graph.backend.build",
-    "certify": "slam_graph.mapping.pose_graph_certificate",
+    "build_estimator": "slam_graph.backend.build_estimator",
+    "certify": "slam_graph.pose_graph.certificate",
     "load_config": "slam_graph.config",
-    "load_map": "slam_graph.output.map_output",
-    "merge_maps": "slam_graph.mapping.map_merge",
-    "open_dataset": "slam_graph.datasets.registry",
-    "optimize_pose_graph": "slam_graph.mapping.pose_graph_optimization",
-    "read_bal": "slam_graph.mapping.bal_file",
+    "load_map": "slam_graph.results.map_output",
+    "merge_maps": "slam_graph.maps.map_merge",
+    "open_dataset": "slam_graph.datasets.dataset_registry",
+    "optimize_pose_graph": "slam_graph.pose_graph.optimize",
+    "read_bal": "slam_graph.bundle_adjustment.bal_file",
     "read_groundtruth": "slam_graph.datasets.groundtruth",
-    "read_pose_graph": "slam_graph.mapping.pose_graph_file",
+    "read_pose_graph": "slam_graph.pose_graph.graph_files",
     "rpe": "slam_graph.evaluation.rpe",
-    "run": "slam_graph.pipeline",
-    "save_map": "slam_graph.output.map_output",
+    "run": "slam_graph.pipeline.run",
+    "save_map": "slam_graph.results.map_output",
 }
 
 

@@ -14,14 +14,15 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field
 
-from slam_graph.backend.config import BackendConfig, Settings
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.config_tree import ConfigTree, closest, override, read_tree, validate
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.config import FrontendConfig
-from slam_graph.mapping.final_ba_config import FinalBaConfig
-from slam_graph.mapping.loop_config import LoopClosureConfig
-from slam_graph.mapping.map_config import LocalizationConfig, MapConfig
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.loop_closure.loop_config import LoopClosureConfig
+from slam_graph.maps.map_config import LocalizationConfig, MapConfig
+from slam_graph.settings.base import Settings
+from slam_graph.settings.tree import ConfigTree, closest, override, read_tree, validate
+from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 DEFAULT_ALGORITHM = "msckf"
 

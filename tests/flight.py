@@ -10,17 +10,15 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.reprojection import Geometry
-from slam_graph.backend.tracks import Observations, TrackWindow
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow
+from slam_graph.backend.cost.reprojection import Geometry
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-FloatArray = NDArray[np.float64]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 NS_PER_S = 1_000_000_000

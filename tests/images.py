@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from slam_graph.frontend.base import Frontend
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_protocol import Frontend
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera

@@ -8,16 +8,16 @@ import gtsam
 import numpy as np
 
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping.loop_config import KeyframeConfig, LoopClosureConfig, PlaceConfig
-from slam_graph.mapping.loop_keyframes import Keyframe, KeyframeLog
+from slam_graph.loop_closure.loop_config import KeyframeConfig, LoopClosureConfig, PlaceConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import (
+from slam_graph.simulation.simulated_sequence import SimulatedTracks
+from slam_graph.simulation.simulation_config import (
     FlightConfig,
     LandmarkConfig,
     SimulationConfig,
     TrackConfig,
 )
-from slam_graph.simulation.sequence import SimulatedTracks
 from slam_graph.simulation.simulator import simulate
 
 YAW_DRIFT, POSITION_DRIFT = 5e-3, 0.01

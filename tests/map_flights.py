@@ -5,15 +5,15 @@
 import gtsam
 import numpy as np
 
-from slam_graph.mapping.loop_config import PlaceConfig, VerificationConfig
-from slam_graph.mapping.loop_keyframes import Keyframe
-from slam_graph.mapping.loop_pose_graph import stacked
-from slam_graph.mapping.map_building import build_map
-from slam_graph.mapping.map_model import MapRecording, SlamMap
+from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_pose_graph import stacked
+from slam_graph.maps.map_building import build_map
+from slam_graph.maps.map_model import MapRecording, SlamMap
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.rigs import euroc_rig
-from slam_graph.simulation.sequence import SimulatedSequence
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 
 PLACES = PlaceConfig(words=50, training_iterations=2)

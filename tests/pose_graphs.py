@@ -5,7 +5,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.mapping.pose_graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 
 def turns(vectors: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from slam_graph.datasets.recorded import RecordedSequence
-from slam_graph.datasets.ros_messages import TRANSFORMS
+from slam_graph.datasets.rosbag.messages import TRANSFORMS
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.sensors.measurements import CameraFrame
 
 LAG_NS = 7_000_000

@@ -5,12 +5,12 @@
 import numpy as np
 import pytest
 
-from slam_graph.backend.adaptive_noise import DensityScale
-from slam_graph.backend.config import AdaptiveNoiseConfig
+from slam_graph.backend.backend_config import AdaptiveNoiseConfig
+from slam_graph.backend.cost.adaptive_noise import DensityScale
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
-from slam_graph.pipeline import run
-from slam_graph.simulation.config import SimulationConfig
+from slam_graph.pipeline.run import run
+from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 
 DT_S = 0.05

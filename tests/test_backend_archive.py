@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.backend.archive import FeatureArchive
-from slam_graph.backend.marginalization import LinearizationPoints, marginalize
-from slam_graph.backend.square_root import SquareRootInformation
-from slam_graph.backend.state import State, dims_of, imu_state_keys
+from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.geometry.trajectory import NavState
 
 FEATURES = 6

@@ -5,21 +5,20 @@
 import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-from slam_graph.backend.config import GatingConfig
-from slam_graph.backend.feature_factors import (
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import GatingConfig
+from slam_graph.backend.cost.feature_factors import (
     ReducedFeatures,
     WhitenedObservations,
     reduce_features,
     robust_weights,
     whiten,
 )
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.tracks import Observations
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 
-FloatArray = NDArray[np.float64]
 FRAMES = 8
 SIGMA_PX = 1.5
 Case = tuple[Observations, WhitenedObservations, ReducedFeatures]

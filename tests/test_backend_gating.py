@@ -9,21 +9,20 @@ import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
 from gtsam.symbol_shorthand import L, X
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
-from slam_graph.backend.config import BackendConfig, GatingConfig, NoiseConfig
-from slam_graph.backend.cost import Cost, Linearization, NewFeatures
-from slam_graph.backend.gating import Innovations, squared_mahalanobis, threshold
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import State, dims_of
-from slam_graph.backend.tracks import Observations
-from slam_graph.backend.triangulation import triangulate
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, GatingConfig, NoiseConfig
+from slam_graph.backend.cost.cost import Cost, Linearization, NewFeatures
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.geometry.trajectory import NavState
 
-FloatArray = NDArray[np.float64]
 FRAMES = 5
 SIGMA_PX = 0.8
 CONFIG = BackendConfig(

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from flight import GRAVITY, Flight
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
-from slam_graph.backend.imu import (
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.imu_factor import (
     ImuBuffer,
     imu_factor,
     predict,
@@ -24,7 +24,6 @@ from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
 
-FloatArray = NDArray[np.float64]
 NOISE = ImuNoise(1e-3, 2e-4, 2e-2, 5e-3, 200.0)
 PARAMS = preintegration_params(NOISE, 9.81)
 NO_BIAS = gtsam.imuBias.ConstantBias()

@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 from flight import Flight, rig
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import BackendConfig
-from slam_graph.backend.cost import Cost
-from slam_graph.backend.gauss_newton import minimize
-from slam_graph.backend.marginalization import LinearizationPoints, marginalize
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.cost import Cost
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
 from slam_graph.backend.policies import GaussNewtonPolicy
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import State, dims_of
+from slam_graph.backend.solve.gauss_newton import minimize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of
 
-FloatArray = NDArray[np.float64]
 ONE_STEP = GaussNewtonPolicy(max_steps=1)
 SIZE = 9  # velocity and bias: variables whose retraction is a sum
 

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
 from gtsam.symbol_shorthand import L, X
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.tracks import Observations
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 
-FloatArray = NDArray[np.float64]
 PLAIN = replace(RADTAN, distortion="none", coefficients=())
 CAMERAS = {"radtan": RADTAN, "equidistant": FISHEYE, "none": PLAIN}
 STEP = 1e-6

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
 
-from slam_graph.backend.config import GatingConfig
-from slam_graph.backend.feature_factors import reduce_features, whiten
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.schur import condense_features, information_root
+from slam_graph.backend.backend_config import GatingConfig
+from slam_graph.backend.cost.feature_factors import reduce_features, whiten
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.schur import condense_features, information_root
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

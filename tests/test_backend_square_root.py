@@ -4,11 +4,10 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 
-FloatArray = NDArray[np.float64]
 DIMS = {10: 3, 11: 6, 12: 1, 13: 3, 14: 2}
 SIZE = sum(DIMS.values())
 SEEDS = range(5)

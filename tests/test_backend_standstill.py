@@ -10,20 +10,18 @@ import numpy as np
 import pytest
 from flight import AT_REST, packets, rig, room
 from gtsam.symbol_shorthand import V, X
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import BackendConfig, ZeroVelocityConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
+from slam_graph.backend.cost.imu_factor import ImuBuffer
+from slam_graph.backend.cost.zero_velocity import StandstillDetector, zero_velocity_factors
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.imu import ImuBuffer
-from slam_graph.backend.zero_velocity import StandstillDetector, zero_velocity_factors
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
-from slam_graph.geometry.history import StateHistory
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.pipeline import run
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
-FloatArray = NDArray[np.float64]
 Motion = Callable[[float], FloatArray]
 CONFIG = ZeroVelocityConfig()
 FRAME_S = 0.05

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
 from gtsam.symbol_shorthand import B, L, V, X
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import BackendConfig
-from slam_graph.backend.cost import Cost, NewFeatures
-from slam_graph.backend.marginalization import marginalize
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.state import State, dim, dims_of, imu_state_keys
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.marginalization.marginalize import marginalize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import State, dim, dims_of, imu_state_keys
 from slam_graph.geometry.trajectory import NavState
 
-FloatArray = NDArray[np.float64]
 KEYS = [L(5), X(0), X(1), V(1), B(1)]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import TrackWindow
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))

@@ -5,16 +5,15 @@
 import numpy as np
 import pytest
 from flight import FISHEYE, FORWARD, RADTAN, Flight, rig, room, scene
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import TriangulationConfig
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.tracks import Observations
-from slam_graph.backend.triangulation import Triangulation, triangulate
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import TriangulationConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 
-FloatArray = NDArray[np.float64]
 CONFIG = TriangulationConfig()
 
 

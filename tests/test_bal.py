@@ -7,21 +7,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from slam_graph.mapping import bal_schur
 
 from benchmarks.bal import SMALL, by_gtsam
 from benchmarks.bal_problems import ring
+from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, moved, reprojection_errors
+from slam_graph.bundle_adjustment.bal_file import read_bal
+from slam_graph.bundle_adjustment.bal_policy import (
+    BalCostPolicy,
+    BalPolicy,
+    BalStepsPolicy,
+    Intrinsics,
+)
+from slam_graph.bundle_adjustment.bal_problem import (
+    BalEstimates,
+    BalProblem,
+    linearize,
+    project,
+    usable,
+)
+from slam_graph.bundle_adjustment.bal_schur import (
+    damped_step,
+    gauge_directions,
+    normal_equations,
+    structure,
+)
+from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.mapping import bal_schur
-from slam_graph.mapping.bal_adjustment import adjust_bundle
-from slam_graph.mapping.bal_checks import usable
-from slam_graph.mapping.bal_cost import BalCost, construct, moved, reprojection_errors
-from slam_graph.mapping.bal_file import read_bal
-from slam_graph.mapping.bal_gauge import gauge_directions
-from slam_graph.mapping.bal_policy import BalCostPolicy, BalPolicy, BalStepsPolicy, Intrinsics
-from slam_graph.mapping.bal_problem import BalEstimates, BalProblem
-from slam_graph.mapping.bal_projection import linearize, project
-from slam_graph.mapping.bal_schur import damped_step, normal_equations, structure
 
 TIGHT = BalStepsPolicy(tolerance=1e-12)
 

@@ -13,9 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.bal_problems import ring
+from slam_graph.bundle_adjustment.bal_file import bal_lines, is_bal, read_bal
 from slam_graph.cli.main import app
 from slam_graph.errors import DataError, SlamGraphError
-from slam_graph.mapping.bal_file import bal_lines, is_bal, read_bal
 
 FILES = {
     "optimized.txt",

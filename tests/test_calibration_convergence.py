@@ -11,19 +11,19 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from slam_graph.backend.config import BackendConfig, CalibrationConfig, InitializationConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, InitializationConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline import run
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
-from slam_graph.sensors.kalibr import read_kalibr, write_kalibr
+from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import (
     FeatureFrame,
     FeatureObservations,
@@ -31,11 +31,10 @@ from slam_graph.sensors.measurements import (
     Packet,
 )
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import FlightConfig, SimulationConfig
+from slam_graph.simulation.simulation_config import FlightConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.writers import write
 
-FloatArray = NDArray[np.float64]
 KINDS = ("extrinsics", "time_offset", "intrinsics")
 SIGMAS = np.array([2e-3, 1e-3, 0.02, 0.02, 2e-3])
 POINTS = 150

@@ -10,29 +10,28 @@ import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, packets, rig, room, scene
 from gtsam.symbol_shorthand import E, L, X
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 from test_calibration_convergence import wrong
 from test_estimator_first_estimates import CONFIG, WEAK, claimed_information
 
-from slam_graph.backend.calibrated_projection import CalibratedProjection
-from slam_graph.backend.calibration import CalibrationVariables
-from slam_graph.backend.config import BackendConfig, CalibrationConfig
-from slam_graph.backend.cost import Cost, NewFeatures
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
+from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
+from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.gauss_newton import minimize
+from slam_graph.backend.marginalization.observability import relinearized, unseen_directions
+from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import GaussNewtonPolicy
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.square_root import Layout, SquareRootInformation
-from slam_graph.backend.state import FrameMotion, State, dims_of
-from slam_graph.backend.tracks import Observations
-from slam_graph.backend.unseen import relinearized, unseen_directions
+from slam_graph.backend.solve.gauss_newton import minimize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 from slam_graph.config import load_config
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame
 
-FloatArray = NDArray[np.float64]
 PLAIN = replace(RADTAN, distortion="none", coefficients=())
 ALL = CalibrationConfig(extrinsics=True, time_offset=True, intrinsics=True, distortion=True)
 OFF = CalibrationConfig()

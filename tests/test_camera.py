@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam_graph.backend.native_factors import calibration
+from slam_graph.backend.gtsam_smoothers.smoother_factors import calibration
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.tracker import ImageFrontend
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.image_frontend import ImageFrontend
 from slam_graph.sensors.camera import WIDE as WIDE_MODELS
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from slam_graph.cli.main import app
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.errors import SlamGraphError
-from slam_graph.mapping.pose_graph_file import g2o_lines, read_pose_graph
+from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "optimize"]
 

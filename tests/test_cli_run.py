@@ -13,7 +13,7 @@ import pytest
 
 from slam_graph import pipeline
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 

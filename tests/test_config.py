@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from slam_graph.config import RunConfig, algorithm_names, config_folder, dump_yaml, load_config
-from slam_graph.config_tree import override, read_tree
 from slam_graph.errors import ConfigError
+from slam_graph.settings.tree import override, read_tree
 
 
 def write(tmp_path: Path, text: str) -> Path:

@@ -17,9 +17,9 @@ from recordings_public import (
 )
 from recordings_ros import write_bag
 
-from slam_graph.datasets.base import Sequence
-from slam_graph.datasets.recording import TrackRecorder
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.formats.track_recording import TrackRecorder
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 
 SECOND_NS = 1_000_000_000

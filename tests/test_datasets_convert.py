@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets.convert import convert_to_euroc
-from slam_graph.datasets.recorded import RecordedSequence
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
-from slam_graph.pipeline import run
-from slam_graph.sensors.kalibr import read_kalibr, write_kalibr
+from slam_graph.pipeline.run import run
+from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig
 

@@ -18,10 +18,10 @@ from recordings import (
     write_imu,
 )
 
-from slam_graph.datasets.euroc import EurocSequence
-from slam_graph.datasets.pairing import ABSENT, group_by_time
+from slam_graph.datasets.formats.euroc import EurocSequence
+from slam_graph.datasets.streams.pairing import ABSENT, group_by_time
 from slam_graph.errors import DataError
-from slam_graph.sensors.kalibr import write_kalibr
+from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import CameraFrame
 
 

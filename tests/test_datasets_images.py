@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from recordings import FRAME_PERIOD_NS, START_NS, write_euroc
 
-from slam_graph.datasets.euroc import EurocSequence
-from slam_graph.datasets.images import find_damage, prefetch
+from slam_graph.datasets.formats.euroc import EurocSequence
+from slam_graph.datasets.streams.images import find_damage, prefetch
 from slam_graph.sensors.measurements import CameraFrame
 
 

@@ -22,14 +22,14 @@ from recordings_loose import (
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
-from slam_graph.datasets.checks import check_sequence
-from slam_graph.datasets.recorded import RecordedSequence
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.data_checks import check_sequence
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.frontend.config import FrontendConfig
-from slam_graph.frontend.registry import build_frontend
-from slam_graph.pipeline import run
+from slam_graph.frontend.build_frontend import build_frontend
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.measurements import CameraFrame
 
 WITHOUT_IMU = CHAIN.replace(CHAIN.splitlines()[1] + "\n", "")

@@ -18,9 +18,9 @@ from recordings import (
     write_openvins,
 )
 
-from slam_graph.datasets.checks import check_sequence
+from slam_graph.datasets.data_checks import check_sequence
+from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
 from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.datasets.registry import DATASETS, open_dataset
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from recordings import edit_line, edit_text, write_euroc, write_lines, write_openvins
 
-from slam_graph.datasets.eqvio_tracks import EqvioTracks, wheel_tracks
-from slam_graph.datasets.openvins_sim import OpenvinsSimulation
-from slam_graph.datasets.recording import TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets.formats.eqvio import EqvioTracks, wheel_tracks
+from slam_graph.datasets.formats.openvins_sim import OpenvinsSimulation
+from slam_graph.datasets.formats.track_recording import TrackRecorder, TrackRecordingSequence
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.calibration import read_euroc_rig
-from slam_graph.sensors.kalibr import write_kalibr
+from slam_graph.sensors.euroc_calibration import read_euroc_rig
+from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig, TrackConfig
+from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.writers import write
 

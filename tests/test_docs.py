@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from slam_graph.config import algorithm_names, load_config
-from slam_graph.datasets.registry import DATASETS, open_dataset
-from slam_graph.pipeline import run
+from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
+from slam_graph.pipeline.run import run
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import BackendConfig, InitializationConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.config import load_config
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 
-FloatArray = NDArray[np.float64]
 Change = Callable[[list[Packet]], list[Packet]]
 
 FRAME_RATE_HZ = 20.0

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
 from gtsam.symbol_shorthand import B, L, V, X
-from numpy.typing import NDArray
 
-from slam_graph.backend.config import BackendConfig, GatingConfig, InitializationConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, GatingConfig, InitializationConfig
+from slam_graph.backend.cost.imu_factor import (
+    ImuBuffer,
+    imu_factor,
+    preintegrate,
+    preintegration_params,
+)
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.imu import ImuBuffer, imu_factor, preintegrate, preintegration_params
 from slam_graph.backend.policies import (
     AlgorithmConfig,
     CostPolicy,
@@ -24,8 +29,6 @@ from slam_graph.backend.policies import (
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 EPSILON = 1e-3
 """Noise of the pixels and error of the start, in standard deviations."""

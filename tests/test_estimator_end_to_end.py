@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from slam_graph.config import algorithm_names, load_config
-from slam_graph.datasets.base import Sequence
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.choices import PoseRelation
-from slam_graph.geometry.alignment import AlignmentMode
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
+from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.pipeline.run import run
+from slam_graph.results.run_result import RunResult
 
 
 def rmse(

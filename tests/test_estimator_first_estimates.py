@@ -11,20 +11,19 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from slam_graph.backend.config import BackendConfig, InitializationConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
+from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.imu import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.marginalization.observability import unseen_directions
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.backend.square_root import Layout
-from slam_graph.backend.state import State, dims_of
-from slam_graph.backend.unseen import unseen_directions
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.config import load_config
 from slam_graph.sensors.measurements import FeatureFrame
 
-FloatArray = NDArray[np.float64]
 CONFIG = BackendConfig(initialization=InitializationConfig(mode="given", fix_gauge=False))
 WEAK = np.array([0.1, 0.5, 0.3, 0.1, 0.02])
 

@@ -13,10 +13,9 @@ from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import associate, nearest
 from slam_graph.evaluation.rpe import rpe
-from slam_graph.geometry.alignment import Similarity, align, align_first_pose, umeyama
 from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.tum import seconds_text, tum_lines
+from slam_graph.geometry.trajectory import Trajectory, seconds_text, tum_lines
+from slam_graph.geometry.trajectory_alignment import Similarity, align, align_first_pose, umeyama
 
 MODES = ("yaw", "se3", "sim3")
 

@@ -18,13 +18,13 @@ import pytest
 
 from slam_graph import pipeline
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.ape import ape
 from slam_graph.experiment.comparison import load_configs, plan, with_variants
+from slam_graph.experiment.comparison_figures import binned_mean
+from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
-from slam_graph.experiment.figures import binned_mean
-from slam_graph.experiment.results import ALIGNMENTS, peak_memory_mb
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
 

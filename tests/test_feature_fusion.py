@@ -11,31 +11,31 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from slam_graph.mapping import final_adjustment
 
-from slam_graph.backend.config import BackendConfig
-from slam_graph.backend.reprojection import Geometry, RigProjection
-from slam_graph.backend.tracks import Observations
-from slam_graph.datasets.base import Sequence
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping import final_adjustment
-from slam_graph.mapping.drift_consensus import agreeing, by_drift
-from slam_graph.mapping.feature_fusion import fused, relabelled
-from slam_graph.mapping.final_adjustment import UndeterminedError, adjust_recording
-from slam_graph.mapping.final_ba_config import FinalBaConfig
-from slam_graph.mapping.frame_log import FrameLog
-from slam_graph.mapping.keyframes import read_piece, triangulated
-from slam_graph.mapping.projected_matches import Scene
 from slam_graph.sensors.measurements import FeatureObservations
-from slam_graph.simulation.config import (
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import (
     FlightConfig,
     LandmarkConfig,
     SimulationConfig,
     TrackConfig,
 )
-from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
+from slam_graph.smoothing.drift_consensus import agreeing, by_drift
+from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
+from slam_graph.smoothing.frame_log import FrameLog
+from slam_graph.smoothing.projected_matches import Scene
+from slam_graph.smoothing.recording_keyframes import read_piece, triangulated
+from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.smoothing.track_fusion import fused, relabelled
 
 LENGTH_S = 40.0
 BROKEN_EVERY_S = 5.0

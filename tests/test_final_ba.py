@@ -11,32 +11,32 @@ from typing import Any
 import numpy as np
 import pytest
 from flight import FISHEYE, rig
+from slam_graph.mapping import final_adjustment
 
-from slam_graph.backend.config import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.association import select
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping import final_adjustment
-from slam_graph.mapping.averaged_observations import nearest_keyframe
-from slam_graph.mapping.final_adjustment import FinalBa, adjust_recording, pieces
-from slam_graph.mapping.final_ba_config import FinalBaConfig
-from slam_graph.mapping.frame_log import FrameLog
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
+from slam_graph.pipeline.run import run
+from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr import write_kalibr
-from slam_graph.simulation.config import (
+from slam_graph.sensors.kalibr_calibration import write_kalibr
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import (
     FlightConfig,
     LandmarkConfig,
     SimulatedImuConfig,
     SimulationConfig,
     TrackConfig,
 )
-from slam_graph.simulation.sequence import SimulatedSequence
 from slam_graph.simulation.simulator import simulate
+from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, pieces
+from slam_graph.smoothing.frame_log import FrameLog
+from slam_graph.smoothing.recording_problem import nearest_keyframe
+from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 LENGTH_S = 8.0
 DOUBLE_SPHERE = Camera(160.0, 160.0, 254.0, 256.0, "double_sphere", (-0.2, 0.55), 512, 512)

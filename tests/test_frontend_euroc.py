@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
-from slam_graph.frontend.registry import build_frontend
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig

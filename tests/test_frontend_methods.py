@@ -26,14 +26,14 @@ from images import (
 )
 
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.base import Feedback
-from slam_graph.frontend.config import FrontendConfig, MatchingConfig
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.frontend.descriptors import DESCRIPTORS, Orb
+from slam_graph.frontend.frontend_config import FrontendConfig, MatchingConfig
+from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
 from slam_graph.frontend.motion import ImuMotion
-from slam_graph.frontend.references import reference_cameras
-from slam_graph.frontend.registry import build_frontend
+from slam_graph.frontend.stereo import reference_cameras
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.outliers import (
     coherent_groups,
     direction_inliers,

@@ -32,9 +32,9 @@ from pydantic import ValidationError
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.frontend.detectors import DETECTORS
-from slam_graph.frontend.registry import build_frontend
+from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera

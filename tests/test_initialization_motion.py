@@ -7,26 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flight import GRAVITY, Flight, features, packets, rig, room, scene
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from slam_graph.backend.alignment import Motion, align
-from slam_graph.backend.config import BackendConfig, InitializationConfig, NoiseConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
+from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegration_params
+from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.gyro_bias import estimate_gyro_bias
-from slam_graph.backend.imu import ImuBuffer, preintegration_params
-from slam_graph.backend.motion_start import StartGuess, StartWindow, guess_states
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.start_consensus import static_features
-from slam_graph.backend.tracks import TrackWindow
+from slam_graph.backend.initialization.dynamic_start import StartGuess, StartWindow, guess_states
+from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.start_consensus import static_features
+from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
-from slam_graph.frontend.registry import build_frontend
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
-FloatArray = NDArray[np.float64]
 PARAMS = preintegration_params(rig().imu, 9.81)
 TIMES = np.linspace(0.0, 1.5, 11)
 SPACING_S = InitializationConfig().frame_spacing_s

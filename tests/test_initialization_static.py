@@ -6,25 +6,24 @@ import gtsam
 import numpy as np
 import pytest
 from flight import AT_REST, Flight, packets, rig, room
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.config import BackendConfig, InitializationConfig, PriorConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, PriorConfig
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization import start_from
-from slam_graph.backend.state import imu_state_keys
-from slam_graph.backend.static_start import (
+from slam_graph.backend.initialization.initializer import start_from
+from slam_graph.backend.initialization.static_start import (
     fix_gauge,
     level_rotation,
     prior_covariance,
     state_at_rest,
 )
+from slam_graph.backend.solve.state import imu_state_keys
 from slam_graph.config import load_config
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
-FloatArray = NDArray[np.float64]
 PRIOR = PriorConfig()
 GYRO_SIGMA = 2.4e-3
 UP = np.array([0.0, 0.0, 1.0])

@@ -13,15 +13,15 @@ import slam_graph
 PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
-    {"errors", "diagnostics", "version"},
-    {"geometry"},
+    {"errors", "diagnostics", "version", "arrays"},
+    {"settings", "geometry"},
     {"sensors"},
     {"datasets", "frontend", "backend"},
-    {"mapping", "simulation", "config_tree"},
+    {"pose_graph", "bundle_adjustment", "smoothing", "simulation"},
+    {"loop_closure"},
+    {"maps"},
     {"evaluation", "visualization", "config"},
-    {"output"},
-    {"known_start", "supervision", "tracking"},
-    {"final_stage", "loop_stage", "map_stage", "localization_stage"},
+    {"results"},
     {"pipeline"},
     {"experiment"},
     {"cli"},

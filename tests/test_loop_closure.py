@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.evaluation.ape import ape
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.mapping.loop_closure import LoopClosures, close_loops, correct_by
-from slam_graph.mapping.loop_config import VerificationConfig
-from slam_graph.mapping.loop_keyframes import Keyframe
-from slam_graph.mapping.loop_pose_graph import level, split
-from slam_graph.mapping.loop_verification import FLOOR_SIGMAS, LoopVerifier, tilt
-from slam_graph.mapping.pose_graph import PoseGraph, Poses
-from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
+from slam_graph.loop_closure.close_loops import LoopClosures, close_loops, correct_by
+from slam_graph.loop_closure.loop_config import VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_pose_graph import level, split
+from slam_graph.loop_closure.loop_verification import FLOOR_SIGMAS, LoopVerifier, tilt
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.sensors.rig import Rig
 
 Tour = tuple[Rig, list[Keyframe], Trajectory, Trajectory]

@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from slam_graph.frontend.registry import build_frontend
-from slam_graph.mapping.loop_config import KeyframeConfig, VerificationConfig
-from slam_graph.mapping.loop_keyframes import Keyframe, KeyframeLog
-from slam_graph.mapping.loop_verification import LoopVerifier
+from slam_graph.frontend.build_frontend import build_frontend
+from slam_graph.loop_closure.loop_config import KeyframeConfig, VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog
+from slam_graph.loop_closure.loop_verification import LoopVerifier
 from slam_graph.sensors.measurements import ImuData
-from slam_graph.simulation.config import FlightConfig, ImageConfig, SimulationConfig
-from slam_graph.simulation.sequence import SimulatedImages
+from slam_graph.simulation.simulated_sequence import SimulatedImages
+from slam_graph.simulation.simulation_config import FlightConfig, ImageConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
 
 FRAMES = 5

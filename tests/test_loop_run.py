@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
-from slam_graph.pipeline import run
-from slam_graph.simulation.config import LandmarkConfig, SimulationConfig, TrackConfig
+from slam_graph.pipeline.run import run
+from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.writers import write
 
@@ -84,7 +84,7 @@ def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatc
         def fail(*_: object, error: BaseException = error) -> None:
             raise error
 
-        monkeypatch.setattr("slam_graph.loop_stage.close_loops", fail)
+        monkeypatch.setattr("slam_graph.pipeline.loop_stage.close_loops", fail)
         result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
         assert result.status == "ok"
         assert len(result.trajectory) > 10

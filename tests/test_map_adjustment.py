@@ -13,20 +13,20 @@ from map_flights import World
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
+from slam_graph.bundle_adjustment.bal_cost import moved, reprojection_errors
+from slam_graph.bundle_adjustment.bal_policy import BalStepsPolicy, Intrinsics
+from slam_graph.bundle_adjustment.bal_prior import camera_residuals, linearized_prior
+from slam_graph.bundle_adjustment.bal_problem import rays_of
 from slam_graph.cli.main import app
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, SlamGraphError
-from slam_graph.geometry.alignment import umeyama
-from slam_graph.mapping.bal_cost import moved, reprojection_errors
-from slam_graph.mapping.bal_policy import BalStepsPolicy, Intrinsics
-from slam_graph.mapping.bal_prior import camera_residuals, linearized_prior
-from slam_graph.mapping.bal_projection import rays_of
-from slam_graph.mapping.map_adjustment import adjust_map, bundle_of
-from slam_graph.mapping.map_config import MapBalPolicy, MapCostPolicy, MapPriorPolicy
-from slam_graph.mapping.map_file import read_map
-from slam_graph.mapping.map_model import NO_FEATURE, SlamMap
-from slam_graph.mapping.pose_graph import Poses
-from slam_graph.output.map_output import MAP_NAME, save_map
+from slam_graph.geometry.trajectory_alignment import umeyama
+from slam_graph.maps.map_adjustment import adjust_map, bundle_of
+from slam_graph.maps.map_config import MapBalPolicy, MapCostPolicy, MapPriorPolicy
+from slam_graph.maps.map_file import read_map
+from slam_graph.maps.map_model import NO_FEATURE, SlamMap
+from slam_graph.pose_graph.graph import Poses
+from slam_graph.results.map_output import MAP_NAME, save_map
 
 VIEWS = range(8)
 TIGHT = BalStepsPolicy(tolerance=1e-12)

@@ -18,9 +18,9 @@ import pytest
 from map_flights import World
 
 from slam_graph.errors import DataError
-from slam_graph.mapping.map_file import ARRAYS, arrays_of, read_map
-from slam_graph.mapping.map_model import SlamMap
-from slam_graph.output.map_output import MAP_NAME, export_ply, export_tum, load_map, save_map
+from slam_graph.maps.map_file import ARRAYS, arrays_of, read_map
+from slam_graph.maps.map_model import SlamMap
+from slam_graph.results.map_output import MAP_NAME, export_ply, export_tum, load_map, save_map
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_crash_while_saving_leaves_the_old_map(file: Path) -> None:
 import os, signal
 import numpy as np
 from slam_graph.mapping import map_file
-from slam_graph.output.map_output import load_map, save_map
+from slam_graph.results.map_output import load_map, save_map
 content, left = load_map({str(file)!r}), [8]
 write = np.lib.format.write_array
 def write_some(*arguments, **options):

@@ -10,11 +10,11 @@ import pytest
 from map_flights import PLACES, World
 
 from slam_graph.errors import DataError
-from slam_graph.mapping.loop_config import VerificationConfig
-from slam_graph.mapping.map_config import LocalizationConfig
-from slam_graph.mapping.map_filter import MapPoseFilter, upright
-from slam_graph.mapping.map_localization import MapLocalizer
-from slam_graph.mapping.map_places import MapPlaces
+from slam_graph.loop_closure.loop_config import VerificationConfig
+from slam_graph.maps.map_config import LocalizationConfig
+from slam_graph.maps.map_localization import MapLocalizer
+from slam_graph.maps.map_places import MapPlaces
+from slam_graph.maps.pose_filter import MapPoseFilter, upright
 
 CONFIG = LocalizationConfig()
 SIGMAS = np.array([0.004] * 3 + [0.02] * 3)

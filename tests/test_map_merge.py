@@ -10,11 +10,11 @@ import pytest
 from map_flights import PLACES, World
 
 from slam_graph.errors import EstimationError
-from slam_graph.mapping.loop_config import LoopClosureConfig
-from slam_graph.mapping.map_config import LocalizationConfig
-from slam_graph.mapping.map_merge import MIN_LINKS, merge_maps
-from slam_graph.mapping.map_model import SlamMap
-from slam_graph.mapping.pose_graph import Poses
+from slam_graph.loop_closure.loop_config import LoopClosureConfig
+from slam_graph.maps.map_config import LocalizationConfig
+from slam_graph.maps.map_merge import MIN_LINKS, merge_maps
+from slam_graph.maps.map_model import SlamMap
+from slam_graph.pose_graph.graph import Poses
 
 LOOPS, LOCALIZATION = LoopClosureConfig(places=PLACES), LocalizationConfig()
 MOVE = gtsam.Pose3(gtsam.Rot3.Rz(2.5), np.array([20.0, -5.0, 1.0]))

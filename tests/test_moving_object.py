@@ -11,15 +11,15 @@ import pytest
 
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
+from slam_graph.pipeline.run import run
+from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr import write_kalibr
+from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig
 from slam_graph.simulation.rendering import cast
 from slam_graph.simulation.rigs import euroc_rig
-from slam_graph.simulation.sequence import SimulatedImages
+from slam_graph.simulation.simulated_sequence import SimulatedImages
+from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.world import World
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from slam_graph.config import LimitsConfig, load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.known_start import true_state
-from slam_graph.pipeline import run
+from slam_graph.pipeline.known_start import true_state
+from slam_graph.pipeline.run import run
+from slam_graph.pipeline.supervision import DivergenceError, check_sane
 from slam_graph.sensors.measurements import Packet
-from slam_graph.supervision import DivergenceError, check_sane
 
 STATIC = "backend.initialization.mode=static"
 SHORT = load_config(overrides=["duration_s=3", "min_coverage=0.1", STATIC])

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from slam_graph.mapping.place_recognition import (
+from slam_graph.loop_closure.place_recognition import (
     PlaceDatabase,
     Vocabulary,
     WordVector,

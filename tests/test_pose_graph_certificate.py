@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from pose_graphs import laps, turns
 from scipy.optimize import approx_fprime
-
 from slam_graph.mapping import pose_graph_certificate as dual
-from slam_graph.mapping.chordal_objective import chordal_cost, stacked, whitened_rows
-from slam_graph.mapping.pose_graph import PoseGraph, Poses
-from slam_graph.mapping.pose_graph_certificate import certify
-from slam_graph.mapping.pose_graph_file import read_pose_graph
-from slam_graph.mapping.pose_graph_optimization import optimize_pose_graph
-from slam_graph.mapping.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
+
+from slam_graph.pose_graph.certificate import certify
+from slam_graph.pose_graph.chordal import chordal_cost, stacked, whitened_rows
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_files import read_pose_graph
+from slam_graph.pose_graph.optimize import optimize_pose_graph
+from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
 
 SESYNC_OPTIMA = {
     "parking-garage": 1.2625244,

@@ -11,8 +11,8 @@ from pose_graphs import laps
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.mapping.native_pose_graph import edge_factors, factor_graph, values_of
-from slam_graph.mapping.pose_graph_file import g2o_lines, read_pose_graph
+from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
+from slam_graph.pose_graph.gtsam_graph import edge_factors, factor_graph, values_of
 
 V2 = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n"
 E2 = "EDGE_SE2 0 1 1 0 0.1 4 0 0 4 0 9\n"

@@ -17,15 +17,19 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-from slam_graph.simulation.config import SimulatedImuConfig, SimulationConfig, TrackConfig
-from slam_graph.simulation.imu import SimulatedImu
+from slam_graph.simulation.imu_simulation import SimulatedImu
 from slam_graph.simulation.landmarks import on_walls
 from slam_graph.simulation.motion import GRAVITY, SplineMotion
 from slam_graph.simulation.rigs import euroc_rig
-from slam_graph.simulation.sequence import SimulatedTracks
+from slam_graph.simulation.simulated_sequence import SimulatedTracks
+from slam_graph.simulation.simulation_config import (
+    SimulatedImuConfig,
+    SimulationConfig,
+    TrackConfig,
+)
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.splines import continuous, fit, stamps_between, through_waypoints
-from slam_graph.simulation.tracks import TrackSimulator
+from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import box, three_rooms
 
 SHAPES = ("figure8", "rooms", "random")

@@ -15,15 +15,15 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
-from slam_graph.datasets.checks import check_sequence
-from slam_graph.datasets.registry import open_dataset
-from slam_graph.pipeline import run
+from slam_graph.datasets.data_checks import check_sequence
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr import write_kalibr
+from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig
 from slam_graph.simulation.rigs import euroc_rig
-from slam_graph.simulation.sequence import SimulatedSequence
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 from slam_graph.simulation.writers import write
 

@@ -11,19 +11,23 @@ import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
 from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.backend.config import BackendConfig, GatingConfig
-from slam_graph.backend.initialization import prior_of
-from slam_graph.backend.native_factors import ProjectionFactors, joint_prior, pixel_noise
-from slam_graph.backend.native_solvers import SOLVERS
+from slam_graph.backend.backend_config import BackendConfig, GatingConfig
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.gtsam_smoothers.smoother_factors import (
+    ProjectionFactors,
+    joint_prior,
+    pixel_noise,
+)
+from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS
+from slam_graph.backend.initialization.initializer import prior_of
+from slam_graph.backend.initialization.static_start import prior_covariance
 from slam_graph.backend.policies import SmootherPolicy
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.state import imu_state_keys
-from slam_graph.backend.static_start import prior_covariance
+from slam_graph.backend.solve.state import imu_state_keys
 from slam_graph.config import load_config
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.evaluation.ape import ape
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline import run
+from slam_graph.pipeline.run import run
 from slam_graph.sensors.camera import Camera
 
 PLAIN = replace(RADTAN, distortion="none", coefficients=())

@@ -10,17 +10,17 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam_graph.backend.gating import Innovations
+from slam_graph.backend.cost.gating import Innovations
 from slam_graph.config import LimitsConfig, load_config
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.output.run_result import RunResult
-from slam_graph.pipeline import run
+from slam_graph.pipeline.run import run
+from slam_graph.pipeline.supervision import Agreement, DivergenceError, check_sane
+from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, Packet
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig
-from slam_graph.simulation.sequence import SimulatedSequence
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.supervision import Agreement, DivergenceError, check_sane
 
 LIMITS = LimitsConfig()
 

@@ -12,33 +12,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from slam_graph.backend.calibrated_projection import CalibratedProjection
-from slam_graph.backend.calibration import CalibrationVariables
-from slam_graph.backend.config import BackendConfig
-from slam_graph.backend.construction import ConstructedCost, CostConstruction
-from slam_graph.backend.gating import Innovations
-from slam_graph.backend.gauss_newton import Minimum, minimize
-from slam_graph.backend.imu import ImuBuffer
-from slam_graph.backend.initialization import Initializer, start_from
-from slam_graph.backend.marginalization import marginalize_step
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
+from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.cost.gating import Innovations
+from slam_graph.backend.cost.imu_factor import ImuBuffer
+from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.initialization.initializer import Initializer, start_from
+from slam_graph.backend.marginalization.marginalize import marginalize_step
+from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.backend.propagation import Propagation
-from slam_graph.backend.reprojection import RigProjection
-from slam_graph.backend.square_root import SquareRootInformation
+from slam_graph.backend.solve.gauss_newton import Minimum, minimize
+from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
-from slam_graph.backend.zero_velocity import StandstillDetector
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""

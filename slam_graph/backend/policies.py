@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from slam_graph.backend.config import Settings
+from slam_graph.settings.base import Settings
 
 
 class CostPolicy(Settings):

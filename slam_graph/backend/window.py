@@ -10,16 +10,13 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
-from numpy.typing import NDArray
 
-from slam_graph.backend.archive import FeatureArchive
-from slam_graph.backend.square_root import SquareRootInformation
-from slam_graph.backend.state import State, imu_state_keys, stacked_points
-from slam_graph.backend.tracks import TrackWindow, is_in
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.cost.feature_tracks import TrackWindow, is_in
+from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.geometry.trajectory import NavState
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def _no_ids() -> IntArray:

@@ -86,7 +86,7 @@ def compare(
     from slam_graph.config import load_config
     from slam_graph.experiment.comparison import compare as run_comparison
     from slam_graph.experiment.comparison import load_configs, with_variants
-    from slam_graph.experiment.report import write_report
+    from slam_graph.experiment.comparison_report import write_report
     from slam_graph.experiment.sources import find_sources
 
     said = {"duration_s": duration, "cameras": cameras}
@@ -145,7 +145,7 @@ def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
 
 def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Path]) -> None:
     """Print the table, and where the files are."""
-    from slam_graph.experiment.report import COLUMNS, cells
+    from slam_graph.experiment.comparison_report import COLUMNS, cells
 
     table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)]
     echo_table(_telling(table))

@@ -14,8 +14,7 @@ import typer
 from slam_graph.cli.output import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.datasets.base import Sequence
-    from slam_graph.datasets.recorded import RecordedSequence
+    from slam_graph.datasets.sequence import RecordedSequence, Sequence
 
 app = typer.Typer(
     help="Look at recordings, check and convert them.", no_args_is_help=True, rich_markup_mode=None
@@ -91,7 +90,7 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Read a recording and report what is wrong with it; the exit code is 1 if it is unusable."""
-    from slam_graph.datasets.checks import check_sequence
+    from slam_graph.datasets.data_checks import check_sequence
 
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
     findings = check_sequence(sequence, read_images=images)
@@ -123,7 +122,7 @@ def convert(
     """Write a recording of images as an EuRoC folder, whole or not at all."""
     from slam_graph.cli.progress import ProgressBar
     from slam_graph.datasets.convert import convert_to_euroc
-    from slam_graph.datasets.euroc_writer import refuse_existing
+    from slam_graph.datasets.formats.euroc_writer import refuse_existing
 
     refuse_existing(output, force)
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
@@ -154,7 +153,7 @@ def open_recording(
     cameras: int | None = None,
 ) -> RecordedSequence:
     """The recording that the options of a command mean, with its first `cameras` cameras or all."""
-    from slam_graph.datasets.registry import open_dataset
+    from slam_graph.datasets.dataset_registry import open_dataset
 
     return open_dataset(
         data,

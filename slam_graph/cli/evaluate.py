@@ -15,8 +15,8 @@ from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, Po
 
 if TYPE_CHECKING:
     from slam_graph.evaluation.ape import ErrorSeries
-    from slam_graph.geometry.alignment import AlignmentMode
     from slam_graph.geometry.trajectory import Trajectory
+    from slam_graph.geometry.trajectory_alignment import AlignmentMode
 
 Align = Literal["none", "yaw", "se3", "sim3"]
 

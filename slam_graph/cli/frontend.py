@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from slam_graph.config import RunConfig
-    from slam_graph.datasets.base import Sequence
-    from slam_graph.experiment.frontends import FrontendReport
-    from slam_graph.tracking import TrackedPacket
+    from slam_graph.datasets.sequence import Sequence
+    from slam_graph.experiment.frontend_comparison import FrontendReport
+    from slam_graph.pipeline.tracking import TrackedPacket
 
 EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
@@ -80,7 +80,7 @@ def run(
 ) -> None:
     """Track a recording, report how good the tracks are, and draw them."""
     from slam_graph.config import load_config
-    from slam_graph.experiment.frontends import track
+    from slam_graph.experiment.frontend_comparison import track
 
     settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
     sequence = open_recording(data, format_, calibration, groundtruth, sources, settings.cameras)
@@ -119,7 +119,7 @@ def compare(
 ) -> None:
     """Run several front ends on one recording, and print a table."""
     from slam_graph.config import load_config
-    from slam_graph.experiment.frontends import parse_frontends, track, track_and_estimate
+    from slam_graph.experiment.frontend_comparison import parse_frontends, track, track_and_estimate
 
     said = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
@@ -146,7 +146,7 @@ def _watch(
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
     """What is done with every frame: drawn, and recorded if asked for."""
-    from slam_graph.datasets.recording import TrackRecorder
+    from slam_graph.datasets.formats.track_recording import TrackRecorder
     from slam_graph.sensors.measurements import CameraFrame
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
 

@@ -63,7 +63,7 @@ def localize(
     """
     from slam_graph.config import load_config
     from slam_graph.errors import EstimationError
-    from slam_graph.output.map_output import find_map, load_map
+    from slam_graph.results.map_output import find_map, load_map
 
     said: dict[str, Any] = {
         "algorithm": algorithm,

@@ -14,7 +14,7 @@ from slam_graph.cli.data import Json
 from slam_graph.cli.output import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.mapping.map_model import MapRecording, SlamMap
+    from slam_graph.maps.map_model import MapRecording, SlamMap
 
 app = typer.Typer(
     help="Look at maps, export and merge them.", no_args_is_help=True, rich_markup_mode=None
@@ -29,7 +29,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace files that exist."
 @app.command()
 def info(path: MapPath, as_json: Json = False) -> None:
     """Show what a map holds."""
-    from slam_graph.output.map_output import find_map, load_map
+    from slam_graph.results.map_output import find_map, load_map
 
     file = find_map(path)
     table = _describe(load_map(file), file)
@@ -63,8 +63,8 @@ def export(
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
-    from slam_graph.output.files import refuse_to_replace
-    from slam_graph.output.map_output import export_ply, export_tum, load_map
+    from slam_graph.results.map_output import export_ply, export_tum, load_map
+    from slam_graph.results.result_files import refuse_to_replace
 
     if ply is None and tum is None:
         raise ConfigError("nothing to write: say --ply FILE, --tum FILE, or both")
@@ -93,9 +93,9 @@ def merge(
     from dataclasses import asdict
 
     from slam_graph.config import load_config
-    from slam_graph.mapping.map_merge import merge_maps
-    from slam_graph.output.files import refuse_to_replace
-    from slam_graph.output.map_output import load_map, save_map
+    from slam_graph.maps.map_merge import merge_maps
+    from slam_graph.results.map_output import load_map, save_map
+    from slam_graph.results.result_files import refuse_to_replace
 
     settings = load_config(config, set_ or ())
     refuse_to_replace(output, force)

@@ -39,7 +39,7 @@ def read_policy(
         overrides: `key=value` each.
         options: values by table and name; None where nothing is said.
     """
-    from slam_graph.config_tree import ConfigTree, KeyPath, override, read_tree, validate
+    from slam_graph.settings.tree import ConfigTree, KeyPath, override, read_tree, validate
 
     tree = ConfigTree() if file is None else read_tree(file)
     for (table, name), value in options.items():
@@ -56,7 +56,7 @@ def write_result(
     result: Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
     """Write all files into a new folder, under the name of the problem."""
-    from slam_graph.output.files import create_run_folder, link_latest, write_text
+    from slam_graph.results.result_files import create_run_folder, link_latest, write_text
 
     folder = create_run_folder(output, name)
     try:

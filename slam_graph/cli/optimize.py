@@ -81,9 +81,9 @@ def optimize(
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
-    from slam_graph.mapping.bal_policy import BalPolicy
-    from slam_graph.mapping.map_config import MapBalPolicy
-    from slam_graph.mapping.pose_graph_policy import PoseGraphPolicy
+    from slam_graph.bundle_adjustment.bal_policy import BalPolicy
+    from slam_graph.maps.map_config import MapBalPolicy
+    from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
         raise DataError(f"{save}: is there already; say --force to replace it")
@@ -115,7 +115,7 @@ def optimize(
 
 def _seen_format(file: Path) -> Format:
     """What a file is, as its content says; a folder is one of a run with a map."""
-    from slam_graph.mapping.bal_file import is_bal
+    from slam_graph.bundle_adjustment.bal_file import is_bal
 
     if file.is_dir() or is_zipfile(file):
         return "map"

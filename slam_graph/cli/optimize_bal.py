@@ -16,10 +16,10 @@ from slam_graph.cli.optimization import timed, write_result
 from slam_graph.cli.output import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.mapping.bal_policy import BalPolicy
-    from slam_graph.mapping.map_config import MapBalPolicy
-    from slam_graph.mapping.map_model import SlamMap
-    from slam_graph.output.bal_result import BalResult
+    from slam_graph.bundle_adjustment.bal_policy import BalPolicy
+    from slam_graph.maps.map_config import MapBalPolicy
+    from slam_graph.maps.map_model import SlamMap
+    from slam_graph.results.bundle_result import BalResult
 
 MOST_LETTERS = 100
 """Of the name of a recording in that of a folder."""
@@ -29,10 +29,10 @@ def optimize_bal(
     file: Path, policy: BalPolicy, save: Path | None, output: Path, as_json: bool
 ) -> None:
     """Estimate all cameras and points, write the results and print what was reached."""
+    from slam_graph.bundle_adjustment.bal_file import read_bal
+    from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.mapping.bal_adjustment import adjust_bundle
-    from slam_graph.mapping.bal_file import read_bal
-    from slam_graph.output.bal_result import BalResult
+    from slam_graph.results.bundle_result import BalResult
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}
@@ -51,9 +51,9 @@ def optimize_map(
 ) -> None:
     """Estimate all keyframes and features of a map, write the results and print them."""
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.mapping.map_adjustment import adjust_map
-    from slam_graph.output.map_bal_result import MapBalResult
-    from slam_graph.output.map_output import find_map, load_map
+    from slam_graph.maps.map_adjustment import adjust_map
+    from slam_graph.results.map_adjustment_result import MapBalResult
+    from slam_graph.results.map_output import find_map, load_map
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}
@@ -74,7 +74,7 @@ def _name(content: SlamMap, file: Path) -> str:
 
     A name out of a file must not lead out of the folder of results.
     """
-    from slam_graph.output.map_output import MAP_NAME
+    from slam_graph.results.map_output import MAP_NAME
 
     if file.name != MAP_NAME:
         return file.stem

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from slam_graph.config import RunConfig
-    from slam_graph.datasets.base import Sequence
-    from slam_graph.mapping.map_model import SlamMap
-    from slam_graph.output.run_result import RunResult
+    from slam_graph.datasets.sequence import Sequence
+    from slam_graph.maps.map_model import SlamMap
+    from slam_graph.results.run_result import RunResult
 
 RerunMode = Literal["off", "save", "spawn", "connect"]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")]
@@ -143,8 +143,8 @@ def execute(
     known_map: SlamMap | None = None,
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write whatever came of it."""
-    from slam_graph.output.files import create_run_folder, link_latest, write_text
-    from slam_graph.pipeline import run as run_pipeline
+    from slam_graph.pipeline.run import run as run_pipeline
+    from slam_graph.results.result_files import create_run_folder, link_latest, write_text
 
     folder = create_run_folder(output, sequence.info().name)
     try:

@@ -17,8 +17,8 @@ from slam_graph.cli.output import echo_json, echo_table
 from slam_graph.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
-    from slam_graph.simulation.config import SimulationConfig
-    from slam_graph.simulation.sequence import SimulatedSequence
+    from slam_graph.simulation.simulated_sequence import SimulatedSequence
+    from slam_graph.simulation.simulation_config import SimulationConfig
 
 Kind = Literal["tracks", "images"]
 
@@ -74,7 +74,7 @@ def simulate(
 
     OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
     """
-    from slam_graph.datasets.euroc_writer import refuse_existing
+    from slam_graph.datasets.formats.euroc_writer import refuse_existing
     from slam_graph.simulation.simulator import simulate as make
     from slam_graph.simulation.writers import write
 
@@ -106,8 +106,8 @@ def simulate(
 
 def _settings(file: Path | None, overrides: list[str], options: dict[str, Any]) -> SimulationConfig:
     """The settings: file under options under overrides."""
-    from slam_graph.config_tree import ConfigTree, override, read_tree, validate
-    from slam_graph.simulation.config import SimulationConfig
+    from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
+    from slam_graph.simulation.simulation_config import SimulationConfig
 
     tree = ConfigTree()
     if file is not None:

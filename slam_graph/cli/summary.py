@@ -13,7 +13,7 @@ import typer
 from slam_graph.cli.output import echo_table, number
 
 if TYPE_CHECKING:
-    from slam_graph.output.run_result import RunResult
+    from slam_graph.results.run_result import RunResult
 
 Table = dict[str, Any]
 

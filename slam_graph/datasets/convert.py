@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from slam_graph.datasets.euroc_writer import EurocWriter
-from slam_graph.datasets.recorded import RecordedSequence
+from slam_graph.datasets.formats.euroc_writer import EurocWriter
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.sensors.measurements import CameraFrame
 
@@ -38,7 +38,7 @@ def convert_to_euroc(
     if info.content == "tracks":
         raise DataError(
             f"{info.name}: format '{info.format}' holds feature tracks, no images; copy it as it "
-            "is, or write tracks with slam_graph.datasets.recording.TrackRecorder"
+            "is, or write tracks with slam_graph.datasets.formats.track_recording.TrackRecorder"
         )
     seconds = max((info.end_ns - info.start_ns) * 1e-9, 1e-9)
     rate_hz = round((info.frames - 1) / seconds, 3)

@@ -11,11 +11,17 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.rows import STAMP_TEXT, Rows, parse, read_rows, stamps_from_seconds
+from slam_graph.datasets.streams.csv_rows import (
+    STAMP_TEXT,
+    Rows,
+    parse,
+    read_rows,
+    stamps_from_seconds,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.calibration import read_body_T_sensor
+from slam_graph.sensors.euroc_calibration import read_body_T_sensor
 
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Where EuRoC and its kin keep poses, in the order of preference."""

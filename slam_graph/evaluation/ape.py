@@ -17,8 +17,8 @@ from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchron
 from slam_graph.evaluation.choices import PoseRelation
 from slam_graph.evaluation.relations import errors, relative_poses
 from slam_graph.evaluation.statistics import Statistics
-from slam_graph.geometry.alignment import AlignmentMode, Similarity, align
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry.trajectory_alignment import AlignmentMode, Similarity, align
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
-
-IntArray = NDArray[np.int64]
 
 DEFAULT_MAX_DIFFERENCE_S = 0.01
 

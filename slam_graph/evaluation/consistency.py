@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
-from slam_graph.geometry.alignment import Similarity
+from slam_graph.arrays import FloatArray
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
+from slam_graph.geometry.trajectory_alignment import Similarity
 
 CONFIDENCE = 0.95
 

@@ -15,12 +15,10 @@ The difference is the relative pose E = T_reference⁻¹ T_estimate, with rotati
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.choices import PoseRelation
-
-FloatArray = NDArray[np.float64]
 
 
 def relative_poses(

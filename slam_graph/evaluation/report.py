@@ -17,9 +17,13 @@ from slam_graph.evaluation.ape import ErrorSeries, ape
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
 from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.rpe import rpe
-from slam_graph.geometry.alignment import AlignmentMode, Similarity, align_first_pose, align_yaw
-from slam_graph.geometry.history import StateHistory
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.geometry.trajectory_alignment import (
+    AlignmentMode,
+    Similarity,
+    align_first_pose,
+    align_yaw,
+)
 
 REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 

@@ -8,20 +8,17 @@ Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; numbe
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ErrorSeries
 from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
 from slam_graph.evaluation.choices import STEP_UNITS, DeltaUnit, PoseRelation
 from slam_graph.evaluation.relations import errors, relative_poses
 from slam_graph.evaluation.statistics import Statistics
-from slam_graph.geometry.alignment import AlignmentMode, align
 from slam_graph.geometry.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from slam_graph.geometry.trajectory_alignment import AlignmentMode, align
 
 DEFAULT_TOLERANCE = 0.1
 

@@ -9,15 +9,13 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 GAP_FRAMES = 5
 """Features are compared with themselves so many frames before: over one frame the true motion is

@@ -14,7 +14,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import RecordTask, RunTask, Task
-from slam_graph.mapping.final_ba_config import FinalBaConfig
+from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 WITHOUT_FEJ = "_no_fej"
 """What the name of an algorithm without first-estimates Jacobians ends in."""

@@ -8,12 +8,12 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from slam_graph.backend.config import Settings
-from slam_graph.config_tree import ConfigTree, override, validate
-from slam_graph.datasets.base import Sequence
-from slam_graph.datasets.registry import open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.simulation.config import SHAPES, SimulationConfig, StartConfig
+from slam_graph.settings.base import Settings
+from slam_graph.settings.tree import ConfigTree, override, validate
+from slam_graph.simulation.simulation_config import SHAPES, SimulationConfig, StartConfig
 from slam_graph.simulation.simulator import simulate
 
 PREFIX = "sim:"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam_graph.frontend.keypoints import Mask, Points
 from slam_graph.frontend.prediction import Prediction
-from slam_graph.frontend.tracks import Image, Tracks
+from slam_graph.frontend.tracked_features import Image, Tracks
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.frontend.association import Associator
-from slam_graph.frontend.base import Feedback
-from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.outliers import (
     MIN_POINTS,
     coherent_groups,
@@ -21,12 +22,8 @@ from slam_graph.frontend.outliers import (
     map_inliers,
 )
 from slam_graph.frontend.prediction import PointPredictor
-from slam_graph.frontend.stats import FrameStats
-from slam_graph.frontend.tracks import Image, Mask, Tracks
+from slam_graph.frontend.tracked_features import Image, Mask, Tracks
 from slam_graph.sensors.rig import RigCamera
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 class CameraTracker:

@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.frontend.detectors import BRISK_OCTAVES, ORB_EDGE_PX, ORB_LEVELS
+from slam_graph.frontend.detectors import BRISK_OCTAVES, ORB_EDGE_PX, ORB_LEVELS, require
 from slam_graph.frontend.keypoints import Indices, Keypoints
-from slam_graph.frontend.optional import require
-from slam_graph.frontend.tracks import Image
+from slam_graph.frontend.tracked_features import Image
 
 Vectors = NDArray[Any]
 

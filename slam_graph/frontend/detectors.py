@@ -4,20 +4,43 @@
 
 Corner scores are local, so those detectors look only at the cells of the grid that need features.
 The others build a pyramid, and look at the image as a whole.
+
+Libraries that only some methods need: imported when asked for, with advice where absent.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.errors import ConfigError
+from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Indices, Keypoints, Points
-from slam_graph.frontend.optional import require
-from slam_graph.frontend.tracks import Image
+from slam_graph.frontend.tracked_features import Image
+
+INSTALL = "pip install 'slam-graph[descriptors]'"
+
+
+def require(module: str, purpose: str) -> Any:
+    """Import a module of an optional library.
+
+    Args:
+        module: its full name.
+        purpose: what needs it, for the message.
+
+    Raises:
+        ConfigError: if it is not installed; names the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        library = module.split(".")[0]
+        raise ConfigError(f"{purpose}: needs {library}, install it: {INSTALL}") from error
+
 
 HARRIS_K = 0.04
 """Weight of the trace in Harris' score det - k trace² (Harris and Stephens 1988)."""

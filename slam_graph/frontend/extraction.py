@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.detectors import DETECTORS, refine
+from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points, spread
-from slam_graph.frontend.tracks import Image
+from slam_graph.frontend.tracked_features import Image
 from slam_graph.sensors.camera import WIDE, Camera
 
 REST_FRAMES = 3

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.frontend.association import Births, Match, inside
-from slam_graph.frontend.config import FrontendConfig
 from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Mask, Points
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.frontend.tracks import Image, Tracks
+from slam_graph.frontend.tracked_features import Image, Tracks
 
 GUIDED_LEVELS = 1
 """Pyramid levels where the guess is good; more of them lead away from it."""

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from slam_graph.frontend.association import Births, Match, inside
-from slam_graph.frontend.config import FrontendConfig, MatchingConfig
 from slam_graph.frontend.descriptors import DESCRIPTORS, Descriptor, Vectors
 from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.frontend.frontend_config import FrontendConfig, MatchingConfig
 from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points
 from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.frontend.tracks import Image, Tracks
+from slam_graph.frontend.tracked_features import Image, Tracks
 from slam_graph.sensors.camera import Camera
 
 SAME_PX = 3.0

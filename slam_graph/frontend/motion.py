@@ -6,12 +6,10 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import ImuData
-
-FloatArray = NDArray[np.float64]
 
 HISTORY_NS = 2_000_000_000
 """How long samples are kept."""

@@ -11,10 +11,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.frontend.frontend_config import FrontendConfig
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MIN_POINTS = 8

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from slam_graph.frontend.base import Feedback
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import Mask, Points
 from slam_graph.frontend.motion import ImuMotion
-from slam_graph.frontend.tracks import Tracks
+from slam_graph.frontend.tracked_features import Tracks
 from slam_graph.sensors.rig import RigCamera
-
-FloatArray = NDArray[np.float64]
 
 NEAREST_DEPTH_M = 0.1
 """Points of the map nearer than this, or behind the camera, predict nothing."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.frontend.base import Feedback
-from slam_graph.frontend.config import FrontendConfig
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 

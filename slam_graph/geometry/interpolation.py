@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DEFAULT_MAX_GAP_S = 0.2
 

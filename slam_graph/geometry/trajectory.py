@@ -1,17 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory: time-stamped poses `world_T_body`, and what else is known at these times."""
+"""Writing trajectories as TUM files: `t[s] x y z qx qy qz qw`, nine decimals each.
+
+A trajectory: time-stamped poses `world_T_body`, and what else is known at these times.
+
+All states that a run has estimated, as compact rows: about 0.6 kB a frame.
+"""
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from slam_graph.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,3 +70,88 @@ class Trajectory:
         """`world_T_body` of one row."""
         x, y, z, w = self.quaternions[index]
         return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), self.positions[index])
+
+
+STATE_WIDTH = 16
+"""Position, quaternion (x y z w), velocity, gyroscope bias, accelerometer bias."""
+
+COVARIANCE_WIDTH = 15
+POSE_WIDTH = 6
+
+
+class StateHistory:
+    """Grows by one state at a time and gives arrays.
+
+    Where a state has no covariance its rows are NaN.
+    """
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._states = array("d")
+        self._sigmas = array("d")
+        self._pose_covariances = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def append(self, state: NavState) -> None:
+        """Add the state of the next frame."""
+        pose = state.world_T_body
+        quaternion: Any = pose.rotation().toQuaternion()  # an Eigen type that the stubs do not know
+        row = np.concatenate(
+            [
+                pose.translation(),
+                quaternion.coeffs(),
+                state.velocity,
+                state.gyro_bias,
+                state.accel_bias,
+            ]
+        )
+        covariance = state.covariance
+        if covariance is None:
+            covariance = np.full((COVARIANCE_WIDTH, COVARIANCE_WIDTH), np.nan)
+        variances = np.maximum(np.diag(covariance), 0.0)
+        self._stamps_ns.append(state.stamp_ns)
+        self._states.extend(row.tolist())
+        self._sigmas.extend(np.sqrt(variances).tolist())
+        self._pose_covariances.extend(covariance[:POSE_WIDTH, :POSE_WIDTH].ravel().tolist())
+
+    def trajectory(self) -> Trajectory:
+        """The states as a trajectory with velocities and biases."""
+        rows = _table(self._states, STATE_WIDTH)
+        return Trajectory(
+            np.array(self._stamps_ns, dtype=np.int64),
+            rows[:, 0:3],
+            rows[:, 3:7],
+            velocities=rows[:, 7:10],
+            gyro_biases=rows[:, 10:13],
+            accel_biases=rows[:, 13:16],
+        )
+
+    def sigmas(self) -> FloatArray:
+        """(N, 15) standard deviations, in the order and frames of `NavState.covariance`."""
+        return _table(self._sigmas, COVARIANCE_WIDTH)
+
+    def pose_covariances(self) -> FloatArray:
+        """(N, 6, 6) covariances of rotation and position, in the body frame."""
+        return _table(self._pose_covariances, POSE_WIDTH * POSE_WIDTH).reshape(
+            -1, POSE_WIDTH, POSE_WIDTH
+        )
+
+
+def _table(values: array[float], width: int) -> FloatArray:
+    """A copy of flat values as rows of `width`."""
+    return np.array(values, dtype=np.float64).reshape(-1, width)
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """A time in seconds with all nine decimals, which a float would not keep."""
+    sign, magnitude = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
+    return f"{sign}{magnitude // 10**9}.{magnitude % 10**9:09d}"
+
+
+def tum_lines(trajectory: Trajectory) -> Iterator[str]:
+    """The lines of a TUM file."""
+    rows = np.hstack([trajectory.positions, trajectory.quaternions])
+    for stamp, row in zip(trajectory.stamps_ns, rows, strict=True):
+        yield f"{seconds_text(int(stamp))} {' '.join(f'{value:.9f}' for value in row.tolist())}\n"

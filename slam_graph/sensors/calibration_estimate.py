@@ -9,11 +9,9 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.sensors.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.omnidirectional import (
     double_sphere,
@@ -26,7 +27,6 @@ from slam_graph.sensors.omnidirectional import (
     unified_inverse,
 )
 
-FloatArray = NDArray[np.float64]
 Distortion = Literal["none", "radtan", "equidistant", "mei", "double_sphere"]
 
 COEFFICIENTS: dict[Distortion, int] = {

@@ -10,9 +10,8 @@ front of the camera goes to q, they give NaN.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slam_graph.arrays import FloatArray
 
 
 def unified(m: FloatArray, xi: float) -> tuple[FloatArray, FloatArray]:

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.simulation.config import TrackConfig, random_stream
-from slam_graph.simulation.motion import IntArray
+from slam_graph.arrays import IntArray
+from slam_graph.simulation.simulation_config import TrackConfig, random_stream
 
 DESCRIPTOR_BYTES = 32
 

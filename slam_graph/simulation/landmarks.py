@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.simulation.config import LandmarkConfig
-from slam_graph.simulation.motion import FloatArray, IntArray, Motion
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.simulation_config import LandmarkConfig
 from slam_graph.simulation.views import View
 from slam_graph.simulation.world import World
 

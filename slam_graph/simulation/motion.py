@@ -14,15 +14,12 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """m/s², in the world."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.simulation.config import MovingObjectConfig, random_stream
-from slam_graph.simulation.motion import FloatArray, Motion
+from slam_graph.arrays import FloatArray
+from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.simulation_config import MovingObjectConfig, random_stream
 from slam_graph.simulation.world import Panel
 
 SMOOTHING_NS = 1_000_000_000

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.datasets.euroc import EurocSequence
+from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
+from slam_graph.simulation.simulation_config import SimulationConfig
 
 LEAD_NS = 100_000_000
 """How long before the first frame and after the last one a motion and its IMU go on."""

@@ -11,11 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.sensors.measurements import CameraFrame
 from slam_graph.sensors.rig import Rig, RigCamera
-from slam_graph.simulation.config import ImageConfig, random_stream
-from slam_graph.simulation.motion import FloatArray, Motion
+from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.moving_object import MovingBoard
+from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
 

@@ -8,22 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.sensors.kalibr import read_kalibr
+from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.config import SimulationConfig, random_stream
-from slam_graph.simulation.imu import ImuSource, RecordedImu, SimulatedImu
+from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
-from slam_graph.simulation.motion import FloatArray, IntArray, Motion
+from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.recorded_flight import LEAD_NS, RecordedFlight
 from slam_graph.simulation.rigs import euroc_rig
-from slam_graph.simulation.sequence import (
+from slam_graph.simulation.simulated_sequence import (
     Flight,
     SimulatedImages,
     SimulatedSequence,
     SimulatedTracks,
 )
+from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
 from slam_graph.simulation.splines import fit, stamps_between
 from slam_graph.simulation.trajectories import fly
 from slam_graph.simulation.views import View, camera_groups

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly, CubicSpline, make_lsq_spline
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.simulation.motion import FloatArray, IntArray, SplineMotion
+from slam_graph.simulation.motion import SplineMotion
 
 KNOT_SPACING_S = 0.1
 """Distance of the knots of a fitted spline: it follows motions of up to some 4 Hz, and smooths what

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.simulation.config import random_stream
+from slam_graph.simulation.simulation_config import random_stream
 
 Grey = NDArray[np.float32]
 

@@ -17,8 +17,9 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from slam_graph.simulation.config import FlightConfig
-from slam_graph.simulation.motion import FloatArray, SplineMotion
+from slam_graph.arrays import FloatArray
+from slam_graph.simulation.motion import SplineMotion
+from slam_graph.simulation.simulation_config import FlightConfig
 from slam_graph.simulation.splines import continuous, through_waypoints
 
 WAYPOINT_PERIOD_S = 0.25

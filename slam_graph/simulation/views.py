@@ -7,16 +7,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors.camera import WIDEST, Camera
 from slam_graph.sensors.rig import Rig, RigCamera
-from slam_graph.simulation.config import TrackConfig
-from slam_graph.simulation.motion import FloatArray
+from slam_graph.simulation.simulation_config import TrackConfig
 from slam_graph.simulation.world import World
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 OVERLAP_DEPTH_M = 4.0
 """At this depth it is looked whether two cameras see the same."""

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.simulation.motion import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.simulation.trajectories import ROOM_PITCH_M
-
-BoolArray = NDArray[np.bool_]
 
 HEADROOM_M = 1.2
 """Distance of floor and ceiling from a trajectory."""

@@ -9,10 +9,14 @@ from pathlib import Path
 
 import yaml
 
-from slam_graph.datasets.euroc_writer import EurocWriter
-from slam_graph.datasets.recorder import TrackRecorder
+from slam_graph.datasets.formats.euroc_writer import EurocWriter
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-from slam_graph.simulation.sequence import SimulatedImages, SimulatedSequence, SimulatedTracks
+from slam_graph.simulation.simulated_sequence import (
+    SimulatedImages,
+    SimulatedSequence,
+    SimulatedTracks,
+)
 
 SETTINGS = "simulation.yaml"
 

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slam_graph.arrays import FloatArray
 
 SIZE_INCHES = (11.0, 5.2)
 DPI = 110

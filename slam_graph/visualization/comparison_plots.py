@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slam_graph.arrays import FloatArray
 
 PANEL_INCHES = (5.6, 3.3)
 DPI = 100

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.geometry.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 SIZE_INCHES = (11.0, 4.5)
 DPI = 110

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from slam_graph.arrays import FloatArray
 
 SIZE_INCHES = (11.0, 5.2)
 DPI = 110

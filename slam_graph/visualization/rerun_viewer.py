@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.geometry.alignment import align_first_pose
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.geometry.trajectory_alignment import align_first_pose
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
 
-FloatArray = NDArray[np.float64]
 ViewerMode = Literal["save", "spawn", "connect"]
 
 TIMELINE = "time"

@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cost: residuals as a function of the variables, their linearisation and their gate.
+
+The cost is the sum of the marginal prior, factors of GTSAM (IMU, zero velocity), single
+observations of features that are in the state, and whole tracks of features that enter it now. A
+new feature either becomes a variable of the state or is used once, that is, marginalised as soon as
+it is linearised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+from numpy.typing import NDArray
+
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_factors import (
+    ReducedFeatures,
+    WhitenedObservations,
+    reduce_features,
+    robust_loss,
+    whiten,
+)
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.gating import Gate, Innovations, squared_mahalanobis, threshold
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.schur import CondensedFeatures, condense_features
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewFeatures:
+    """Features that enter the cost in this step with all of their observations.
+
+    Attributes:
+        obs: their tracks.
+        points: (J, 3) triangulated positions; moved by every Gauss-Newton step.
+        in_state: (J,) whether the feature stays as a variable or is used once.
+    """
+
+    obs: Observations
+    points: FloatArray
+    in_state: BoolArray
+
+    def subset(self, keep: BoolArray) -> NewFeatures:
+        """The features where `keep` (J,) holds."""
+        return NewFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearization:
+    """The cost, linear in an increment of the tangents.
+
+    Attributes:
+        tracked: observations of the features of the state.
+        fresh: new features: their rows apart, as the gate needs them, or summed up.
+    """
+
+    tracked: WhitenedObservations | None
+    fresh: ReducedFeatures | CondensedFeatures | None
+
+    def subset(self, tracked: BoolArray, fresh: BoolArray) -> Linearization:
+        """The tracked observations (N,), and of new features (J,) that are apart those, kept."""
+        return Linearization(
+            self.tracked.subset(tracked) if self.tracked is not None else None,
+            self.fresh.subset(fresh) if isinstance(self.fresh, ReducedFeatures) else self.fresh,
+        )
+
+
+@dataclass(eq=False)
+class Cost:
+    """All residuals of one step, as a function of the variables in `state`.
+
+    Attributes:
+        state: estimates and linearisation points.
+        rig: projection into the cameras.
+        config: noise and gating.
+        prior: what was marginalised before, over the offsets from the linearisation points; its
+            variables must be frozen.
+        factors: GTSAM's factors between the variables.
+        tracked: observations of features that are in the state already.
+        fresh: features that enter now.
+    """
+
+    state: State
+    rig: RigProjection
+    config: BackendConfig
+    prior: SquareRootInformation
+    factors: Sequence[gtsam.NonlinearFactor] = field(default_factory=list)
+    tracked: Observations | None = None
+    fresh: NewFeatures | None = None
+
+    def layout(self) -> Layout:
+        """Columns of the variables: those of the prior, then the new ones."""
+        keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
+        if self.fresh is not None:
+            keys += self.rig.keys_of(self.fresh.obs)
+            keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
+        return self.prior.layout.extended(
+            dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
+        )
+
+    def prior_at_estimate(self) -> SquareRootInformation:
+        """The prior as a function of an increment of the current estimates."""
+        prior = self.prior.shifted(self.state.offset(self.prior.layout))
+        layout = self.layout()
+        return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
+
+    def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
+        """The prior with only some of the factors and of the new features (J,)."""
+        features = None
+        if self.fresh is not None:
+            features = self.fresh.subset(fresh & (self.fresh.obs.counts > 1))
+            features = replace(features, obs=features.obs.without_idle_frames())
+        return Cost(self.state, self.rig, self.config, self.prior, factors, None, features)
+
+    def value(self) -> float:
+        """The cost at the current estimates: half the squared residuals, under the robust loss."""
+        offset = self.state.offset(self.prior.layout)
+        total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
+        total += 0.5 * self.prior.residual
+        total += sum(factor.error(self.state.estimate) for factor in self.factors)
+        if self.tracked is not None and len(self.tracked):
+            total += self._loss(self.tracked, None)
+        if self.fresh is not None and len(self.fresh.obs):
+            total += self._loss(self.fresh.obs, self.fresh.points)
+        return total
+
+    def _loss(self, obs: Observations, points: FloatArray | None) -> float:
+        errors = np.sqrt(self.squared_errors(obs, points))
+        return float(np.sum(robust_loss(errors, self.config.gating)))
+
+    def squared_errors(self, obs: Observations, points: FloatArray | None) -> FloatArray:
+        """Squared residuals (N,) of observations at the current estimates, in units of σ².
+
+        Args:
+            obs: of features at `points` (J, 3), or of features of the state where these are None.
+            points: in the world.
+        """
+        rig = self.rig.at(self.state)
+        residuals, _ = rig.residuals(obs, self._geometry(rig, self.state.estimate, obs, points))
+        squares = np.einsum("ni,ni->n", residuals, residuals)
+        return np.asarray(squares / self.config.noise.pixel_sigma**2, dtype=np.float64)
+
+    # --- linearisation -------------------------------------------------------------------------
+
+    def linearize(self, summed: bool = False) -> Linearization:
+        """Linearise all observations.
+
+        Args:
+            summed: whether new features are summed up; else their rows stay apart, as the gate
+                needs them.
+        """
+        self.state.relinearize()
+        tracked = fresh = None
+        if self.tracked is not None and len(self.tracked):
+            tracked = self._whitened(self.tracked, None)
+        if self.fresh is not None and len(self.fresh.obs):
+            whitened = self._whitened(self.fresh.obs, self.fresh.points)
+            reduce = condense_features if summed else reduce_features
+            fresh = reduce(self.fresh.obs, whitened)
+        return Linearization(tracked, fresh)
+
+    def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
+        rig = self.rig.at(self.state)
+        first, estimate = (
+            self._geometry(rig, values, obs, points)
+            for values in (self.state.first, self.state.estimate)
+        )
+        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating)
+
+    def _geometry(
+        self,
+        rig: RigProjection,
+        values: gtsam.Values,
+        obs: Observations,
+        points: FloatArray | None,
+    ) -> Geometry:
+        """Poses and points of observations; the points of features of the state if not given."""
+        if points is None:
+            points = stacked_points(values, obs.ids.tolist())
+        return Geometry(*rig.poses(values, obs.frames), points)
+
+    def factor_rows(self, layout: Layout) -> FloatArray:
+        """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
+        rows = []
+        for factor in self.factors:
+            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first))
+            A, _ = jacobian.jacobian()
+            b = gtsam.JacobianFactor(factor.linearize(self.state.estimate)).jacobian()[1]
+            Ab = np.zeros((len(b), layout.size + 1))
+            Ab[:, layout.indices(jacobian.keys())] = A
+            Ab[:, -1] = b
+            rows.append(Ab)
+        return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
+
+    def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
+        """Rows [A b] (m, n + 1) of all observations."""
+        parts = [np.zeros((0, layout.size + 1))]
+        if linear.tracked is not None and self.tracked is not None:
+            columns = self._tracked_columns(self.tracked, layout)
+            parts.append(_tracked_rows(linear.tracked, columns, layout))
+        if linear.fresh is not None and self.fresh is not None:
+            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
+            parts.append(_null_space_rows(linear.fresh, columns, layout))
+            parts.append(_new_variable_rows(self.fresh, linear.fresh, columns, layout))
+        return np.concatenate(parts)
+
+    # --- moving --------------------------------------------------------------------------------
+
+    def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
+        """Move the estimates by an increment (n,), and the new features with them."""
+        if self.fresh is not None and linear.fresh is not None:
+            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
+            step = linear.fresh.point_increments(delta[columns])
+            self.fresh = replace(self.fresh, points=self.fresh.points + step)
+        self.state.update(layout, delta)
+
+    def snapshot(self) -> tuple[State, NewFeatures | None]:
+        """What `apply` changes, to be given back to `restore`."""
+        return self.state.copy(), self.fresh
+
+    def restore(self, before: tuple[State, NewFeatures | None]) -> None:
+        """Undo what was applied since a snapshot."""
+        self.state.assign(before[0])
+        self.fresh = before[1]
+
+    # --- gating --------------------------------------------------------------------------------
+
+    def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
+        """Which tracked observations and new features pass the χ² test.
+
+        New features that are summed up all pass: they are not told apart before the steps.
+
+        Args:
+            linear: of this cost.
+            predicted: what is known of the variables before these measurements.
+        """
+        tracked = np.zeros(0, np.bool_)
+        fresh = np.zeros(0, np.bool_)
+        innovations, confidence = Innovations(), self.config.gating.confidence
+        if linear.tracked is not None and self.tracked is not None:
+            keys = self.rig.keys_of(self.tracked)
+            keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
+            columns = self._tracked_columns(self.tracked, Layout(dims_of(keys)))
+            P = predicted.covariance_blocks(keys, columns)
+            distance = squared_mahalanobis(linear.tracked.r, linear.tracked.H, P)
+            dof = np.full(len(distance), 2)
+            largest = threshold(dof, confidence)
+            # nearer or behind, the slope of the projection is so large that any residual would pass
+            near = linear.tracked.depths < self.config.triangulation.min_depth_m
+            tracked = (distance < largest) & ~near
+            innovations += Innovations.of(distance, dof, largest, tracked)
+        if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
+            fresh = np.ones(len(self.fresh.points), np.bool_)
+            innovations += Innovations.untested(2 * self.fresh.obs.counts - POINT_DIM)
+        elif isinstance(linear.fresh, ReducedFeatures) and self.fresh is not None:
+            P = predicted.covariance_of(self.rig.keys_of(self.fresh.obs))
+            distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
+            largest = threshold(linear.fresh.dof, confidence)
+            fresh = distance < largest
+            innovations += Innovations.of(distance, linear.fresh.dof, largest, fresh)
+        return Gate(tracked, fresh, innovations)
+
+    def _tracked_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
+        """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
+        poses = np.array([layout.columns[X(i)].start for i in obs.frames])
+        keys = [L(j) for j in obs.ids.tolist()]
+        points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
+        calibration = layout.indices(self.rig.calibration_keys)
+        return np.concatenate(
+            [
+                poses[obs.frame][:, None] + np.arange(6),
+                points[obs.feature][:, None] + np.arange(POINT_DIM),
+                np.broadcast_to(calibration, (len(obs), len(calibration))),
+            ],
+            axis=1,
+        )
+
+
+def _tracked_rows(
+    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """The rows of observations of features of the state."""
+    Ab = np.zeros((len(columns), 2, layout.size + 1))
+    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
+    Ab[:, :, -1] = linear.r
+    return Ab.reshape(-1, layout.size + 1)
+
+
+def _null_space_rows(
+    linear: ReducedFeatures | CondensedFeatures, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
+    compact = linear.null_space_rows()
+    if len(compact) > len(columns):
+        compact = triangularize(compact)
+    Ab = np.zeros((len(compact), layout.size + 1))
+    Ab[:, columns] = compact[:, :-1]
+    Ab[:, -1] = compact[:, -1]
+    return Ab
+
+
+def _new_variable_rows(
+    fresh: NewFeatures,
+    linear: ReducedFeatures | CondensedFeatures,
+    columns: NDArray[np.intp],
+    layout: Layout,
+) -> FloatArray:
+    """The three rows that determine each feature that stays in the state."""
+    features = np.flatnonzero(fresh.in_state)
+    Ab = np.zeros((len(features), POINT_DIM, layout.size + 1))
+    for row, j in enumerate(features):
+        Ab[row][:, layout.columns[L(int(fresh.obs.ids[j]))]] = linear.R_f[j]
+    Ab[:, :, columns] = linear.T[features]
+    Ab[:, :, -1] = linear.r_1[features]
+    return Ab.reshape(-1, layout.size + 1)

@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The feature observations of the frames in the cost, and tables of them for the solver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.sensors.measurements import FeatureFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Observations of some features in some frames, one row each, sorted by feature.
+
+    Attributes:
+        ids: (J,) features, ascending.
+        frames: the F frames, in the order of time.
+        feature: (N,) row of each observation's feature in `ids`.
+        frame: (N,) index of each observation's frame in `frames`.
+        camera: (N,) camera of each observation.
+        pixels: (N, 2) raw pixels.
+        normalized: (N, 2) undistorted coordinates.
+    """
+
+    ids: IntArray
+    frames: tuple[int, ...]
+    feature: IntArray
+    frame: IntArray
+    camera: IntArray
+    pixels: FloatArray
+    normalized: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.feature)
+
+    @property
+    def counts(self) -> IntArray:
+        """(J,) number of observations of each feature."""
+        return np.bincount(self.feature, minlength=len(self.ids))
+
+    @property
+    def slots(self) -> IntArray:
+        """(N,) running number of each observation within its feature."""
+        counts = self.counts
+        starts = np.cumsum(counts) - counts
+        return np.arange(len(self)) - starts[self.feature]
+
+    def rows(self, keep: NDArray[np.bool_] | IntArray) -> Observations:
+        """Some of the observations, by mask or number, of the same features."""
+        return Observations(
+            self.ids,
+            self.frames,
+            self.feature[keep],
+            self.frame[keep],
+            self.camera[keep],
+            self.pixels[keep],
+            self.normalized[keep],
+        )
+
+    def without_idle_frames(self) -> Observations:
+        """The same observations over only those frames that have any."""
+        used = np.unique(self.frame)
+        return replace(
+            self,
+            frames=tuple(self.frames[int(k)] for k in used),
+            frame=np.searchsorted(used, self.frame),
+        )
+
+    def subset(self, keep: NDArray[np.bool_]) -> Observations:
+        """The observations of the features where `keep` (J,) holds."""
+        rows = keep[self.feature]
+        renumbered = np.cumsum(keep) - 1
+        return Observations(
+            self.ids[keep],
+            self.frames,
+            renumbered[self.feature[rows]],
+            self.frame[rows],
+            self.camera[rows],
+            self.pixels[rows],
+            self.normalized[rows],
+        )
+
+
+class TrackWindow:
+    """The observations of the frames in the cost that have not been used yet.
+
+    Every observation enters the cost once: `consume` forgets those that have become part of the
+    prior. Rows are sorted by feature, then frame, then camera.
+
+    Attributes:
+        seen: ids (N,) of all features that the last frame saw, used or not, ascending.
+    """
+
+    def __init__(self) -> None:
+        self._ids = np.zeros(0, np.int64)
+        self._frames = np.zeros(0, np.int64)
+        self._cameras = np.zeros(0, np.int64)
+        self._pixels = np.zeros((0, 2))
+        self._normalized = np.zeros((0, 2))
+        self.seen = np.zeros(0, np.int64)
+
+    def add(self, index: int, frame: FeatureFrame) -> None:
+        """Add the observations of a new frame, later than all before."""
+        cameras = frame.cameras
+        self.seen = np.unique(np.concatenate([c.ids for c in cameras]))
+        ids = np.concatenate([self._ids, *(c.ids for c in cameras)])
+        count = len(ids) - len(self._ids)
+        numbers = [np.full(len(c), number) for number, c in enumerate(cameras)]
+        order = np.argsort(ids, kind="stable")
+        self._ids = ids[order]
+        self._frames = np.concatenate([self._frames, np.full(count, index)])[order]
+        self._cameras = np.concatenate([self._cameras, *numbers])[order]
+        self._pixels = np.concatenate([self._pixels, *(c.pixels for c in cameras)])[order]
+        self._normalized = np.concatenate([self._normalized, *(c.normalized for c in cameras)])[
+            order
+        ]
+
+    def retain(self, frames: Sequence[int]) -> None:
+        """Forget the observations of all other frames."""
+        self._select(np.isin(self._frames, frames))
+
+    def consume(self, ids: IntArray) -> None:
+        """Forget all observations of some features (ascending ids)."""
+        if len(ids):
+            self._select(~is_in(self._ids, ids))
+
+    def forget(self, obs: Observations) -> None:
+        """Forget single observations."""
+        if len(obs):
+            frames = np.array(obs.frames)[obs.frame]
+            key = self._key(obs.ids[obs.feature], frames, obs.camera)
+            self._select(~np.isin(self._key(self._ids, self._frames, self._cameras), key))
+
+    def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
+        """A number (N,) for each observation that no other one has."""
+        first = self._frames.min(initial=0)
+        span = self._frames.max(initial=0) - first + 1
+        count = self._cameras.max(initial=0) + 1
+        return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
+
+    def _select(self, rows: NDArray[np.bool_]) -> None:
+        if rows.all():
+            return
+        self._ids, self._frames, self._cameras = (
+            self._ids[rows],
+            self._frames[rows],
+            self._cameras[rows],
+        )
+        self._pixels, self._normalized = self._pixels[rows], self._normalized[rows]
+
+    def frames(self) -> set[int]:
+        """The frames with unused observations."""
+        return set(np.unique(self._frames).tolist())
+
+    def ids_in(self, index: int) -> IntArray:
+        """The features that any camera saw in one frame, ascending."""
+        return sorted_unique(self._ids[self._frames == index])
+
+    def parallax(self, before: int, after: int, turn: FloatArray) -> FloatArray:
+        """Angles (N,) in rad between the rays of the first camera to features in two frames.
+
+        Args:
+            before: a frame.
+            after: another.
+            turn: (3, 3) rotation from the camera at the first frame to that at the second.
+        """
+        i, j = (
+            np.flatnonzero((self._frames == index) & (self._cameras == 0))
+            for index in (before, after)
+        )
+        _, a, b = np.intersect1d(
+            self._ids[i], self._ids[j], assume_unique=True, return_indices=True
+        )
+        rays = (np.insert(self._normalized[rows], 2, 1.0, axis=1) for rows in (i[a], j[b]))
+        x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+        sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
+        return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
+
+    def lengths(self) -> tuple[IntArray, IntArray]:
+        """All features with unused observations (J,), and the number of frames that see each."""
+        new_frame = np.ones(len(self._ids), np.bool_)
+        new_frame[1:] = (np.diff(self._ids) != 0) | (np.diff(self._frames) != 0)
+        return np.unique(self._ids[new_frame], return_counts=True)
+
+    def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
+        """The unused observations of some features (ascending ids) in some or all frames."""
+        rows = is_in(self._ids, ids)
+        if frames is not None:
+            rows &= np.isin(self._frames, frames)
+        numbers = self._frames[rows]
+        order = np.unique(numbers)
+        return Observations(
+            ids,
+            tuple(order.tolist()),
+            np.searchsorted(ids, self._ids[rows]),
+            np.searchsorted(order, numbers),
+            self._cameras[rows],
+            self._pixels[rows],
+            self._normalized[rows],
+        )
+
+
+def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
+    """Which values (N,) are among some ascending ones."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    place = np.minimum(np.searchsorted(ascending, values), len(ascending) - 1)
+    return np.asarray(ascending[place] == values)
+
+
+def sorted_unique(values: IntArray) -> IntArray:
+    """The distinct values of an ascending array."""
+    first = np.ones(len(values), np.bool_)
+    first[1:] = values[1:] != values[:-1]
+    return values[first]

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The Mahalanobis (χ²) gate: is a residual as large as its predicted covariance allows?"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammainc, gammaincinv
+
+from slam_graph.arrays import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Innovations:
+    """How far the measurements of one step were from what was predicted of them.
+
+    A measurement is a new feature with all of its observations, or one observation of a feature of
+    the state; where the gate is on what remains after the steps, each single observation. Distances
+    are squared Mahalanobis distances, which the gate judges.
+
+    Attributes:
+        tested: number of measurements.
+        rejected: how many of them the gate left out.
+        distance: sum of the distances of all that were tested.
+        dof: sum of their degrees of freedom.
+        passed_distance: of those that passed; jointly, where the engine knows that.
+        passed_dof: sum of the degrees of freedom of those that passed.
+        expected: mean of the sum of the distances of those that passed if all covariances are
+            right: less than `passed_dof`, as the gate cuts off the tail of the distribution.
+    """
+
+    tested: int = 0
+    rejected: int = 0
+    distance: float = 0.0
+    dof: int = 0
+    passed_distance: float = 0.0
+    passed_dof: int = 0
+    expected: float = 0.0
+
+    @staticmethod
+    def of(
+        distances: FloatArray, dof: NDArray[np.int64], largest: FloatArray, passed: BoolArray
+    ) -> Innovations:
+        """The sums over J measurements.
+
+        Args:
+            distances: (J,) squared Mahalanobis distances.
+            dof: (J,) their degrees of freedom.
+            largest: (J,) what the gate lets through.
+            passed: (J,) what it let through.
+        """
+        k, q = 0.5 * dof[passed], 0.5 * largest[passed]
+        # a χ² variable of k degrees of freedom, cut off at q, has the mean k F(k + 2, q) / F(k, q)
+        means = dof[passed] * gammainc(k + 1.0, q) / gammainc(k, q)
+        return Innovations(
+            len(distances),
+            int(np.sum(~passed)),
+            float(np.sum(distances)),
+            int(np.sum(dof)),
+            float(np.sum(distances[passed])),
+            int(np.sum(dof[passed])),
+            float(np.sum(means)),
+        )
+
+    @staticmethod
+    def untested(dof: NDArray[np.int64]) -> Innovations:
+        """Measurements with degrees of freedom (J,) that enter without a gate."""
+        total = int(np.sum(dof))
+        return Innovations(passed_dof=total, expected=float(total))
+
+    def __add__(self, other: Innovations) -> Innovations:
+        return Innovations(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gate:
+    """What the gate of one step lets through.
+
+    Attributes:
+        tracked: (N,) observations of features of the state that pass.
+        fresh: (J,) new features that pass.
+        innovations: their distances.
+    """
+
+    tracked: BoolArray
+    fresh: BoolArray
+    innovations: Innovations
+
+
+def squared_mahalanobis(r: FloatArray, H: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Squared Mahalanobis distances of whitened residuals.
+
+    Args:
+        r: (J, m) residuals in standard deviations of their measurement noise.
+        H: (J, m, n) their derivatives by the state.
+        covariance: (n, n) of the state, or (J, n, n).
+
+    Returns:
+        (J,) rᵀ (H P Hᵀ + I)⁻¹ r; χ² distributed with m degrees of freedom.
+    """
+    S = H @ covariance @ H.transpose(0, 2, 1) + np.eye(H.shape[1])
+    distances: FloatArray = np.einsum("ji,ji->j", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+    return distances
+
+
+def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:
+    """The χ² quantile for each number of degrees of freedom."""
+    table = _quantiles(int(dof.max(initial=1)), confidence)
+    return table[dof]
+
+
+@lru_cache(maxsize=64)
+def _quantiles(largest: int, confidence: float) -> FloatArray:
+    # the quantile of χ² with k degrees of freedom is 2 P⁻¹(k/2, p), P the incomplete gamma function
+    return np.concatenate([[0.0], 2.0 * gammaincinv(0.5 * np.arange(1, largest + 1), confidence)])

@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""From one frame to the next: the state is predicted from the IMU, and the factor says how well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+from gtsam.symbol_shorthand import B
+
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_noise import DynamicsNoise, predicted_covariance
+from slam_graph.backend.cost.imu_factor import (
+    ImuBuffer,
+    imu_factor,
+    predict,
+    preintegrate,
+)
+from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
+from slam_graph.backend.window import Window
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.rig import ImuNoise
+
+
+class Propagation:
+    """Appends a new frame to a window by the dynamics model.
+
+    Attributes:
+        noise: of the IMU, which is learned on the way.
+    """
+
+    def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
+        self.config = config
+        self.diagnostics = diagnostics
+        self.noise = DynamicsNoise(imu, config.noise)
+        self._last: NavState | None = None
+        self._predicted: NavState | None = None
+
+    def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
+        """Make a new frame the current one.
+
+        Args:
+            window: gets the predicted state of the new frame, and the factors that tie it to the
+                frame before.
+            imu: samples up to the frame.
+            stamp_ns: time of the frame on the clock of the IMU.
+            still: whether the platform has not moved.
+        """
+        i, j = window.frame, window.frame + 1
+        previous = window.state.nav_state(i, window.stamp_ns, None)
+        samples = imu.between(window.stamp_ns, stamp_ns)
+        bias = window.state.estimate.atConstantBias(B(i))
+        pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
+        predicted = predict(previous, pim, stamp_ns)
+        window.state.insert_imu_state(j, predicted)
+        window.past.append(i)
+        window.moving.append(i)
+        window.frame, window.stamp_ns = j, stamp_ns
+        factor = imu_factor(i, j, pim)
+        window.factors.append(factor)
+        self._predicted = None if still else self._with_covariance(predicted, factor, window)
+        if still:
+            window.factors += zero_velocity_factors(i, j, self.config.zero_velocity)
+
+    def _with_covariance(
+        self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window
+    ) -> NavState | None:
+        """A prediction from the last state, with its covariance where that is known."""
+        last = self._last
+        if last is None or last.covariance is None:
+            return None
+        covariance = predicted_covariance(factor, window.state.estimate, last.covariance)
+        return replace(predicted, covariance=covariance)
+
+    def learn(self, state: NavState) -> None:
+        """Learn the noise of the IMU from what a step made of the last prediction."""
+        if self._last is not None and self._predicted is not None:
+            dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
+            self.noise.learn(self._predicted, state, dt_s)
+        self._last = state
+
+    def _params(
+        self, imu: ImuBuffer, start_ns: int, end_ns: int
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Noise of the IMU, much larger where samples are missing."""
+        gap_s = imu.largest_gap_s(start_ns, end_ns)
+        if gap_s <= self.config.noise.max_imu_gap_s:
+            return self.noise.params()
+        self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
+        return self.noise.params(self.config.noise.imu_gap_scale)

@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features of GTSAM's smoothers: which are variables, and which observations become factors.
+
+A feature enters with all its observations in the lag once these determine it, and is observed once
+more in every later state that sees it. It leaves when it was not seen for the lag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow, is_in
+from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
+from slam_graph.backend.policies import SmootherPolicy
+from slam_graph.backend.solve.state import stacked_points, stacked_poses
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.sensors.rig import Rig
+
+GATE_SCALE = 4.0
+"""The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
+OUTLIER_PX = 3.0
+"""Features with a larger root mean square reprojection error do not enter, in units of σ."""
+
+
+@dataclass(eq=False)
+class NewObservations:
+    """What the images add to the graph at one state.
+
+    Attributes:
+        factors: one for each observation.
+        points: the features that enter.
+        seen: keys of all features with a new observation.
+    """
+
+    factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    points: gtsam.Values = field(default_factory=gtsam.Values)
+    seen: list[int] = field(default_factory=list)
+
+
+class SmootherFeatures:
+    """Chooses features and makes their factors.
+
+    Attributes:
+        active: ids (N,) of the features that are variables, ascending.
+        rejected: ids (N,) of those whose last observation the gate rejected.
+        innovations: how far the last observations of these were from what was predicted, by a
+            covariance that lacks that of the features.
+    """
+
+    def __init__(
+        self, rig: Rig, policy: SmootherPolicy, config: BackendConfig, diagnostics: Diagnostics
+    ) -> None:
+        self.active = np.zeros(0, np.int64)
+        self.rejected = np.zeros(0, np.int64)
+        self.innovations = Innovations()
+        self._policy = policy
+        self._config = config
+        self._diagnostics = diagnostics
+        self._rig = RigProjection(rig)
+        gating = config.gating.model_copy(update={"robust_loss": policy.robust_loss})
+        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, gating))
+        angle = max(policy.min_parallax_rad, config.triangulation.min_parallax_rad)
+        self._triangulation = config.triangulation.model_copy(update={"min_parallax_rad": angle})
+
+    def retain(self, estimate: gtsam.Values) -> None:
+        """Forget the features that are no variables any more."""
+        kept = [j for j in self.active.tolist() if estimate.exists(L(j))]
+        self.active = np.array(kept, np.int64)
+
+    def observe(
+        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, covariance: FloatArray
+    ) -> NewObservations:
+        """The observations of the graph's newest state.
+
+        Args:
+            tracks: observations that are not in the graph yet.
+            frame: index of the newest state.
+            estimate: of the poses in `tracks`, the newest one predicted, and of the features.
+            covariance: (6, 6) of the predicted pose.
+        """
+        new = NewObservations()
+        seen = np.intersect1d(self.active, tracks.ids_in(frame), True)
+        again = tracks.observations(seen, [frame])
+        tracks.consume(self.active)
+        again = again.rows(self._gate(again, estimate, covariance))
+        ids = np.unique(again.ids[again.feature])
+        self._add(new, again, ids)
+        room = self._policy.max_features - len(ids)
+        entering, points = self._entering(tracks, frame, estimate, room)
+        for j, point in zip(entering.ids.tolist(), points, strict=True):
+            new.points.insert(L(j), point)
+        self._add(new, entering, entering.ids)
+        tracks.consume(entering.ids)
+        self.active = np.union1d(self.active, entering.ids)
+        return new
+
+    def _add(self, new: NewObservations, obs: Observations, ids: IntArray) -> None:
+        new.factors += self._factors.of(obs)
+        new.seen += [L(j) for j in ids.tolist()]
+
+    def _gate(
+        self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Which observations (N,) are where the predicted pose lets them be."""
+        self.rejected = np.zeros(0, np.int64)
+        self.innovations = Innovations()
+        if len(obs) == 0:
+            return np.zeros(0, np.bool_)
+        at = Geometry(
+            *stacked_poses(estimate, obs.frames), stacked_points(estimate, obs.ids.tolist())
+        )
+        residuals, depths = self._rig.residuals(obs, at)
+        by_pose, _ = self._rig.jacobians(obs, at)
+        sigma = self._config.noise.pixel_sigma
+        distances = squared_mahalanobis(residuals / sigma, by_pose / sigma, covariance)
+        dof = np.full(len(obs), 2)
+        largest = GATE_SCALE * threshold(dof, self._config.gating.confidence)
+        good = (distances < largest) & (depths > 0.0)
+        self.rejected = np.unique(obs.ids[obs.feature[~good]])
+        self.innovations = Innovations.of(distances, dof, largest, good)
+        self._diagnostics.counts["feature_rejected_by_gate"] += self.innovations.rejected
+        return np.asarray(good)
+
+    def _entering(
+        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, room: int
+    ) -> tuple[Observations, FloatArray]:
+        """New variables: the longest tracks that are seen now and determine a point."""
+        ids, lengths = tracks.lengths()
+        ready = (lengths >= self._policy.min_feature_frames) & is_in(ids, tracks.ids_in(frame))
+        ids, lengths = ids[ready], lengths[ready]
+        obs = tracks.observations(ids)
+        if len(ids) == 0 or room <= 0:
+            return obs.subset(np.zeros(len(ids), np.bool_)), np.zeros((0, 3))
+        poses = stacked_poses(estimate, obs.frames)
+        result = triangulate(obs, self._rig, *poses, self._triangulation)
+        fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
+        good = result.good & fits
+        longest = np.argsort(-np.where(good, lengths, 0), kind="stable")[:room]
+        chosen = np.zeros(len(ids), np.bool_)
+        chosen[longest] = True
+        chosen &= good
+        return obs.subset(chosen), result.points[chosen]

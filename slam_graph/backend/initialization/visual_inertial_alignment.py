@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Visual-inertial alignment: velocity, gravity and scale of a short window in closed form.
+
+With rotations R_k and the doubly integrated specific force α_k of a gyroscope of known bias, the
+body is at p_k = v₀ t_k + ½ g t_k² + α_k in the frame of the first body. Every observation m of a
+feature f then gives two equations that are linear in (f, v₀, g),
+
+    (I₂ | -m) (R_camᵀ (R_kᵀ (f - p_k) - p_cam)) = 0,
+
+(Dong-Si & Mourikis 2012). The features are eliminated one by one, and the six remaining unknowns
+are solved for under the constraint that gravity has its known length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_factors import eliminate_points
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.solve.square_root import triangularize
+
+REWEIGHTINGS = 2
+"""How often the equations are weighed anew by the depths that they gave."""
+MIN_DEPTH_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The inertial motion of the body relative to its first frame, up to velocity and gravity.
+
+    Attributes:
+        times_s: (K,) since the first frame.
+        rotations: (K, 3, 3) first_R_body.
+        displacements: (K, 3) α, the double integral of the rotated specific force.
+        velocities: (K, 3) its single integral.
+    """
+
+    times_s: FloatArray
+    rotations: FloatArray
+    displacements: FloatArray
+    velocities: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """What the alignment found, in the frame of the first body.
+
+    Attributes:
+        velocity: (3,) of the body at the first frame.
+        gravity: (3,) m/s².
+    """
+
+    velocity: FloatArray
+    gravity: FloatArray
+
+    def positions(self, motion: Motion) -> FloatArray:
+        """(K, 3) of the body."""
+        t = motion.times_s[:, None]
+        return self.velocity * t + 0.5 * self.gravity * t**2 + motion.displacements
+
+    def velocities(self, motion: Motion) -> FloatArray:
+        """(K, 3) of the body."""
+        return self.velocity + self.gravity * motion.times_s[:, None] + motion.velocities
+
+
+def align(
+    obs: Observations, motion: Motion, rig: RigProjection, gravity: float
+) -> Alignment | None:
+    """Solve for velocity and gravity.
+
+    Args:
+        obs: features seen from at least two of the K frames.
+        motion: inertial motion between the frames.
+        rig: mounting of the cameras.
+        gravity: its magnitude, m/s².
+
+    Returns:
+        None if the equations do not determine a solution.
+    """
+    weights = np.ones(len(obs))
+    alignment = None
+    for _ in range(1 + REWEIGHTINGS):
+        A, b = _reduced_equations(obs, motion, rig, weights)
+        try:
+            alignment = constrained_solution(A, b, gravity)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        weights = 1.0 / _depths(obs, motion, rig, alignment, weights)
+    return alignment
+
+
+def alignment_equations(
+    obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coefficients of f (N, 2, 3) and of (v₀, g) (N, 2, 6), and right-hand sides (N, 2)."""
+    camera_R_body = rig.body_R_camera[obs.camera].transpose(0, 2, 1)
+    rows = np.zeros((len(obs), 2, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[:, :, 2] = -obs.normalized
+    in_body = rows @ camera_R_body * weights[:, None, None]
+    by_point = in_body @ motion.rotations[obs.frame].transpose(0, 2, 1)
+    t = motion.times_s[obs.frame][:, None, None]
+    by_motion = np.concatenate([-by_point * t, -0.5 * by_point * t**2], axis=2)
+    b = np.einsum("nij,nj->ni", by_point, motion.displacements[obs.frame])
+    b += np.einsum("nij,nj->ni", in_body, rig.body_p_camera[obs.camera])
+    return by_point, by_motion, b
+
+
+def _reduced_equations(
+    obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The equations (rows, 6) and right-hand sides (rows,) that no longer contain the features."""
+    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
+    _, eliminated = eliminate_points(obs, by_point, np.concatenate([by_motion, b[:, :, None]], 2))
+    rest = eliminated[:, 3:].reshape(-1, 7)
+    return rest[:, :6], rest[:, 6]
+
+
+def _depths(
+    obs: Observations, motion: Motion, rig: RigProjection, found: Alignment, weights: FloatArray
+) -> FloatArray:
+    """Depths (N,) of the features in their cameras under an alignment."""
+    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
+    rest = b - by_motion @ np.concatenate([found.velocity, found.gravity])
+    R, right = eliminate_points(obs, by_point, rest[:, :, None])
+    points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :3])[:, :, 0]
+    p = found.positions(motion)[obs.frame]
+    in_body = np.einsum("nji,nj->ni", motion.rotations[obs.frame], points[obs.feature] - p)
+    camera_axis = rig.body_R_camera[obs.camera][:, :, 2]
+    depths = np.einsum("ni,ni->n", camera_axis, in_body - rig.body_p_camera[obs.camera])
+    return np.asarray(np.maximum(np.abs(depths), MIN_DEPTH_M), dtype=np.float64)
+
+
+def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignment:
+    """Least squares under |g| = gravity: a secular equation in the Lagrange multiplier."""
+    R = triangularize(np.column_stack([A, b]))
+    of_v, of_g, right = R[:3, :3], R[3:6, 3:6], R[3:6, 6]
+    values, vectors = np.linalg.eigh(of_g.T @ of_g)
+    projected = vectors.T @ (of_g.T @ right)
+
+    def excess(multiplier: float) -> float:
+        return float(np.sum((projected / (values + multiplier)) ** 2) - gravity**2)
+
+    low = -values[0] + 1e-12 * max(values[-1], 1e-12)
+    high = np.linalg.norm(projected) / gravity + values[-1]
+    multiplier = brentq(excess, low, high) if excess(low) > 0 else low
+    g = vectors @ (projected / (values + multiplier))
+    length = np.linalg.norm(g)
+    if length == 0.0:
+        raise ValueError("the equations do not see gravity")
+    g *= gravity / length
+    v = np.linalg.solve(of_v, R[:3, 6] - R[:3, 3:6] @ g)
+    return Alignment(v, g)

@@ -1,0 +1,182 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The features that an EKF keeps when it no longer sees them, at no cost until it sees them again.
+
+When variables e are eliminated from a Gaussian over (e, s), it falls into p(e | s) p(s). Filters go
+on with p(s). The rows of p(e | s) are all that is ever known of a feature in e as long as it is not
+measured again: no later measurement of s changes them. So they are put aside as they are, and the
+filter goes on with what it tracks. This is the joint Gaussian of all features, exactly, in the form
+of a Bayes net (Kaess et al. 2008) and not as one dense matrix, whose update is O(n²) in the number
+n of all features.
+
+When a feature is seen again, its conditional is multiplied with those that were put aside after it,
+and what they eliminated is eliminated from the product. That pays as long as features that are lost
+stay lost, as those of a tracker do. Where identities come back again and again, everything is
+recalled once and the archive is closed: from then on the filter holds on to all features in one
+dense matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from gtsam import Symbol
+from gtsam.symbol_shorthand import L
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.solve.square_root import (
+    Conditional,
+    Layout,
+    SquareRootInformation,
+    triangularize,
+)
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
+
+MAX_EXCHANGES = 300
+"""So many conditionals are worked over for recalled features before the archive is closed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Where a feature is: which conditional eliminated it, and its linearisation point (3,)."""
+
+    conditional: int
+    first: FloatArray
+
+
+class FeatureArchive:
+    """Conditionals of eliminated variables, in the order of elimination.
+
+    They are over the offsets of all variables from the first linearisation point that each had.
+
+    Attributes:
+        open: whether it takes features; a closed one is empty.
+    """
+
+    def __init__(self) -> None:
+        self.open = True
+        self._exchanges = 0
+        self._conditionals: list[Conditional] = []
+        self._places: dict[int, _Place] = {}
+        self._moved: dict[int, FloatArray] = {}  # how far linearisation points are from the first
+
+    def __len__(self) -> int:
+        """How many features are put aside."""
+        return len(self._places)
+
+    @property
+    def size(self) -> int:
+        """Dimension of what is put aside."""
+        return POINT_DIM * len(self._places)
+
+    def put(self, conditional: Conditional, state: State) -> None:
+        """Put eliminated variables aside.
+
+        Args:
+            conditional: of all variables that a step eliminated, over an increment of their
+                estimates.
+            state: that still has them.
+        """
+        for key in conditional.gone.dims:
+            symbol = Symbol(key)
+            if symbol.chr() == ord("l"):
+                first = np.asarray(state.first.atPoint3(key))
+                self._places[symbol.index()] = _Place(len(self._conditionals), first)
+        offset = np.concatenate([state.offset(part) for part in conditional.layouts])
+        self._conditionals.append(conditional.shifted(-offset - self._bases(conditional)))
+
+    def follow(self, state: State) -> None:
+        """Take note that the linearisation points of all variables move to their estimates now."""
+        for key, offset in state.offsets.items():
+            if offset.any():
+                self._moved[key] = self._moved.get(key, 0.0) + offset
+
+    def _bases(self, conditional: Conditional) -> FloatArray:
+        """How far the linearisation points of variables (w + n,) are from their first ones."""
+        keys = [(key, dim) for part in conditional.layouts for key, dim in part.dims.items()]
+        parts = [self._moved.get(key, np.zeros(dim)) for key, dim in keys]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def due(self, seen: IntArray) -> IntArray:
+        """Which features must become variables again: of those seen; all if the archive closes."""
+        again = [j for j in seen.tolist() if j in self._places]
+        if again and self._exchanges > MAX_EXCHANGES:
+            again = list(self._places)
+        return np.array(again, dtype=np.int64)
+
+    def recall(
+        self, features: IntArray, prior: SquareRootInformation, state: State
+    ) -> SquareRootInformation:
+        """Make features variables of the state again.
+
+        Args:
+            features: ids of features that are put aside.
+            prior: over the offsets of the variables in the state.
+            state: gets the features.
+
+        Returns:
+            The prior with the features before all other variables.
+        """
+        places = {int(j): self._places.pop(int(j)) for j in features}
+        carried = Conditional.nothing()
+        wanted = {L(j) for j in places}
+        first = min(place.conditional for place in places.values())
+        self._exchanges += len(self._conditionals) - first
+        for k in range(first, len(self._conditionals)):
+            self._conditionals[k], carried = _exchanged(self._conditionals[k], carried, wanted)
+        if not self._places and self._exchanges > MAX_EXCHANGES:
+            self.open = False
+            self._conditionals.clear()
+        carried = carried.shifted(self._bases(carried))
+        for j, place in places.items():
+            state.insert_point(j, place.first)
+        state.update(carried.gone, carried.solution(state.offset(carried.given)))
+        state.freeze(wanted)
+        return _joined(carried, prior)
+
+
+def _exchanged(
+    conditional: Conditional, carried: Conditional, wanted: set[int]
+) -> tuple[Conditional, Conditional]:
+    """Change the order of elimination: wanted variables after the others of a conditional.
+
+    Args:
+        conditional: p(e, w | s), w being those of its variables that are wanted.
+        carried: p(w' | e, …), the wanted variables that were eliminated before.
+        wanted: keys of all wanted variables.
+
+    Returns:
+        p(e | w, w', s, …) and p(w, w' | s, …).
+    """
+    if not carried.gone.size and wanted.isdisjoint(conditional.gone.dims):
+        return conditional, carried
+    gone = [key for key in conditional.gone.dims if key not in wanted]
+    found = [*carried.gone.dims, *(key for key in conditional.gone.dims if key in wanted)]
+    parts = (conditional, carried)
+    known = {*gone, *found}
+    parents = dict.fromkeys([*conditional.given.dims, *carried.given.dims])
+    given = [key for key in parents if key not in known]
+    layout = Layout(dims_of([*gone, *found, *given]))
+    rows = np.zeros((sum(len(part.rows) for part in parts), layout.size + 1))
+    top = 0
+    for part in parts:
+        columns = np.append(layout.indices(part.keys), layout.size)
+        rows[top : top + len(part.rows), columns] = part.rows
+        top += len(part.rows)
+    triangle = triangularize(rows)
+    width = Layout(dims_of(gone)).size
+    return (
+        Conditional(Layout(dims_of(gone)), Layout(dims_of([*found, *given])), triangle[:width]),
+        Conditional(Layout(dims_of(found)), Layout(dims_of(given)), triangle[width:top, width:]),
+    )
+
+
+def _joined(carried: Conditional, prior: SquareRootInformation) -> SquareRootInformation:
+    """p(w | s) p(s) as one Gaussian over (w, s)."""
+    w, n = carried.gone.size, prior.layout.size
+    layout = Layout({**carried.gone.dims, **prior.layout.dims})
+    Rd = np.zeros((w + n + 1, w + n + 1), order="F")
+    Rd[w:, w:] = prior.Rd
+    Rd[:w, np.append(layout.indices(carried.keys), w + n)] = carried.rows
+    return SquareRootInformation(layout, Rd)

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Module 3, marginalization: variables leave, and the Gaussian prior that they leave behind.
+
+min over (x_K, x_M) of c = min over x_K of (min over x_M of c): the inner minimum of the linearised
+cost is again a quadratic in x_K, the marginal prior. A QR whose columns begin with x_M gives it
+without forming the information matrix (see `SquareRootInformation.marginal`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from slam_graph.backend.cost.construction import ConstructedCost
+from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.marginalization.observability import relinearized
+from slam_graph.backend.policies import MarginalizationPolicy
+from slam_graph.backend.solve.gauss_newton import Minimum, linearized
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State
+from slam_graph.backend.window import Window
+
+LinearizationPoints = Literal["first", "current", "corrected"]
+"""Where variables of the prior are linearised (see `marginalize`)."""
+
+
+def marginalize_step(
+    window: Window,
+    constructed: ConstructedCost,
+    minimum: Minimum,
+    policy: MarginalizationPolicy,
+) -> None:
+    """Let go of what does not stay after a step.
+
+    Args:
+        window: loses the variables and observations that leave, and gets the new prior.
+        constructed: the cost of the step, at its minimum, and what stays.
+        minimum: what the steps have come to.
+        policy: which residuals become part of the prior.
+    """
+    posterior = minimum.posterior
+    keep = window.keys(constructed.past, constructed.moving, constructed.features)
+    if policy.absorb == "all":
+        window.factors = []
+    else:
+        staying = set(keep)
+        stays = [staying.issuperset(factor.keys()) for factor in window.factors]
+        leaving = [f for f, stay in zip(window.factors, stays, strict=True) if not stay]
+        posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
+        window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
+    _keep_landmarks(window, constructed)
+    archive = window.archive if constructed.keep_lost_features else None
+    points: LinearizationPoints = "first" if policy.first_estimates else "current"
+    if policy.first_estimates and minimum.repeated:
+        points = "corrected"
+    window.prior = marginalize(posterior, window.state, keep, points, archive)
+    window.past, window.moving = list(constructed.past), list(constructed.moving)
+    window.features = constructed.features
+    window.tracks.retain([*constructed.past, window.frame])
+
+
+def _keep_landmarks(window: Window, constructed: ConstructedCost) -> None:
+    """Remember where the features are that the next step uses again, forget the others."""
+    fresh = constructed.cost.fresh
+    if fresh is None:
+        return
+    window.used = fresh.obs.ids, fresh.points
+    again = ~constructed.leaving
+    window.landmarks = fresh.obs.ids[again], fresh.points[again]
+    if len(constructed.leaving):
+        window.tracks.consume(fresh.obs.ids[constructed.leaving])
+
+
+def marginalize(
+    posterior: SquareRootInformation,
+    state: State,
+    keep: Sequence[int],
+    points: LinearizationPoints,
+    archive: FeatureArchive | None = None,
+) -> SquareRootInformation:
+    """Eliminate all variables but `keep` and make the rest the prior of the next step.
+
+    Args:
+        posterior: over an increment of the current estimates; of the residuals that are to become
+            part of the prior.
+        state: the variables that leave are removed from it.
+        keep: keys that stay, in the order of the new prior's columns; those that the posterior does
+            not contain stay free of it.
+        points: where the variables that stay are linearised from now on: where the prior was made
+            (first-estimates Jacobians), at their estimates, or there without the prior gaining
+            information about what no measurement sees.
+        archive: gets what the variables that leave are, given those that stay.
+
+    Returns:
+        The prior as a function of the offsets of the estimates from their linearisation points.
+    """
+    staying = set(keep)
+    conditional, prior = posterior.divided([key for key in keep if key in posterior.layout])
+    if archive is not None:
+        archive.put(conditional, state)
+    state.remove([key for key in state.variables() if key not in staying])
+    if points != "first" and archive is not None:
+        archive.follow(state)
+    if points == "current":
+        state.rebase()
+    elif points == "corrected":
+        prior = relinearized(prior, state)
+    state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
+    return prior.shifted(-state.offset(prior.layout))

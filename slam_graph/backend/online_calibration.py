@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of the rig as variables of the state: which they are, and what is known at first.
+
+`E(c)` is the pose body_T_camera of camera c, `K(c)` its (fx, fy, cx, cy), `D(c)` the coefficients
+of its distortion, and `T(0)` the time offset t_imu - t_camera in seconds, one for the rig. They are
+in the state and in its prior from the start and never leave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import D, E, K, T
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import CalibrationConfig
+from slam_graph.backend.cost.imu_factor import ImuBuffer
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import FrameMotion, State, dim, dims_of
+from slam_graph.sensors.calibration_estimate import CalibrationEstimate
+from slam_graph.sensors.rig import Rig, RigCamera
+
+MAX_HELD_NS = 50_000_000
+"""By how much the time of a frame may be taken too early, where the IMU has no samples yet."""
+
+FAR = 0.3
+"""A step that moves the parameters by more standard deviations (root mean square) is repeated."""
+
+
+class CalibrationVariables:
+    """Which parameters of a rig are variables.
+
+    Attributes:
+        nominal: the rig as it was calibrated before.
+        keys: of the variables, camera by camera, the time offset last; empty if there are none.
+        estimates_offset: whether the time offset is one of them.
+    """
+
+    def __init__(self, nominal: Rig, config: CalibrationConfig) -> None:
+        self.nominal = nominal
+        self.config = config
+        self.estimates_offset = config.time_offset
+        self.keys = tuple(self._keys())
+
+    def _keys(self) -> Iterator[int]:
+        for c, mounted in enumerate(self.nominal.cameras):
+            if self.config.extrinsics:
+                yield E(c)
+            if self.config.intrinsics:
+                yield K(c)
+            if self.config.distortion and mounted.camera.coefficients:
+                yield D(c)
+        if self.config.time_offset:
+            yield T(0)
+
+    # --- the start -------------------------------------------------------------------------------
+
+    def enter(self, state: State, prior: SquareRootInformation) -> SquareRootInformation:
+        """Add the parameters to a state, at their nominal values.
+
+        Returns:
+            The prior on the state, extended by what is known of the parameters.
+        """
+        if not self.keys:
+            return prior
+        state.insert_calibration(self._nominal_values())
+        state.freeze(self.keys)
+        sigmas = np.concatenate([self._sigmas(key) for key in self.keys])
+        n = prior.layout.size
+        rows = np.zeros((len(sigmas), n + len(sigmas) + 1))
+        rows[:, n:-1] = np.diag(1.0 / sigmas)
+        return prior.extended(dims_of(self.keys)).updated(rows)
+
+    def _nominal_values(self) -> gtsam.Values:
+        values = gtsam.Values()
+        for key in self.keys:
+            kind, c = _kind_and_camera(key)
+            mounted = self.nominal.cameras[c]
+            if kind == "e":
+                values.insert(key, mounted.body_T_camera)
+            elif kind == "k":
+                values.insert(key, mounted.camera.intrinsics)
+            elif kind == "d":
+                values.insert(key, np.array(mounted.camera.coefficients))
+            else:
+                values.insert(key, np.array([mounted.time_offset_s]))
+        return values
+
+    def _sigmas(self, key: int) -> FloatArray:
+        """Prior standard deviations (dim,) of a variable, in its tangent."""
+        kind, c = _kind_and_camera(key)
+        config = self.config
+        if kind == "e":
+            return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
+        if kind == "k":
+            focal = config.focal_length_sigma * self.nominal.cameras[c].camera.intrinsics[:2]
+            return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
+        sigma = config.distortion_sigma if kind == "d" else config.time_offset_sigma_s
+        return np.full(dim(key), sigma)
+
+    def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
+        """Whether a step (n,) moved the parameters far, compared to their standard deviations.
+
+        Such a step is not linear: what it says of the parameters depends on where they were.
+        """
+        step = delta[posterior.layout.indices(self.keys)]
+        covariance = posterior.covariance_of(self.keys)
+        return float(step @ np.linalg.solve(covariance, step)) > FAR**2 * len(step)
+
+    # --- the estimate ----------------------------------------------------------------------------
+
+    def rig(self, values: gtsam.Values) -> Rig:
+        """The rig with the parameters that are in `values`."""
+        shift_s = self._shift_s(values)
+        cameras = (
+            self._camera(c, mounted, values, shift_s)
+            for c, mounted in enumerate(self.nominal.cameras)
+        )
+        return Rig(tuple(cameras), self.nominal.imu)
+
+    def _shift_s(self, values: gtsam.Values) -> float:
+        """By how much the time offset differs from the nominal one."""
+        if not self.estimates_offset:
+            return 0.0
+        return float(values.atVector(T(0))[0]) - self.nominal.cameras[0].time_offset_s
+
+    def _camera(
+        self, c: int, mounted: RigCamera, values: gtsam.Values, shift_s: float
+    ) -> RigCamera:
+        camera, body_T_camera = mounted.camera, mounted.body_T_camera
+        if E(c) in self.keys:
+            body_T_camera = values.atPose3(E(c))
+        if K(c) in self.keys:
+            fx, fy, cx, cy = values.atVector(K(c)).tolist()
+            camera = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
+        if D(c) in self.keys:
+            camera = replace(camera, coefficients=tuple(values.atVector(D(c)).tolist()))
+        return RigCamera(camera, body_T_camera, mounted.time_offset_s + shift_s, mounted.name)
+
+    def estimate(
+        self, stamp_ns: int, state: State, information: SquareRootInformation
+    ) -> CalibrationEstimate:
+        """Values and standard deviations now.
+
+        Args:
+            stamp_ns: time of the estimate.
+            state: its parameters are at the estimate.
+            information: about an increment of the estimates, in the tangents at the first ones.
+        """
+        covariance = information.covariance_of(self.keys)
+        blocks, start = {}, 0
+        for key in self.keys:
+            stop = start + dim(key)
+            block = covariance[start:stop, start:stop]
+            if _kind_and_camera(key)[0] == "e":  # from the first estimate's tangent to this one's
+                turn = gtsam.Pose3.ExpmapDerivative(state.offsets[key])
+                block = turn @ block @ turn.T
+            blocks[gtsam.Symbol(key).string()] = block
+            start = stop
+        return CalibrationEstimate(stamp_ns, self.nominal, self.rig(state.estimate), blocks)
+
+    # --- the time offset -------------------------------------------------------------------------
+
+    def stamp(self, frame_ns: int, state: State | None, imu: ImuBuffer) -> int:
+        """Time of a frame on the clock of the IMU, by the best time offset there is.
+
+        An estimated offset may lead beyond the samples that came with the frame. Then the time of
+        the last sample is taken, and the rest of the offset is bridged by the motion of the frame
+        (see `note_motion`): an extrapolated IMU would err in the dynamics, for good.
+        """
+        if state is None or not self.estimates_offset:
+            return frame_ns + round(self.nominal.cameras[0].time_offset_s * 1e9)
+        stamp_ns = frame_ns + round(float(state.estimate.atVector(T(0))[0]) * 1e9)
+        beyond_ns = stamp_ns - imu.newest_ns()
+        return stamp_ns - beyond_ns if 0 < beyond_ns <= MAX_HELD_NS else stamp_ns
+
+    def note_motion(
+        self, state: State, frame: int, stamp_ns: int, frame_ns: int, imu: ImuBuffer
+    ) -> None:
+        """Remember how the body moves when a frame is taken.
+
+        Args:
+            state: has the pose, velocity and bias of the frame.
+            frame: index of the frame.
+            stamp_ns: time of its pose on the clock of the IMU.
+            frame_ns: its stamp on the clock of the cameras.
+            imu: samples up to the frame.
+        """
+        if not self.estimates_offset:
+            return
+        now = state.nav_state(frame, stamp_ns, None)
+        gyro = imu.between(stamp_ns, stamp_ns).gyro[0] - now.gyro_bias
+        velocity = now.world_T_body.rotation().unrotate(now.velocity)
+        state.motions[frame] = FrameMotion(
+            np.concatenate([gyro, velocity]), (stamp_ns - frame_ns) * 1e-9
+        )
+
+
+def _kind_and_camera(key: int) -> tuple[str, int]:
+    symbol = gtsam.Symbol(key)
+    return chr(symbol.chr()), int(symbol.index())

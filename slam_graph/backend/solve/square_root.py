@@ -1,0 +1,317 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians in square-root information form, updated and reduced by QR.
+
+A Gaussian over a stacked vector δ is kept as the upper triangular R and the vector d of the
+least-squares cost ‖R δ - d‖². New measurement rows ‖A δ - b‖² are folded in by a triangular QR,
+and variables are marginalised out by a QR whose columns begin with them: the rows that no longer
+touch them are the marginal over the others (Kaess et al. 2008; Dellaert & Kaess 2017, ch. 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from slam_graph.arrays import FloatArray
+
+BLOCK_SIZE = 32
+"""Width of the blocks of LAPACK's triangular-pentagonal QR."""
+ROWS_AT_ONCE = 48
+"""Height of the blocks from which variables are eliminated that stand behind them."""
+
+
+class Layout:
+    """Where each variable stands in a stacked tangent vector.
+
+    Attributes:
+        dims: dimension of each key, in the order of the columns.
+        columns: the slice of each key.
+        size: length of the stacked vector.
+    """
+
+    def __init__(self, dims: Mapping[int, int]) -> None:
+        self.dims = dict(dims)
+        self.columns: dict[int, slice] = {}
+        self.size = 0
+        for key, dim in self.dims.items():
+            self.columns[key] = slice(self.size, self.size + dim)
+            self.size += dim
+
+    def __contains__(self, key: int) -> bool:
+        return key in self.dims
+
+    def extended(self, dims: Mapping[int, int]) -> Layout:
+        """The layout with further keys appended."""
+        return Layout({**self.dims, **dims})
+
+    def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
+        """Column numbers of the keys, in the order given."""
+        parts = [np.arange(self.columns[k].start, self.columns[k].stop) for k in keys]
+        return np.concatenate(parts) if parts else np.zeros(0, np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conditional:
+    """What some variables are given others: the cost ‖R δ_gone + S δ_given - d‖².
+
+    Attributes:
+        gone: columns of the variables that it determines, `w` in all.
+        given: columns of the others.
+        rows: (w, w + n + 1) [R S d], R upper triangular.
+    """
+
+    gone: Layout
+    given: Layout
+    rows: FloatArray
+
+    @staticmethod
+    def nothing() -> Conditional:
+        """Of no variables."""
+        return Conditional(Layout({}), Layout({}), np.zeros((0, 1)))
+
+    @property
+    def layouts(self) -> tuple[Layout, Layout]:
+        """`gone` and `given`."""
+        return self.gone, self.given
+
+    @property
+    def keys(self) -> list[int]:
+        """Keys of all variables, in the order of the columns."""
+        return [*self.gone.dims, *self.given.dims]
+
+    def solution(self, given: FloatArray) -> FloatArray:
+        """The δ_gone (w,) of least cost where the others are at `given` (n,).
+
+        Raises:
+            numpy.linalg.LinAlgError: if some direction is not determined.
+        """
+        w = self.gone.size
+        return _solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
+
+    def shifted(self, delta: FloatArray) -> Conditional:
+        """The same as a function of δ - delta, delta (w + n,) over `gone` and `given`."""
+        rows = self.rows.copy()
+        rows[:, -1] -= self.rows[:, :-1] @ delta
+        return Conditional(self.gone, self.given, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SquareRootInformation:
+    """The Gaussian ‖R δ - d‖² over the variables of a layout.
+
+    Attributes:
+        layout: columns of the variables, `n` in all.
+        Rd: (n + 1, n + 1) upper triangular: R with d as its last column; the corner is the root of
+            the part of the cost that no δ can remove.
+    """
+
+    layout: Layout
+    Rd: FloatArray
+
+    @staticmethod
+    def empty() -> SquareRootInformation:
+        """A Gaussian over nothing."""
+        return SquareRootInformation(Layout({}), np.zeros((1, 1), order="F"))
+
+    @property
+    def R(self) -> FloatArray:
+        """(n, n) upper triangular root of the information."""
+        return self.Rd[:-1, :-1]
+
+    @property
+    def d(self) -> FloatArray:
+        """(n,) right-hand side."""
+        return self.Rd[:-1, -1]
+
+    @property
+    def residual(self) -> float:
+        """The part of the cost that no δ can remove."""
+        return float(self.Rd[-1, -1] ** 2)
+
+    def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
+        """The same Gaussian with further variables of which nothing is known."""
+        if not dims:
+            return self
+        layout = self.layout.extended(dims)
+        n, m = self.layout.size, layout.size
+        Rd = np.zeros((m + 1, m + 1), order="F")
+        Rd[:n, :n] = self.R
+        Rd[:n, m] = self.d
+        Rd[m, m] = self.Rd[n, n]
+        return SquareRootInformation(layout, Rd)
+
+    def shifted(self, delta: FloatArray) -> SquareRootInformation:
+        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖²."""
+        Rd = self.Rd.copy(order="F")
+        Rd[:-1, -1] -= self.R @ delta
+        return SquareRootInformation(self.layout, Rd)
+
+    def updated(self, Ab: FloatArray) -> SquareRootInformation:
+        """Fold in measurement rows.
+
+        Args:
+            Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
+        """
+        if len(Ab) == 0:
+            return self
+        first = int(np.argmax(Ab.any(axis=0)))  # columns to the left are not touched
+        Ab = Ab[:, first:]
+        if len(Ab) > 2 * Ab.shape[1]:
+            Ab = triangularize(Ab)
+        triangle = np.asfortranarray(self.Rd[first:, first:])
+        block = min(BLOCK_SIZE, len(triangle))
+        triangle, _, _, info = lapack.dtpqrt(0, block, triangle, np.asfortranarray(Ab))
+        if info != 0:
+            raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
+        Rd = self.Rd.copy(order="F")
+        Rd[first:, first:] = triangle
+        return SquareRootInformation(self.layout, Rd)
+
+    def solution(self) -> FloatArray:
+        """The δ (n,) of least cost.
+
+        Raises:
+            numpy.linalg.LinAlgError: if some direction is not determined.
+        """
+        return _solved(self.R, self.d)
+
+    def covariance(self) -> FloatArray:
+        """The (n, n) covariance R⁻¹ R⁻ᵀ."""
+        inverse = self.root_covariance()
+        return np.asarray(inverse @ inverse.T, dtype=np.float64)
+
+    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """The covariance of some variables only, in the order given."""
+        root = self._root_covariance_of(keys)
+        return np.asarray(root.T @ root, dtype=np.float64)
+
+    def covariance_blocks(self, keys: Sequence[int], columns: NDArray[np.intp]) -> FloatArray:
+        """Small blocks of the covariance of some variables, without forming the whole.
+
+        Args:
+            keys: the variables.
+            columns: (N, k) places in their stacked tangent.
+
+        Returns:
+            (N, k, k) the covariance of each row of `columns`.
+        """
+        root = np.ascontiguousarray(self._root_covariance_of(keys).T)[columns]
+        return np.asarray(root @ root.transpose(0, 2, 1), dtype=np.float64)
+
+    def _root_covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """Rows (m, k) of R⁻ᵀ, the columns of the variables; zero rows are left out."""
+        columns = self.layout.indices(keys)
+        first = int(columns.min(initial=self.layout.size))
+        right = np.zeros((self.layout.size - first, len(columns)), order="F")
+        right[columns - first, np.arange(len(columns))] = 1.0
+        root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the information is singular")
+        return np.asarray(root, dtype=np.float64)
+
+    def root_covariance(self) -> FloatArray:
+        """The (n, n) upper triangular R⁻¹, a root of the covariance."""
+        inverse, info = lapack.dtrtri(self.R)
+        if info != 0:
+            raise np.linalg.LinAlgError("the information is singular")
+        return np.asarray(np.triu(inverse), dtype=np.float64)
+
+    def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
+        """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
+        return self.divided(keep)[1]
+
+    def divided(self, keep: Sequence[int]) -> tuple[Conditional, SquareRootInformation]:
+        """The conditional of all variables but `keep` given these, and the marginal over `keep`.
+
+        What changes its order goes through one QR. The rows of variables that stand before it are
+        worked on in blocks, with the rows that determine the eliminated variables carried upwards.
+        That costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
+        """
+        staying = set(keep)
+        gone = Layout({k: d for k, d in self.layout.dims.items() if k not in staying})
+        kept = Layout({k: self.layout.dims[k] for k in keep})
+        Rd = np.zeros((kept.size + 1, kept.size + 1), order="F")
+        order = np.append(self.layout.indices([*gone.dims, *keep]), self.layout.size)
+        lead, w = self._unmoved(keep), gone.size
+        lead_gone = int(np.searchsorted(order[:w], lead))
+        top = lead - lead_gone  # the rows of the marginal that come from the leading ones
+        tail = np.r_[lead_gone:w, w + top : len(order)]
+        triangle = triangularize(self.Rd[lead:, order[tail]])
+        Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
+        carried = np.zeros((w - lead_gone, len(order)))
+        carried[:, tail] = triangle[: w - lead_gone]
+        if w == 0:
+            Rd[:lead] = self.Rd[:lead, order]
+        else:
+            carried = _eliminate_behind(Rd, self.Rd[:lead, order], order[:w], carried)
+        return Conditional(gone, kept, carried), SquareRootInformation(kept, Rd)
+
+    def _unmoved(self, keep: Sequence[int]) -> int:
+        """How many leading columns are of variables that leave, or stay in their order."""
+        staying, place, columns = set(keep), 0, 0
+        for mine, dim in self.layout.dims.items():
+            if mine in staying:
+                if keep[place] != mine:
+                    break
+                place += 1
+            columns += dim
+        return columns
+
+
+def _eliminate_behind(
+    Rd: FloatArray, rows: FloatArray, gone: NDArray[np.intp], carried: FloatArray
+) -> FloatArray:
+    """Eliminate variables from rows of a triangle, block by block from the bottom up.
+
+    A rotation with each block takes the eliminated columns out of it, another restores its
+    triangle.
+
+    Args:
+        Rd: gets the rows without the eliminated variables as its first ones.
+        rows: (n, w + …) the leading rows of the triangle, with the w eliminated columns first.
+        gone: (w,) where these columns stood in the triangle, ascending.
+        carried: (w', w + …) rows that determine those of them that stood behind the leading rows.
+
+    Returns:
+        (w, w + …) rows that determine all of them.
+    """
+    w, width = len(gone), rows.shape[1]
+    for stop in range(len(rows), 0, -ROWS_AT_ONCE):
+        start = max(stop - ROWS_AT_ONCE, 0)
+        before, upto = np.searchsorted(gone, [start, stop])
+        first, last = start - before, stop - upto  # rows of the result
+        stacked = np.vstack([carried, rows[start:stop]])
+        Q, R = np.linalg.qr(stacked[:, before:w], mode="complete")
+        others = Q.T @ stacked[:, w + first :]
+        carried = np.zeros((w - before, width))
+        carried[:, before:w], carried[:, w + first :] = R[: w - before], others[: w - before]
+        Q, _ = np.linalg.qr(others[w - before :, : last - first], mode="complete")
+        Rd[first:last, first:] = Q.T @ others[w - before :]
+        Rd[first:last, first:last] = np.triu(Rd[first:last, first:last])
+    return carried
+
+
+def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
+    """The solution of R x = d for an upper triangular R."""
+    if len(d) == 0:
+        return np.zeros(0)
+    x, info = lapack.dtrtrs(R, d)
+    if info != 0 or not np.all(np.isfinite(x)):
+        raise np.linalg.LinAlgError("the cost does not determine all of its variables")
+    return np.asarray(x, dtype=np.float64)
+
+
+def triangularize(Ab: FloatArray) -> FloatArray:
+    """The upper triangular factor of a QR decomposition of (m, n) rows, always (n, n)."""
+    m, n = Ab.shape
+    if m < n:
+        Ab = np.vstack([Ab, np.zeros((n - m, n))])
+    qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
+    if info != 0:
+        raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
+    return np.asfortranarray(np.triu(qr[:n]))

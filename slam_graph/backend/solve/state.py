@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The variables of the estimator, each with its estimate and its linearisation point.
+
+Keys follow GTSAM's symbols with one frame index i everywhere: `X(i)` the pose world_T_body of frame
+i, `V(i)` its velocity in the world, `B(i)` its IMU bias, `L(j)` the position of feature j in the
+world; `E(c)`, `K(c)`, `D(c)` and `T(0)` are parameters of the rig (see calibration.py). Tangents
+are GTSAM's (rotation before translation, both in the body frame; accelerometer bias before
+gyroscope bias).
+
+First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
+marginal prior, all Jacobians with respect to it are evaluated at the value it had then, its *first
+estimate*. Otherwise its linearisation point follows the estimate, and the estimator gains
+information about directions that no measurement can see (global position and yaw).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, L, V, X
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.geometry.trajectory import NavState
+
+POSE_DIM, VELOCITY_DIM, BIAS_DIM, POINT_DIM = 6, 3, 6, 3
+IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
+CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "d": 4, "t": 1}
+DIMS = IMU_STATE_DIMS | CALIBRATION_DIMS
+
+
+def dim(key: int) -> int:
+    """Tangent dimension of the variable of a key."""
+    return DIMS[chr(gtsam.Symbol(key).chr())]
+
+
+def imu_state_keys(frame: int) -> tuple[int, int, int]:
+    """Keys of the pose, velocity and bias of a frame."""
+    return X(frame), V(frame), B(frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMotion:
+    """How the body moved when a frame was taken, for the time offset of the cameras.
+
+    Attributes:
+        rate: (6,) angular rate (rad/s) and velocity (m/s), both in the body frame.
+        time_offset_s: the time offset under which the pose of the frame is the pose at its time.
+    """
+
+    rate: FloatArray
+    time_offset_s: float
+
+
+class State:
+    """Estimates and linearisation points of all variables in the cost.
+
+    Attributes:
+        first: linearisation point of every variable.
+        offsets: tangent (dim,) of every variable at its linearisation point.
+        estimate: current values, first ⊕ offsets.
+        frozen: keys whose linearisation point no longer moves.
+        motions: of each frame with a pose, where a time offset is estimated.
+    """
+
+    def __init__(self) -> None:
+        self.first = gtsam.Values()
+        self.estimate = gtsam.Values()
+        self.offsets: dict[int, FloatArray] = {}
+        self.frozen: set[int] = set()
+        self.motions: dict[int, FrameMotion] = {}
+
+    def copy(self) -> State:
+        """An independent copy."""
+        other = State()
+        other.assign(self)
+        return other
+
+    def assign(self, other: State) -> None:
+        """Take over all values of another state."""
+        self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
+        self.offsets = {key: offset.copy() for key, offset in other.offsets.items()}
+        self.frozen = set(other.frozen)
+        self.motions = dict(other.motions)
+
+    def insert_imu_state(self, frame: int, state: NavState) -> None:
+        """Add the pose, velocity and bias of a new frame."""
+        bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+        for values in (self.estimate, self.first):
+            values.insert(X(frame), state.world_T_body)
+            values.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
+            values.insert(B(frame), bias)
+        for key in imu_state_keys(frame):
+            self.offsets[key] = np.zeros(dim(key))
+
+    def insert_point(self, feature: int, point: FloatArray) -> None:
+        """Add a feature at a world position (3,)."""
+        self.estimate.insert(L(feature), point)
+        self.first.insert(L(feature), point)
+        self.offsets[L(feature)] = np.zeros(POINT_DIM)
+
+    def insert_calibration(self, values: gtsam.Values) -> None:
+        """Add parameters of the rig."""
+        self.estimate.insert(values)
+        self.first.insert(values)
+        for key in values.keys():  # noqa: SIM118
+            self.offsets[key] = np.zeros(dim(key))
+
+    def variables(self) -> list[int]:
+        """Keys of all variables."""
+        return list(self.offsets)
+
+    def remove(self, keys: Iterable[int]) -> None:
+        """Forget variables."""
+        for key in keys:
+            self.estimate.erase(key)
+            self.first.erase(key)
+            del self.offsets[key]
+            self.frozen.discard(key)
+        if self.motions:
+            self.motions = {i: motion for i, motion in self.motions.items() if X(i) in self.offsets}
+
+    def relinearize(self) -> None:
+        """Move the linearisation points of all variables that are not frozen to their estimates."""
+        moved = gtsam.Values()
+        for key, offset in self.offsets.items():
+            if key not in self.frozen and offset.any():
+                _copy(self.estimate, moved, key)
+                offset[:] = 0.0
+        if moved.size():
+            self.first.update(moved)
+
+    def freeze(self, keys: Iterable[int]) -> None:
+        """Hold the linearisation points of variables where they are."""
+        self.frozen.update(keys)
+
+    def rebase(self) -> None:
+        """Move all linearisation points to the estimates, the frozen ones too."""
+        self.frozen.clear()
+        self.relinearize()
+
+    def offset(self, layout: Layout) -> FloatArray:
+        """Stacked offset (n,) of the estimates from the linearisation points."""
+        parts = [self.offsets[key] for key in layout.dims]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def update(self, layout: Layout, delta: FloatArray) -> None:
+        """Add an increment (n,) to the tangents at the linearisation points."""
+        tangents = gtsam.VectorValues()
+        for key, columns in layout.columns.items():
+            self.offsets[key] = self.offsets[key] + delta[columns]
+        for key, offset in self.offsets.items():
+            tangents.insert(key, offset)
+        self.estimate = self.first.retract(tangents)
+
+    def nav_state(self, frame: int, stamp_ns: int, covariance: FloatArray | None) -> NavState:
+        """The state of a frame that still has its velocity and bias."""
+        bias = self.estimate.atConstantBias(B(frame))
+        return NavState(
+            stamp_ns,
+            self.estimate.atPose3(X(frame)),
+            np.asarray(self.estimate.atVector(V(frame))),
+            np.asarray(bias.gyroscope()),
+            np.asarray(bias.accelerometer()),
+            covariance,
+        )
+
+
+def _copy(source: gtsam.Values, target: gtsam.Values, key: int) -> None:
+    """Insert the value of `key` in `source` into `target`."""
+    kind = chr(gtsam.Symbol(key).chr())
+    if kind in "xe":
+        target.insert(key, source.atPose3(key))
+    elif kind == "b":
+        target.insert(key, source.atConstantBias(key))
+    elif kind == "l":
+        target.insert(key, source.atPoint3(key))
+    else:
+        target.insert(key, source.atVector(key))
+
+
+def stacked_poses(values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
+    """Rotations (F, 3, 3) and positions (F, 3) of the poses of some frames."""
+    matrices = np.array([values.atPose3(X(i)).matrix() for i in frames]).reshape(-1, 4, 4)
+    return matrices[:, :3, :3], matrices[:, :3, 3]
+
+
+def stacked_points(values: gtsam.Values, features: Iterable[int]) -> FloatArray:
+    """Positions (J, 3) of some features."""
+    return np.array([values.atPoint3(L(j)) for j in features]).reshape(-1, 3)
+
+
+def dims_of(keys: Iterable[int]) -> Mapping[int, int]:
+    """Dimension of each key."""
+    return {key: dim(key) for key in keys}

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Module 1 of bundle adjustment: all cameras and all points, and no costs between poses.
+
+Half the squared reprojection errors, under a robust loss if there is one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_factors import robust_loss, robust_weights
+from slam_graph.bundle_adjustment.bal_policy import BalCostPolicy, Intrinsics
+from slam_graph.bundle_adjustment.bal_prior import prior_cost
+from slam_graph.bundle_adjustment.bal_problem import (
+    CAMERA_DIM,
+    POSE_DIM,
+    BalEstimates,
+    BalLinearization,
+    BalPart,
+    BalProblem,
+    linearize,
+    project,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BalCost:
+    """A cost over all cameras and points of a part.
+
+    Attributes:
+        part: cameras, points and observations.
+        policy: which intrinsics are variables, and the loss.
+        variables: (9 C, n) which tangents of the cameras each of n variables moves, entries 0 or 1.
+    """
+
+    part: BalPart
+    policy: BalCostPolicy
+    variables: csr_array
+
+    def __call__(self, estimates: BalEstimates) -> float:
+        """The cost; infinite where a point has no pixel."""
+        errors = reprojection_errors(self.part.problem, estimates)
+        with np.errstate(all="ignore"):
+            cost = float(np.sum(robust_loss(errors, self.policy.loss)))
+            if self.part.problem.prior is not None:
+                cost += prior_cost(self.part.problem.prior, estimates)
+        return cost if np.isfinite(cost) else np.inf
+
+    def linearized(self, estimates: BalEstimates) -> BalLinearization:
+        """Residuals and derivatives, weighted so that their squares stand for the loss."""
+        problem = self.part.problem
+        linear = linearize(estimates, problem.camera, problem.point, problem.pixels)
+        if self.policy.robust == "none":
+            return linear
+        weights = robust_weights(np.linalg.norm(linear.r, axis=1), self.policy.loss)
+        root = np.sqrt(weights)[:, None]
+        return BalLinearization(
+            linear.by_camera * root[:, :, None], linear.by_point * root[:, :, None], linear.r * root
+        )
+
+
+def construct(part: BalPart, policy: BalCostPolicy) -> BalCost:
+    """The cost of a part."""
+    return BalCost(part, policy, _variables(part.problem, policy.intrinsics))
+
+
+def first_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
+    """Those of the file; intrinsics that all cameras share begin with their median."""
+    start = part.problem.estimates
+    if policy.intrinsics != "shared":
+        return start
+    median = np.median(start.intrinsics, axis=0)
+    return replace(start, intrinsics=np.tile(median, (part.problem.cameras, 1)))
+
+
+def reprojection_errors(problem: BalProblem, estimates: BalEstimates) -> FloatArray:
+    """(N,) lengths of the residuals in pixels; not finite where a point has no pixel."""
+    pixels, _ = project(estimates, problem.camera, problem.point)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.linalg.norm(pixels - problem.pixels, axis=1), dtype=np.float64)
+
+
+def moved(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) -> BalEstimates:
+    """Estimates after a step.
+
+    Args:
+        estimates: before it.
+        by_camera: (C, 9) increments δθ, δt, f, k1, k2.
+        by_point: (P, 3).
+    """
+    return BalEstimates(
+        Rotation.from_rotvec(by_camera[:, :3]).as_matrix() @ estimates.rotations,
+        estimates.translations + by_camera[:, 3:POSE_DIM],
+        estimates.intrinsics + by_camera[:, POSE_DIM:],
+        estimates.points + by_point,
+    )
+
+
+def _variables(problem: BalProblem, intrinsics: Intrinsics) -> csr_array:
+    """(9 C, n): poses, and the intrinsics as they are estimated."""
+    cameras, lenses = problem.cameras, problem.lenses
+    tangents = np.arange(CAMERA_DIM * cameras).reshape(cameras, CAMERA_DIM)
+    columns = tangents
+    if intrinsics != "per_camera" or lenses is not None:
+        columns = np.arange(POSE_DIM * cameras).reshape(cameras, POSE_DIM)
+    if intrinsics == "shared":
+        lenses = np.zeros(cameras, np.int64)
+    if intrinsics != "fixed" and lenses is not None:
+        lens = POSE_DIM * cameras + 3 * lenses[:, None] + np.arange(3)
+        columns = np.hstack([columns, lens])
+    rows = tangents[:, : columns.shape[1]]
+    shape = (tangents.size, int(columns.max()) + 1)
+    return csr_array((np.ones(rows.size), (rows.ravel(), columns.ravel())), shape=shape)

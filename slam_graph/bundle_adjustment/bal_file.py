@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading and writing bundle-adjustment problems in BAL's format, plain or compressed by bzip2.
+
+A header `cameras points observations`; `camera point x y` of each observation; then nine numbers of
+each camera (rotation vector, translation, f, k1, k2) and three of each point. White space separates
+numbers, whether it ends a line or not.
+"""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem
+from slam_graph.errors import DataError
+
+BZIP2_MAGIC = b"BZh"
+HEADER = 3
+OBSERVATION = 4
+LARGEST = 1e100
+"""Greatest magnitude of a number: squares must be finite."""
+LONGEST_HEADER = 200
+"""Bytes among which the first line ends, if the file is of this format."""
+
+
+def is_bal(path: Path) -> bool:
+    """Whether a file begins as a BAL problem does: with a line of three whole numbers.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            compressed = file.read(len(BZIP2_MAGIC)) == BZIP2_MAGIC
+        if compressed:
+            return True  # no other format here comes compressed
+        with path.open("rb") as file:
+            start = file.read(LONGEST_HEADER).split(b"\n")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    words = next((line.split() for line in start if line.strip()), [])
+    return len(words) == HEADER and all(word.lstrip(b"-").isdigit() for word in words)
+
+
+def problem_name(path: Path) -> str:
+    """The name of a file without `.txt` or `.txt.bz2`; it also names a folder of results."""
+    return path.name.removesuffix(".bz2").removesuffix(".txt").strip(".") or "problem"
+
+
+def read_bal(path: Path | str) -> BalProblem:
+    """Read a problem.
+
+    Raises:
+        DataError: naming file and line, if the file cannot be read or unpacked, is cut short or too
+            long, has no observations, numbers that are not finite, or an index out of range.
+    """
+    path = Path(path)
+    text = _text(path)
+    numbers = _numbers(path, text)
+    cameras, points, observations = _header(path, text, numbers)
+    expected = HEADER + OBSERVATION * observations + CAMERA_DIM * cameras + 3 * points
+    if len(numbers) < expected:
+        raise DataError(
+            f"{_where(path, text, len(numbers) - 1)}: ends after {len(numbers)} of the {expected} "
+            "numbers that the header promises; is the file cut short?"
+        )
+    if len(numbers) > expected:
+        raise DataError(
+            f"{_where(path, text, expected)}: {len(numbers) - expected} numbers more than the "
+            "header promises"
+        )
+    bad = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
+    if len(bad):
+        raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite, or too large")
+    seen, by_camera, by_point = np.split(
+        numbers[HEADER:], np.cumsum([OBSERVATION * observations, CAMERA_DIM * cameras])
+    )
+    table = seen.reshape(-1, OBSERVATION)
+    for column, (what, count) in enumerate((("camera", cameras), ("point", points))):
+        _check_indices(path, text, table[:, column], column, what, count)
+    camera, point = table[:, :2].T.astype(np.int64)
+    estimates = _estimates(by_camera.reshape(-1, CAMERA_DIM), by_point.reshape(-1, 3))
+    return BalProblem(estimates, camera, point, table[:, 2:].copy(), problem_name(path))
+
+
+def _text(path: Path) -> str:
+    """The content of a file, unpacked."""
+    try:
+        content = path.read_bytes()
+        if content.startswith(BZIP2_MAGIC):
+            content = bz2.decompress(content)
+    except OSError as error:
+        reason = error.strerror or "damaged bzip2 data"
+        raise DataError(f"{path}: cannot be read ({reason})") from None
+    except ValueError:
+        raise DataError(f"{path}: cannot be read (bzip2 data cut short)") from None
+    return content.decode("ascii", errors="replace")
+
+
+def _numbers(path: Path, text: str) -> FloatArray:
+    """All numbers of a text."""
+    if not text.strip():
+        raise DataError(f"{path}: empty; expected `cameras points observations`")
+    try:
+        return np.fromstring(text, dtype=np.float64, sep=" ")
+    except ValueError:
+        pass  # the line is found below
+    for number, line in enumerate(text.split("\n"), 1):
+        try:
+            if line.strip():
+                np.fromstring(line, dtype=np.float64, sep=" ")
+        except ValueError:
+            raise DataError(f"{path}:{number}: not a number in '{line.strip()[:60]}'") from None
+    raise DataError(f"{path}: not numbers throughout")
+
+
+def _header(path: Path, text: str, numbers: FloatArray) -> tuple[int, int, int]:
+    """Numbers of cameras, points and observations."""
+    counts, line = numbers[:HEADER], text.lstrip().split("\n", 1)[0]
+    whole = np.isfinite(counts) & (counts >= 0) & (counts == np.floor(counts)) & (counts < 2**53)
+    if len(line.split()) != HEADER or not whole.all():
+        raise DataError(
+            f"{_where(path, text, 0)}: expected three whole numbers: cameras points observations"
+        )
+    cameras, points, observations = (int(count) for count in counts)
+    if 0 in (cameras, points, observations):
+        raise DataError(
+            f"{_where(path, text, 0)}: nothing to estimate: {cameras} cameras, {points} points, "
+            f"{observations} observations"
+        )
+    return cameras, points, observations
+
+
+def _check_indices(
+    path: Path, text: str, indices: FloatArray, column: int, what: str, count: int
+) -> None:
+    """Make sure that indices are whole numbers below a count."""
+    bad = np.flatnonzero((indices < 0) | (indices >= count) | (indices != np.floor(indices)))
+    if len(bad):
+        where = _where(path, text, HEADER + OBSERVATION * int(bad[0]) + column)
+        raise DataError(
+            f"{where}: {what} {indices[bad[0]]:.15g}, but they go from 0 to {count - 1}"
+        )
+
+
+def _where(path: Path, text: str, index: int) -> str:
+    """File and line of a number, for messages."""
+    for number, line in enumerate(text.split("\n"), 1):
+        index -= len(line.split())
+        if index < 0:
+            return f"{path}:{number}"
+    return str(path)
+
+
+def _estimates(by_camera: FloatArray, points: FloatArray) -> BalEstimates:
+    rotations = Rotation.from_rotvec(by_camera[:, :3]).as_matrix()
+    return BalEstimates(rotations, by_camera[:, 3:6].copy(), by_camera[:, 6:].copy(), points.copy())
+
+
+def bal_lines(problem: BalProblem, estimates: BalEstimates) -> Iterator[str]:
+    """The lines of a file with given estimates; reading it gives the same numbers back."""
+    yield f"{problem.cameras} {problem.points} {len(problem.camera)}\n"
+    ends = zip(problem.camera.tolist(), problem.point.tolist(), strict=True)
+    for (camera, point), (x, y) in zip(ends, problem.pixels.tolist(), strict=True):
+        yield f"{camera} {point} {x!r} {y!r}\n"
+    turns = Rotation.from_matrix(estimates.rotations).as_rotvec()
+    by_camera = np.hstack([turns, estimates.translations, estimates.intrinsics])
+    for value in (*by_camera.ravel().tolist(), *estimates.points.ravel().tolist()):
+        yield f"{value!r}\n"

@@ -1,0 +1,315 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The damped normal equations of a bundle adjustment, solved by eliminating the points.
+
+With J_c and J_p the derivatives of an observation, U = Σ J_cᵀ J_c of each camera, V = Σ J_pᵀ J_p =
+L Lᵀ of each point, damped, and B = L⁻¹ J_pᵀ J_c, the cameras are left with
+
+    S = U - Σ Bᵀ B over all pairs of observations of a point,
+
+a block for each two cameras that see a point in common. The products of two cameras are one matrix
+product over all such points.
+
+The seven degrees of freedom that no image sees: where the world is, how it is turned, its scale.
+
+A similarity X ← s Q X + b of the world leaves all pixels as they are. Steps are therefore taken
+without any part along its seven directions (inner constraints; Triggs, McLauchlan, Hartley &
+Fitzgibbon 2000), and in the end the gauge of the start is restored: the first camera has its pose,
+and the median distance of the points from it is what it was. Groups of cameras that have no point
+in common have seven directions each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.bundle_adjustment.bal_cost import BalCost
+from slam_graph.bundle_adjustment.bal_prior import linearized_prior
+from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, POSE_DIM, BalEstimates, BalPart
+from slam_graph.errors import EstimationError
+
+GAUGE_DIM = 7
+
+
+def gauge_directions(estimates: BalEstimates, groups: IntArray) -> FloatArray:
+    """(9 C, 7 G) how the tangents of the cameras change with a similarity of each group.
+
+    Of X ← (1 + σ)(I + [φ]ₓ) X + b it is δθ = -R φ and δt = σ t - R b.
+    """
+    C, G = len(groups), int(groups.max()) + 1
+    R, rows = estimates.rotations, np.arange(C)
+    directions = np.zeros((C, CAMERA_DIM, G, GAUGE_DIM))
+    directions[rows, 0:3, groups, 0:3] = -R
+    directions[rows, 3:6, groups, 3:6] = -R
+    directions[rows, 3:6, groups, 6] = estimates.translations
+    return directions.reshape(CAMERA_DIM * C, GAUGE_DIM * G)
+
+
+def restored(part: BalPart, end: BalEstimates) -> BalEstimates:
+    """Estimates of a part, moved by a similarity of each group into the gauge of its start."""
+    start, problem = part.problem.estimates, part.problem
+    group_of_point = np.zeros(problem.points, np.int64)
+    group_of_point[problem.point] = part.groups[problem.camera]
+    rotations, translations = end.rotations.copy(), end.translations.copy()
+    points = end.points.copy()
+    for group in range(int(part.groups.max()) + 1):
+        cameras = np.flatnonzero(part.groups == group)
+        rows, first = np.flatnonzero(group_of_point == group), cameras[0]
+        scale = _median_distance(start, first, rows) / _median_distance(end, first, rows)
+        R_0, t_0 = start.rotations[first], start.translations[first]
+        Q = R_0.T @ end.rotations[first]
+        b = R_0.T @ (scale * end.translations[first] - t_0)
+        points[rows] = scale * end.points[rows] @ Q.T + b
+        rotations[cameras] = end.rotations[cameras] @ Q.T
+        translations[cameras] = scale * end.translations[cameras] - rotations[cameras] @ b
+    return BalEstimates(rotations, translations, end.intrinsics, points)
+
+
+def _median_distance(estimates: BalEstimates, camera: int, points: IntArray) -> float:
+    """Of some points from a camera."""
+    away = estimates.points[points] - estimates.centres()[camera]
+    return float(np.median(np.linalg.norm(away, axis=1)))
+
+
+RowArray = NDArray[np.int32]
+
+MOST_CAMERAS = 1_800
+"""Beyond this the reduced system, which is dense, needs more than 2 GB, and to solve it 6 GB."""
+MOST_PAIRS = 100_000_000
+"""Beyond this the table of pairs of observations needs more than 1 GB."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonPoints:
+    """The pairs of observations of the same point, in one camera and in those from it on.
+
+    Attributes:
+        first: (K,) observations in the camera.
+        second: (K,) observations of the same points, by camera.
+        others: (M,) the cameras of these.
+        starts: (M + 1,) where the pairs of each begin, and K.
+    """
+
+    first: RowArray
+    second: RowArray
+    others: RowArray
+    starts: RowArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Structure:
+    """What of the equations stays the same from step to step.
+
+    Attributes:
+        sum_by_point: (P, N) adds up what belongs to observations of a point.
+        pairs: of each camera.
+    """
+
+    sum_by_point: csr_array
+    pairs: list[CommonPoints]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """A linearised cost.
+
+    Attributes:
+        by_camera: (N, 2, 9) derivatives.
+        by_point: (N, 2, 3).
+        U: (C, 9, 9) information of the cameras.
+        g_c: (C, 9) gradient.
+        V: (P, 3, 3) information of the points.
+        g_p: (P, 3) gradient.
+        gauge: (9 C, 7 G) directions that the cost does not depend on.
+    """
+
+    by_camera: FloatArray
+    by_point: FloatArray
+    U: FloatArray
+    g_c: FloatArray
+    V: FloatArray
+    g_p: FloatArray
+    gauge: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BalStep:
+    """A solution of the damped equations.
+
+    Attributes:
+        by_camera: (C, 9) increments.
+        by_point: (P, 3).
+        predicted: by how much the linearised cost falls.
+    """
+
+    by_camera: FloatArray
+    by_point: FloatArray
+    predicted: float
+
+
+def structure(cost: BalCost) -> Structure:
+    """Prepare the elimination.
+
+    Raises:
+        EstimationError: if the problem is too large for a dense reduced system.
+    """
+    problem = cost.part.problem
+    views = np.bincount(problem.point)
+    pairs = int(np.sum(views * (views + 1) // 2))
+    if problem.cameras > MOST_CAMERAS or pairs > MOST_PAIRS:
+        raise EstimationError(
+            f"{problem.name}: too large: {problem.cameras} cameras and {pairs} pairs of "
+            f"observations of the same point; the most are {MOST_CAMERAS} and {MOST_PAIRS}"
+        )
+    N = len(problem.point)
+    where = (problem.point, np.arange(N))
+    summed = csr_array((np.ones(N), where), shape=(problem.points, N))
+    return Structure(summed, list(_common_points(cost.part, views)))
+
+
+def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[CommonPoints]:
+    """The pairs of each camera."""
+    problem, starts = part.problem, part.camera_starts
+    by_point = np.argsort(problem.point, kind="stable").astype(np.int32)
+    place = np.empty_like(by_point)
+    place[by_point] = np.arange(len(by_point))
+    ends = np.cumsum(views)[problem.point]
+    for camera in range(problem.cameras):
+        rows = np.arange(starts[camera], starts[camera + 1], dtype=np.int32)
+        counts = ends[rows] - place[rows]
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        first = np.repeat(rows, counts)
+        second = by_point[place[first] + within]
+        order = np.argsort(problem.camera[second], kind="stable")
+        first, second = first[order], second[order]
+        others, begin = np.unique(problem.camera[second], return_index=True)
+        bounds = np.append(begin, len(second)).astype(np.int32)
+        yield CommonPoints(first, second, others.astype(np.int32), bounds)
+
+
+def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -> NormalEquations:
+    """Linearise a cost."""
+    linear, part = cost.linearized(estimates), cost.part
+    by_camera, by_point = linear.by_camera, linear.by_point
+    rows = np.concatenate([by_camera, linear.r[:, :, None]], axis=2)
+    squares = np.empty((part.problem.cameras, CAMERA_DIM + 1, CAMERA_DIM + 1))
+    for camera, (a, b) in enumerate(zip(part.camera_starts, part.camera_starts[1:], strict=False)):
+        block = rows[a:b].reshape(-1, CAMERA_DIM + 1)
+        squares[camera] = block.T @ block
+    gauge = gauge_directions(estimates, part.groups)
+    if part.problem.prior is not None:
+        gauge = gauge[:, :0]  # the world is that of the prior
+        by_pose, r = linearized_prior(part.problem.prior, estimates)
+        squares[:, :POSE_DIM, :POSE_DIM] += by_pose.transpose(0, 2, 1) @ by_pose
+        squares[:, :POSE_DIM, -1] += np.einsum("cij,ci->cj", by_pose, r)
+    rows = np.concatenate([by_point, linear.r[:, :, None]], axis=2)
+    products = np.einsum("nai,naj->nij", by_point, rows).reshape(len(rows), -1)
+    of_points = (fixed.sum_by_point @ products).reshape(-1, 3, 4)
+    if part.problem.prior is not None:
+        information = part.problem.prior.point_sigmas[:, None] ** -2.0
+        of_points[:, :, :3] += information[:, :, None] * np.eye(3)
+        of_points[:, :, 3] += information * (estimates.points - part.problem.prior.points)
+    return NormalEquations(
+        by_camera,
+        by_point,
+        squares[:, :-1, :-1],
+        squares[:, :-1, -1],
+        of_points[:, :, :3],
+        of_points[:, :, 3],
+        gauge,
+    )
+
+
+def damped_step(
+    cost: BalCost, fixed: Structure, equations: NormalEquations, damping: float
+) -> BalStep:
+    """The step that minimises the linearised cost with damping, relative to its own diagonal.
+
+    Raises:
+        LinAlgError: if the equations are not positive definite.
+    """
+    problem, E = cost.part.problem, cost.variables
+    D_p = _positive(np.diagonal(equations.V, axis1=1, axis2=2))
+    V = equations.V + damping * D_p[:, :, None] * np.eye(3)
+    inverse_root = np.linalg.inv(np.linalg.cholesky(V))
+    K = inverse_root[problem.point] @ equations.by_point.transpose(0, 2, 1)
+    B = K @ equations.by_camera
+    b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
+
+    S = _reduced(cost, fixed, equations, B)
+    if E.shape[1] < len(S):
+        S = E.T @ S @ E
+    g = (
+        E.T
+        @ (
+            equations.g_c - _per_camera(cost, np.einsum("nki,nk->ni", B, b_p[problem.point]))
+        ).ravel()
+    )
+    D_c = _positive(E.T @ np.diagonal(equations.U, axis1=1, axis2=2).ravel())
+    δ, along_gauge = _solved(S, g, D_c, E.T @ equations.gauge, damping)
+
+    by_camera = (E @ δ).reshape(-1, CAMERA_DIM)
+    pushed = fixed.sum_by_point @ np.einsum("nki,ni->nk", B, by_camera[problem.camera])
+    by_point = -np.einsum("pji,pj->pi", inverse_root, b_p + pushed)
+    slope = np.sum(equations.g_c * by_camera) + np.sum(equations.g_p * by_point)
+    held = damping * (np.sum(D_c * δ**2) + np.sum(D_p * by_point**2)) + along_gauge
+    return BalStep(by_camera, by_point, 0.5 * float(held - slope))
+
+
+def _reduced(
+    cost: BalCost, fixed: Structure, equations: NormalEquations, B: FloatArray
+) -> FloatArray:
+    """(9 C, 9 C) S, both triangles of it."""
+    C = cost.part.problem.cameras
+    S = np.zeros((C, CAMERA_DIM, C, CAMERA_DIM))
+    for i, pairs in enumerate(fixed.pairs):
+        left = B[pairs.first].reshape(-1, CAMERA_DIM)
+        right = B[pairs.second].reshape(-1, CAMERA_DIM)
+        for j, a, b in zip(
+            pairs.others.tolist(),
+            (3 * pairs.starts[:-1]).tolist(),
+            (3 * pairs.starts[1:]).tolist(),
+            strict=True,
+        ):
+            block = left[a:b].T @ right[a:b]
+            S[i, :, j] -= block
+            if i != j:
+                S[j, :, i] -= block.T
+        S[i, :, i] += equations.U[i]
+    return S.reshape(CAMERA_DIM * C, CAMERA_DIM * C)
+
+
+def _solved(
+    S: FloatArray, g: FloatArray, D: FloatArray, gauge: FloatArray, damping: float
+) -> tuple[FloatArray, float]:
+    """The increment of the variables of the cameras, and the cost of its part along the gauge.
+
+    Solved in variables of unit information. The gauge's directions, made orthonormal, get an
+    information of 1 where they had none. `S` is overwritten.
+    """
+    scale = 1.0 / np.sqrt(D)
+    N, _ = np.linalg.qr(gauge / scale[:, None])
+    S *= scale[:, None]  # in its place: it may be large
+    S *= scale
+    S.flat[:: len(S) + 1] += damping
+    S += N @ N.T
+    factor = cho_factor(S.T, lower=True, overwrite_a=True, check_finite=False)
+    scaled = -cho_solve(factor, scale * g, check_finite=False)
+    return scale * scaled, float(np.sum((N.T @ scaled) ** 2))
+
+
+def _per_camera(cost: BalCost, values: FloatArray) -> FloatArray:
+    """(C, k) sums over the observations of each camera."""
+    return np.add.reduceat(values, cost.part.camera_starts[:-1], axis=0)
+
+
+def _positive(diagonal: FloatArray) -> FloatArray:
+    """A diagonal to scale by: 1 where nothing is known."""
+    return np.where(diagonal > 0, diagonal, 1.0)

@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Is a recording fit to run on? Findings about its IMU, frames, ground truth and calibration.
+
+What an IMU stream tells about itself: its rate, and its noise and gravity while it is still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets.streams.image_sequence import GroupedSequence
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import ImuNoise, Rig
+
+WINDOW_NS = 1_000_000_000
+"""Length of the windows among which the calmest is looked for."""
+
+STILL_GYRO = 0.03
+"""rad/s: a window whose rates scatter more than this (largest axis, 1σ) is not still."""
+
+STILL_ACCEL = 0.3
+"""m/s²: the same for the specific force."""
+
+GRAVITY = 9.81
+GRAVITY_TOLERANCE = 0.5
+"""m/s²: biases are a few tenths; more hints at wrong units or scale."""
+
+RATE_TOLERANCE = 0.1
+"""Largest relative difference of the measured rate from the calibrated one."""
+
+NOISE_RATIO = 30.0
+"""Measured noise this many times above the calibrated one deserves a warning; the vibration of a
+hovering multicopter makes a factor of ten."""
+
+Found = tuple[Literal["info", "warning", "error"], str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """Statistics of one second: standard deviations (largest axis), mean force, largest mean."""
+
+    start_ns: int
+    gyro_std: float
+    accel_std: float
+    gravity: float
+
+
+@dataclass
+class ImuSurvey:
+    """Collects statistics over a stream, in constant memory but for one number a second.
+
+    Attributes:
+        samples: so far.
+        calmest: the window with the least scatter so far.
+    """
+
+    samples: int = 0
+    calmest: _Window | None = None
+    _pending: ImuData = field(default_factory=ImuData.empty)
+    _periods: list[float] = field(default_factory=list)
+
+    def add(self, data: ImuData) -> None:
+        """Take the next samples."""
+        self.samples += len(data)
+        self._pending = ImuData.concatenate([self._pending, data])
+        while len(self._pending) and self._spanned() >= WINDOW_NS:
+            end = self._pending.stamps_ns[0] + WINDOW_NS
+            cut = int(np.searchsorted(self._pending.stamps_ns, end))
+            self._survey(self._pending[:cut])
+            self._pending = self._pending[cut:]
+
+    def findings(self, noise: ImuNoise) -> list[Found]:
+        """What the stream tells, compared with the calibration."""
+        if self.samples == 0:
+            return [("error", "no IMU samples")]
+        if not self._periods:
+            self._survey(self._pending)
+        return [*self._rate(noise), *self._stillness(noise)]
+
+    def _spanned(self) -> int:
+        return int(self._pending.stamps_ns[-1] - self._pending.stamps_ns[0])
+
+    def _survey(self, data: ImuData) -> None:
+        if len(data) < 3:
+            return
+        self._periods.append(float(np.median(np.diff(data.stamps_ns))))
+        window = _Window(
+            int(data.stamps_ns[0]),
+            float(np.max(np.std(data.gyro, axis=0))),
+            float(np.max(np.std(data.accel, axis=0))),
+            float(np.linalg.norm(np.mean(data.accel, axis=0))),
+        )
+        if self.calmest is None or _scatter(window) < _scatter(self.calmest):
+            self.calmest = window
+
+    def _rate(self, noise: ImuNoise) -> list[Found]:
+        if not self._periods:
+            return [("warning", f"only {self.samples} IMU samples")]
+        rate_hz = 1e9 / float(np.median(self._periods))
+        found: list[Found] = [("info", f"{self.samples} samples at {rate_hz:.1f} Hz")]
+        if abs(rate_hz / noise.rate_hz - 1.0) > RATE_TOLERANCE:
+            what = f"measured at {rate_hz:.1f} Hz, the calibration says {noise.rate_hz:.1f} Hz"
+            found.append(("warning", what))
+        return found
+
+    def _stillness(self, noise: ImuNoise) -> list[Found]:
+        calm = self.calmest
+        if calm is None or calm.gyro_std > STILL_GYRO or calm.accel_std > STILL_ACCEL:
+            return [("info", "never still for a second: gravity and noise are not checked")]
+        found: list[Found] = [
+            ("info", f"still at {calm.start_ns}: specific force {calm.gravity:.3f} m/s²")
+        ]
+        if abs(calm.gravity - GRAVITY) > GRAVITY_TOLERANCE:
+            what = f"specific force {calm.gravity:.2f} m/s² at rest instead of {GRAVITY}; m/s²?"
+            found.append(("error", what))
+        root = np.sqrt(noise.rate_hz)
+        for name, std, density in (
+            ("gyroscope", calm.gyro_std, noise.gyro_noise_density),
+            ("accelerometer", calm.accel_std, noise.accel_noise_density),
+        ):
+            found.append(
+                ("info", f"{name} noise at rest {std / root:.2g}, calibrated {density:.2g}")
+            )
+            if std / root > NOISE_RATIO * density:
+                what = (
+                    f"{name} noise at rest is {std / root / density:.0f} times the calibrated one"
+                )
+                found.append(("warning", what))
+        return found
+
+
+def _scatter(window: _Window) -> float:
+    return window.gyro_std / STILL_GYRO + window.accel_std / STILL_ACCEL
+
+
+Severity = Literal["info", "warning", "error"]
+
+LONG_PAUSE_PERIODS = 3.0
+"""A pause between frames longer than this many median periods is worth a word."""
+
+FARTHEST_CAMERA_M = 5.0
+"""A camera farther from the IMU than this is more likely a mistake of units than a platform."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was found.
+
+    Attributes:
+        severity: ``info`` for a fact, ``warning`` for what a run survives, ``error`` for what makes
+            its result worthless.
+        what: in one line.
+        where: file, sensor or time.
+    """
+
+    severity: Severity
+    what: str
+    where: str
+
+
+@dataclass
+class _Collector(Diagnostics):
+    """Keeps the first message of each kind instead of logging it."""
+
+    messages: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def warn(self, kind: str, message: str) -> None:
+        self.counts[kind] += 1
+        self.messages.setdefault(kind, message)
+
+
+def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Finding]:
+    """Go through a whole recording once and tell what is remarkable.
+
+    Args:
+        sequence: any recording.
+        read_images: decode every image; otherwise only their files are looked for.
+
+    Returns:
+        findings, the errors first.
+    """
+    if isinstance(sequence, GroupedSequence) and not read_images:
+        sequence = sequence.without_images()
+    opened = dict(sequence.diagnostics.counts)
+    with _collecting(sequence) as faults:
+        survey, stamps = _go_through(sequence)
+        truth = sequence.groundtruth()
+    name = sequence.info().name
+    findings = [
+        Finding("warning", f"{kind}: {count} times, first: {faults.messages[kind]}", name)
+        for kind, count in faults.counts.items()
+    ]
+    findings += [
+        Finding("warning", f"{kind}: {count} times, counted before the check", name)
+        for kind, count in opened.items()
+    ]
+    findings += [Finding(*found, "imu") for found in survey.findings(sequence.rig.imu)]
+    findings += _check_frames(stamps, name)
+    findings += _check_groundtruth(truth, stamps)
+    findings += _check_calibration(sequence.rig)
+    order: tuple[Severity, ...] = ("error", "warning", "info")
+    return sorted(findings, key=lambda found: order.index(found.severity))
+
+
+@contextmanager
+def _collecting(sequence: Sequence) -> Iterator[_Collector]:
+    """Have a sequence report its faults to a collector for a while."""
+    usual, collector = sequence.diagnostics, _Collector()
+    sequence.diagnostics = collector
+    try:
+        yield collector
+    finally:
+        sequence.diagnostics = usual
+
+
+def _go_through(sequence: Sequence) -> tuple[ImuSurvey, NDArray[np.int64]]:
+    """The IMU and the times of the frames; the IMU alone where there are no frames."""
+    survey = ImuSurvey()
+    stamps: list[int] = []
+    for packet in sequence.packets():
+        stamps.append(packet.frame.stamp_ns)
+        survey.add(packet.imu)
+    if not stamps and isinstance(sequence, GroupedSequence):
+        for block in sequence.imu_blocks():
+            survey.add(block)
+    return survey, np.array(stamps, np.int64)
+
+
+def _check_frames(stamps: NDArray[np.int64], name: str) -> list[Finding]:
+    if len(stamps) < 2:
+        return [Finding("warning", f"{len(stamps)} frames: nothing to run on", name)]
+    steps = np.diff(stamps)
+    if np.any(steps <= 0):
+        return [Finding("error", "frames do not follow one another in time", name)]
+    period = float(np.median(steps))
+    duration = (stamps[-1] - stamps[0]) * 1e-9
+    findings = [
+        Finding("info", f"{len(stamps)} frames in {duration:.1f} s, {1e9 / period:.1f} Hz", name)
+    ]
+    pauses = np.flatnonzero(steps > LONG_PAUSE_PERIODS * period)
+    if len(pauses):
+        longest = pauses[np.argmax(steps[pauses])]
+        what = f"{len(pauses)} pauses between frames, the longest {steps[longest] * 1e-9:.2f} s"
+        findings.append(Finding("warning", what, f"after the frame at {stamps[longest]}"))
+    return findings
+
+
+def _check_groundtruth(truth: Trajectory | None, stamps: NDArray[np.int64]) -> list[Finding]:
+    if truth is None:
+        return [Finding("info", "no ground truth", "ground truth")]
+    first, last = int(truth.stamps_ns[0]), int(truth.stamps_ns[-1])
+    if len(stamps) == 0:
+        return [Finding("info", f"{(last - first) * 1e-9:.1f} s of poses", "ground truth")]
+    covered = float(np.mean((stamps >= first) & (stamps <= last)))
+    if covered == 0.0:
+        what = f"covers no frame: it spans {first} to {last}, frames {stamps[0]} to {stamps[-1]}"
+        return [Finding("error", what, "ground truth")]
+    severity: Severity = "info" if covered > 0.95 else "warning"
+    return [Finding(severity, f"covers {100 * covered:.1f} % of the frames", "ground truth")]
+
+
+def _check_calibration(rig: Rig) -> list[Finding]:
+    findings = []
+    for index, mounted in enumerate(rig.cameras):
+        camera, name = mounted.camera, mounted.name or f"camera {index}"
+        if not (0 < camera.cx < camera.width and 0 < camera.cy < camera.height):
+            what = (
+                f"principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies outside the image "
+                f"({camera.width}x{camera.height})"
+            )
+            findings.append(Finding("error", what, name))
+        if not 0.1 < camera.fx / camera.fy < 10:
+            what = f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} do not go together"
+            findings.append(Finding("error", what, name))
+        distance = float(np.linalg.norm(mounted.body_T_camera.translation()))
+        if distance > FARTHEST_CAMERA_M:
+            findings.append(Finding("warning", f"{distance:.1f} m from the IMU; metres?", name))
+    noise = rig.imu
+    values = (
+        noise.gyro_noise_density,
+        noise.gyro_random_walk,
+        noise.accel_noise_density,
+        noise.accel_random_walk,
+    )
+    if min(values) <= 0:
+        findings.append(Finding("error", "a noise density is not positive", "imu calibration"))
+    return findings

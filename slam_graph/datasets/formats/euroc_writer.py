@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""EuRoC (ASL) folders, written whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import mkdtemp
+from types import TracebackType
+from typing import Self, TextIO
+
+import cv2
+import gtsam
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.euroc_calibration import camera_entry
+from slam_graph.sensors.kalibr_calibration import write_kalibr
+from slam_graph.sensors.measurements import CameraFrame, ImuData
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+CALIBRATION = "calibration.yaml"
+"""The calibration in Kalibr's format, beside ``mav0``."""
+
+IMU_COLUMNS = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+CAMERA_COLUMNS = "#timestamp [ns],filename"
+TRUTH_COLUMNS = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],"
+    "q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],"
+    "v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],"
+    "b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],"
+    "b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]"
+)
+TRUTH_FOLDER = "state_groundtruth_estimate0"
+
+
+def refuse_existing(path: Path, force: bool = False) -> None:
+    """Refuse a folder that is there already, before any work is done.
+
+    Args:
+        path: where to write.
+        force: let a folder with ``mav0`` in it be replaced; nothing else ever is.
+    """
+    if force and (path / "mav0").is_dir():
+        return
+    if path.exists():
+        what = "is not an EuRoC folder and is not replaced" if force else "exists already"
+        raise DataError(f"{path}: {what}; remove it or write to another folder")
+
+
+class EurocWriter:
+    """Writes a recording to a new folder, which appears when the block ends well.
+
+    Args:
+        path: the new folder.
+        rig: calibration of the sensors.
+        truth: ground truth, where there is one.
+        comment: what to say of the sensors in their ``sensor.yaml``.
+        rate_hz: of the cameras.
+        force: replace an EuRoC folder that is there already; it is kept until the new one is whole.
+        with_imu: whether there will be samples of an IMU.
+
+    Raises:
+        DataError: if the folder exists already, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        truth: Trajectory | None,
+        comment: str,
+        rate_hz: float,
+        force: bool = False,
+        with_imu: bool = True,
+    ) -> None:
+        refuse_existing(path, force)
+        self._with_imu = with_imu
+        self._path, self._rig, self._truth = path, rig, truth
+        self._comment, self._rate_hz = comment, rate_hz
+        self._files = ExitStack()
+
+    def __enter__(self) -> Self:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder = Path(mkdtemp(prefix=f".{self._path.name}.", dir=self._path.parent))
+        except OSError as error:
+            raise DataError(f"{self._path}: cannot be written ({error.strerror})") from None
+        mav0 = self._folder / "mav0"
+        self._indices = [
+            self._open(mav0 / f"cam{k}", CAMERA_COLUMNS, _camera_values(mounted, self._rate_hz))
+            for k, mounted in enumerate(self._rig.cameras)
+        ]
+        self._images = [mav0 / f"cam{k}" / "data" for k in range(len(self._indices))]
+        for folder in self._images:
+            folder.mkdir()
+        if self._with_imu:
+            self._imu = self._open(mav0 / "imu0", IMU_COLUMNS, _imu_values(self._rig.imu))
+        if self._truth is not None:
+            rows = _truth_rows(self._truth)
+            columns = ",".join(TRUTH_COLUMNS.split(",")[: rows.shape[1] + 1])
+            file = self._open(mav0 / TRUTH_FOLDER, columns, {})
+            _write_rows(file, self._truth.stamps_ns, rows)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._files.close()
+        try:
+            if kind is None:
+                write_kalibr(self._rig, self._folder / CALIBRATION)
+                self._folder.chmod(0o755)
+                self._appear()
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def write_imu(self, imu: ImuData) -> None:
+        """The next samples."""
+        _write_rows(self._imu, imu.stamps_ns, np.column_stack([imu.gyro, imu.accel]))
+
+    def write_frame(self, frame: CameraFrame) -> None:
+        """The next frame; a camera without an image is left out of it."""
+        name = f"{frame.stamp_ns}.png"
+        for index, folder, image in zip(self._indices, self._images, frame.images, strict=True):
+            if image is None:
+                continue
+            if not cv2.imwrite(str(folder / name), image):
+                raise DataError(f"{folder / name}: cannot be written; is the disk full?")
+            index.write(f"{frame.stamp_ns},{name}\n")
+
+    def _open(self, folder: Path, columns: str, calibration: dict[str, object]) -> TextIO:
+        """The index of a new sensor, beside its calibration."""
+        folder.mkdir(parents=True)
+        kind = folder.name.rstrip("0123456789")
+        content = {"sensor_type": SENSOR_TYPES[kind], "comment": self._comment, **calibration}
+        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+        (folder / "sensor.yaml").write_text(text)
+        file = (folder / "data.csv").open("w", encoding="ascii", newline="\n")
+        self._files.enter_context(file)
+        file.write(columns + "\n")
+        return file
+
+    def _appear(self) -> None:
+        """Give the folder its name; one that it replaces goes last."""
+        old = self._folder.with_name(f"{self._folder.name}.old")
+        replaces = self._path.exists()
+        if replaces:
+            self._path.rename(old)
+        self._folder.rename(self._path)
+        if replaces:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+SENSOR_TYPES = {"cam": "camera", "imu": "imu", TRUTH_FOLDER.rstrip("0"): "ground truth"}
+
+
+def _write_rows(file: TextIO, stamps_ns: NDArray[np.int64], values: FloatArray) -> None:
+    """Rows with numbers in the shortest form that gives the same double again."""
+    for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True):
+        file.write(f"{stamp},{','.join(map(repr, row))}\n")
+
+
+def _truth_rows(truth: Trajectory) -> FloatArray:
+    """(N, 7, 10 or 16): position, quaternion w x y z, velocity, gyro and accelerometer bias."""
+    columns = [truth.positions, truth.quaternions[:, [3, 0, 1, 2]]]
+    if truth.velocities is not None:
+        columns.append(truth.velocities)
+        if truth.gyro_biases is not None and truth.accel_biases is not None:
+            columns += [truth.gyro_biases, truth.accel_biases]
+    return np.column_stack(columns)
+
+
+def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
+    """What EuRoC's ``sensor.yaml`` holds, and Kalibr's key for the time offset, if there is one."""
+    camera = mounted.camera
+    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    values: dict[str, object] = {
+        "T_BS": _matrix(mounted.body_T_camera),
+        "rate_hz": float(rate_hz),
+        "resolution": [camera.width, camera.height],
+        "camera_model": model,
+        "intrinsics": intrinsics,
+        "distortion_model": "radial-tangential" if distortion == "radtan" else distortion,
+        "distortion_coefficients": coefficients,
+    }
+    if mounted.time_offset_s:
+        values["timeshift_cam_imu"] = float(mounted.time_offset_s)
+    if mounted.rolling_shutter:
+        values["rolling_shutter"] = True
+    return values
+
+
+def _imu_values(noise: ImuNoise) -> dict[str, object]:
+    return {
+        "T_BS": _matrix(gtsam.Pose3()),
+        "rate_hz": float(noise.rate_hz),
+        "gyroscope_noise_density": float(noise.gyro_noise_density),
+        "gyroscope_random_walk": float(noise.gyro_random_walk),
+        "accelerometer_noise_density": float(noise.accel_noise_density),
+        "accelerometer_random_walk": float(noise.accel_random_walk),
+    }
+
+
+def _matrix(pose: gtsam.Pose3) -> dict[str, object]:
+    return {"cols": 4, "rows": 4, "data": [float(v) for v in pose.matrix().ravel()]}

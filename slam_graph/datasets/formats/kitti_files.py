@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The text files of KITTI: calibrations of lines ``key: numbers``, and time stamps as dates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets.streams.csv_rows import STAMP_TEXT, parse, read_rows, stamps_from_seconds
+from slam_graph.datasets.streams.pairing import in_order
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.rig import pose_from_matrix
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFile:
+    """Lines ``key: numbers`` of a calibration file; those that hold no numbers are left out."""
+
+    path: Path
+    values: dict[str, list[float]]
+
+    def numbers(self, key: str, count: int) -> FloatArray:
+        """(count,) numbers of a line.
+
+        Raises:
+            DataError: if the line is missing or has not so many numbers.
+        """
+        if key not in self.values:
+            raise DataError(f"{self.path}: missing line '{key}:'")
+        if len(self.values[key]) != count:
+            got = len(self.values[key])
+            raise DataError(f"{self.path}: line '{key}:' has {got} numbers instead of {count}")
+        return np.array(self.values[key])
+
+    def pose(self) -> gtsam.Pose3:
+        """The transformation of a file with the lines ``R`` and ``T``: p_to = R p_from + T."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.numbers("R", 9).reshape(3, 3)
+        matrix[:3, 3] = self.numbers("T", 3)
+        return pose_from_matrix(matrix, str(self.path))
+
+
+def read_calibration(path: Path) -> CalibrationFile:
+    """Read a calibration file.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise DataError(f"{path}: calibration cannot be read ({error.strerror})") from None
+    values = {}
+    for line in text.splitlines():
+        key, _, numbers = line.partition(":")
+        try:
+            values[key.strip()] = [float(number) for number in numbers.split()]
+        except ValueError:  # the date of the calibration, the distance of its corners
+            continue
+    return CalibrationFile(path, values)
+
+
+def rectified_camera(projection: FloatArray, width: int, height: int) -> tuple[Camera, gtsam.Pose3]:
+    """A rectified camera from its projection matrix.
+
+    Args:
+        projection: (3, 4) K [I | t], which projects from the frame of the rectified camera 0.
+        width: of the rectified images in pixels.
+        height: of the rectified images in pixels.
+
+    Returns:
+        The camera, and camera_T_camera0.
+    """
+    K = projection[:, :3]
+    camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "none", (), width, height)
+    return camera, gtsam.Pose3(gtsam.Rot3(), np.linalg.solve(K, projection[:, 3]))
+
+
+def read_dates(path: Path) -> NDArray[np.int64]:
+    """Time stamps (N,) in ns from lines like ``2011-09-26 13:02:25.964389445``.
+
+    The files do not say their time zone; the times are taken as UTC.
+
+    Raises:
+        DataError: naming file and line of what is not a date.
+    """
+    stamps: list[int] = []
+    for rows in read_rows(path):
+        for k, line in enumerate(rows.lines):
+            date, _, fraction = line.strip().partition(".")
+            try:
+                seconds = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+                nanoseconds = int(fraction[:9].ljust(9, "0"))
+            except ValueError:
+                text = line.strip()[:60]
+                raise DataError(f"{rows.where(k)}: '{text}' is not a date and time") from None
+            stamps.append(int(seconds.timestamp()) * 10**9 + nanoseconds)
+    if not stamps:
+        raise DataError(f"{path}: no time stamps in this file")
+    return np.array(stamps, np.int64)
+
+
+def read_seconds(path: Path) -> NDArray[np.int64]:
+    """Time stamps (N,) in ns from lines of seconds.
+
+    Raises:
+        DataError: naming file and line of what is not a number.
+    """
+    blocks = []
+    for rows in read_rows(path):
+        table = parse(rows, [("stamp", STAMP_TEXT)], "time [s]", (0,), None)
+        blocks.append(stamps_from_seconds(rows, table["stamp"]))
+    if not blocks:
+        raise DataError(f"{path}: no time stamps in this file")
+    return np.concatenate(blocks)
+
+
+def increasing(
+    stamps_ns: NDArray[np.int64], kind: str, path: Path, diagnostics: Diagnostics
+) -> NDArray[np.intp]:
+    """Indices of the stamps (N,), one a line, that increase; the others are counted."""
+    return in_order(
+        stamps_ns,
+        lambda k, _: diagnostics.warn(
+            kind, f"{path}:{k + 1}: dropped, not between the ones before and after it"
+        ),
+    )

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""KITTI's odometry benchmark: rectified grey stereo and poses, without an IMU.
+
+Geiger et al., "Are we ready for autonomous driving?", CVPR 2012. ``sequences/NN`` holds
+``times.txt`` (seconds), ``calib.txt`` (a 3x4 projection matrix ``P0``, ``P1`` of each grey camera)
+and the images ``image_0``, ``image_1``; ``poses/NN.txt`` beside ``sequences`` the 3x4 poses of
+camera 0 in its first frame, for sequences 00 to 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam_graph.datasets.formats.kitti_files import (
+    increasing,
+    read_calibration,
+    read_seconds,
+    rectified_camera,
+)
+from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.streams.csv_rows import parse, read_rows
+from slam_graph.datasets.streams.image_sequence import ImageSequence
+from slam_graph.datasets.streams.images import Fault, FileImages
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import Rig, RigCamera
+
+WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Turns x right, y down, z forward into the x forward, y left, z up of a world frame."""
+
+
+def is_kitti_odometry(path: Path) -> bool:
+    """Whether this is the folder of a sequence."""
+    needed = (path / "times.txt", path / "calib.txt")
+    return all(file.is_file() for file in needed) and (path / "image_0").is_dir()
+
+
+class KittiOdometrySequence(ImageSequence):
+    """A sequence of KITTI's odometry benchmark; the body frame is that of camera 0.
+
+    Args:
+        path: ``sequences/NN``.
+        cameras: 1 or 2.
+        calibration: a Kalibr camera chain to use instead of ``calib.txt``.
+        groundtruth: file or folder to use instead of ``poses/NN.txt``.
+        diagnostics: where faults are counted.
+
+    Raises:
+        DataError: if a part of the recording is missing or cannot be read.
+    """
+
+    format: ClassVar[str] = "kitti_odometry"
+    has_imu = False
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        self.path = path.resolve()
+        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        self._times_ns = read_seconds(path / "times.txt")
+        folders = [folder for k in range(2) if (folder := path / f"image_{k}").is_dir()]
+        kept = increasing(
+            self._times_ns, "camera_out_of_order", path / "times.txt", diagnostics
+        ).tolist()
+        streams = [
+            FileImages(f.name, self._times_ns[kept], [f / f"{k:06d}.png" for k in kept])
+            for f in folders
+        ]
+        if calibration is not None:
+            rig = read_kalibr(calibration, needs_imu=False)
+        else:
+            rig = _read_rig(path, streams)
+        rig = rig if cameras is None else rig.select(cameras)
+        if len(rig.cameras) > len(streams):
+            raise DataError(f"{calibration}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
+        used = streams[: len(rig.cameras)]
+        super().__init__(f"kitti_{self.path.name}", rig, used, groundtruth, diagnostics)
+        self._poses = self.path.parent.parent / "poses" / f"{self.path.name}.txt"
+        if groundtruth is None and self._poses.is_file():
+            self.own_groundtruth = self._read_poses
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """Nothing: there is no IMU."""
+        return iter(())
+
+    def measure(self) -> Extent:
+        """Count frames."""
+        stamps = self._groups.stamps_ns
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), 0)
+
+    def _read_poses(self) -> Trajectory:
+        matrices = read_poses(self._poses)
+        if len(matrices) != len(self._times_ns):
+            raise DataError(
+                f"{self._poses}: {len(matrices)} poses, {self.path} has {len(self._times_ns)} times"
+            )
+        kept = np.flatnonzero(np.diff(self._times_ns, prepend=self._times_ns[0] - 1) > 0)
+        rotations = WORLD_R_CAMERA0 @ matrices[kept, :, :3]
+        return Trajectory(
+            self._times_ns[kept],
+            matrices[kept, :, 3] @ WORLD_R_CAMERA0.T,
+            Rotation.from_matrix(rotations).as_quat(),
+        )
+
+
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """Poses (N, 3, 4) of a file with twelve numbers a row.
+
+    Raises:
+        DataError: naming file and line of a row that cannot be read.
+    """
+    blocks = [
+        parse(rows, [("pose", "f8", (12,))], "12 numbers of a 3x4 pose", None, None)["pose"]
+        for rows in read_rows(path)
+    ]
+    if not blocks:
+        raise DataError(f"{path}: no poses in this file")
+    return np.concatenate(blocks).reshape(-1, 3, 4)
+
+
+def _read_rig(path: Path, streams: list[FileImages]) -> Rig:
+    """The rectified cameras; the size of the images is not in the calibration."""
+    file = read_calibration(path / "calib.txt")
+    mounted = []
+    for k, stream in enumerate(streams):
+        first = stream.read(0)
+        if isinstance(first, Fault):
+            raise DataError(first.message)
+        height, width = first.shape
+        projection = file.numbers(f"P{k}", 12).reshape(3, 4)
+        camera, camera_T_camera0 = rectified_camera(projection, width, height)
+        mounted.append(RigCamera(camera, camera_T_camera0.inverse(), 0.0, stream.name))
+    if not mounted[0].body_T_camera.equals(gtsam.Pose3(), 1e-6):
+        raise DataError(f"{file.path}: P0 is expected to be the reference camera")
+    return Rig(tuple(mounted))

@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""KITTI raw data: grey stereo images and the navigation unit (oxts) as IMU and ground truth.
+
+Geiger et al., "Vision meets robotics: The KITTI dataset", IJRR 2013. A drive comes in two forms: in
+``…_sync`` the images are rectified and the unit is sampled with them at 10 Hz, in ``…_extract`` the
+images are as they were taken and the unit has its 100 Hz. The calibration is in the folder of the
+day, beside the drives.
+
+The inertial and satellite navigation unit of KITTI's raw data: its IMU, and its poses.
+
+Each sample is a file of 30 numbers. Of them are read (from 0): latitude, longitude [deg] and
+altitude [m] (0 to 2); roll, pitch, yaw [rad] (3 to 5; yaw is 0 towards east, counterclockwise);
+velocity to north and east, and upwards [m/s] (6, 7, 10); specific force x y z [m/s²] (11 to 13) and
+angular rate x y z [rad/s] (17 to 19) along the axes of the unit: x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets.formats.kitti_files import (
+    CalibrationFile,
+    increasing,
+    read_calibration,
+    read_dates,
+    rectified_camera,
+)
+from slam_graph.datasets.formats.tum_rgbd import rectifier
+from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.streams.image_sequence import ImageSequence
+from slam_graph.datasets.streams.images import Fault, FileImages, Image
+from slam_graph.datasets.streams.imu_stream import ImuCleaner
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+EARTH_RADIUS_M = 6_378_137.0
+
+VALUES = 30
+POSITION, ANGLES, ACCEL, GYRO = slice(0, 3), slice(3, 6), slice(11, 14), slice(17, 20)
+EAST_NORTH_UP = [7, 6, 10]
+
+FILES_PER_BLOCK = 256
+
+
+class Oxts:
+    """A folder ``oxts`` with ``timestamps.txt`` and a file for each sample in ``data``.
+
+    Attributes:
+        folder: the folder.
+        stamps_ns: (N,) of the samples, in the order of the file.
+
+    Raises:
+        DataError: if the time stamps cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.stamps_ns = read_dates(folder / "timestamps.txt")
+
+    @property
+    def rate_hz(self) -> float:
+        """Median rate of the samples."""
+        periods = np.diff(self.stamps_ns)
+        return 1e9 / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
+
+    def where(self, index: int) -> str:
+        """The file of a sample."""
+        return str(self._file(index))
+
+    def imu_blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned IMU stream; a sample without a file is not finite."""
+        cleaner = ImuCleaner(diagnostics, after_ns)
+        for begin in range(0, len(self.stamps_ns), FILES_PER_BLOCK):
+            stamps = self.stamps_ns[begin : begin + FILES_PER_BLOCK]
+            if after_ns is not None and np.all(stamps < after_ns):
+                continue
+            values = np.array([self._read(begin + k) for k in range(len(stamps))])
+            data = ImuData(stamps, values[:, GYRO].copy(), values[:, ACCEL].copy())
+            cleaned = cleaner.clean(data, lambda k, begin=begin: self.where(begin + k))  # type: ignore[misc]
+            if len(cleaned):
+                yield cleaned
+
+    def trajectory(self, diagnostics: Diagnostics) -> Trajectory:
+        """Poses of the unit in a world east, north, up with its origin at the first pose.
+
+        Positions are Mercator's, scaled to be true at the first latitude, as KITTI's own tools do.
+        """
+        stamps_ns = self.stamps_ns
+        values = np.array([self._read(k) for k in range(len(stamps_ns))])
+        whole = np.flatnonzero(np.isfinite(values).all(axis=1))
+        for k in np.setdiff1d(np.arange(len(values)), whole):
+            diagnostics.warn("groundtruth_not_finite", f"{self.where(int(k))}: no pose")
+        timestamps = self.folder / "timestamps.txt"
+        kept = whole[
+            increasing(stamps_ns[whole], "groundtruth_out_of_order", timestamps, diagnostics)
+        ]
+        if len(kept) == 0:
+            raise DataError(f"{self.folder}: no pose in these files")
+        values = values[kept]
+        positions = mercator(values[:, POSITION])
+        rotations = Rotation.from_euler("ZYX", values[:, ANGLES][:, ::-1])
+        return Trajectory(
+            stamps_ns[kept],
+            positions - positions[0],
+            rotations.as_quat(),
+            values[:, EAST_NORTH_UP].copy(),
+        )
+
+    def _file(self, index: int) -> Path:
+        return self.folder / "data" / f"{index:010d}.txt"
+
+    def _read(self, index: int) -> FloatArray:
+        """The 30 numbers of a sample, or NaN where its file is missing."""
+        path = self._file(index)
+        try:
+            values = [float(text) for text in path.read_text(encoding="ascii").split()]
+        except FileNotFoundError:
+            return np.full(VALUES, np.nan)
+        except (OSError, ValueError):
+            values = []
+        if len(values) != VALUES:
+            raise DataError(f"{path}: expected {VALUES} numbers, as KITTI's oxts files have")
+        return np.array(values)
+
+
+def mercator(places: FloatArray) -> FloatArray:
+    """Positions (N, 3) east, north, up [m] of latitude, longitude [deg] and altitude [m] (N, 3)."""
+    latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
+    scale = EARTH_RADIUS_M * np.cos(latitude[0])
+    north = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
+    return np.column_stack([scale * longitude, north, places[:, 2]])
+
+
+GREY = ("00", "01")
+"""The grey cameras; 02 and 03 are in colour."""
+
+STEREO_TOLERANCE_S = 0.02
+"""The cameras are triggered together, 10 times a second; their stamps are the computer's."""
+
+SLOW_IMU_HZ = 50.0
+
+NOISE = {
+    "gyro_noise_density": 5e-4,
+    "gyro_random_walk": 1e-5,
+    "accel_noise_density": 1e-2,
+    "accel_random_walk": 1e-4,
+}
+"""Assumed, KITTI tells none: well above the unit's (OXTS RT3003), for the vibration of a car."""
+
+
+def is_kitti_raw(path: Path) -> bool:
+    """Whether this is the folder of a drive."""
+    return (path / "oxts").is_dir() and (path / "image_00").is_dir()
+
+
+class KittiRawSequence(ImageSequence):
+    """A drive of KITTI's raw data, with the body frame of its navigation unit.
+
+    The images of ``…_extract`` are rectified as they are read. A drive ``…_sync`` takes the IMU at
+    100 Hz from ``…_extract`` beside it, if that is there; otherwise its own 10 Hz are counted as
+    `imu_slow`.
+
+    Args:
+        path: folder of the drive, with ``image_00``, ``image_01`` and ``oxts``.
+        cameras: 1 or 2.
+        calibration: a Kalibr camera chain of the rectified images, instead of that of the day.
+        groundtruth: file or folder to use instead of the poses of the navigation unit.
+        diagnostics: where faults are counted.
+
+    Raises:
+        DataError: if a part of the recording is missing or cannot be read.
+    """
+
+    format: ClassVar[str] = "kitti_raw"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        self.path = path.resolve()
+        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        self._oxts = _find_oxts(self.path)
+        streams = [
+            _images(self.path, camera, diagnostics)
+            for camera in GREY
+            if (self.path / f"image_{camera}").is_dir()
+        ]
+        day = self.path.parent
+        noise = ImuNoise(**NOISE, rate_hz=self._oxts.rate_hz)
+        if calibration is not None:
+            rig = read_kalibr(calibration, fallback=noise)
+        else:
+            rig = _read_rig(day, len(streams), noise)
+        rig = rig if cameras is None else rig.select(cameras)
+        if len(rig.cameras) > len(streams):
+            raise DataError(f"{calibration}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
+        for camera, stream in zip(GREY, streams, strict=False):
+            stream.process = _rectification(day, camera, stream)
+        used = streams[: len(rig.cameras)]
+        super().__init__(self.path.name, rig, used, groundtruth, diagnostics, STEREO_TOLERANCE_S)
+        if groundtruth is None:
+            self.own_groundtruth = lambda: self._oxts.trajectory(self.diagnostics)
+        if self._oxts.rate_hz < SLOW_IMU_HZ:
+            what = f"{self._oxts.folder}: the IMU has {self._oxts.rate_hz:.0f} Hz only"
+            better = self.path.name.replace("_sync", "_extract")
+            diagnostics.warn("imu_slow", f"{what}; {better} has 100 Hz, lay it beside")
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        return self._oxts.imu_blocks(self.diagnostics, after_ns)
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples."""
+        stamps = self._groups.stamps_ns
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), len(self._oxts.stamps_ns))
+
+
+def _find_oxts(drive: Path) -> Oxts:
+    """The navigation unit at its full rate, if the unsynchronised form of a drive is beside it."""
+    extract = drive.with_name(drive.name.replace("_sync", "_extract")) / "oxts"
+    return Oxts(extract if (extract / "timestamps.txt").is_file() else drive / "oxts")
+
+
+def _images(drive: Path, camera: str, diagnostics: Diagnostics) -> FileImages:
+    folder = drive / f"image_{camera}"
+    stamps = read_dates(folder / "timestamps.txt")
+    kept = increasing(stamps, "camera_out_of_order", folder / "timestamps.txt", diagnostics)
+    paths = [folder / "data" / f"{k:010d}.png" for k in kept]
+    return FileImages(folder.name, stamps[kept], paths)
+
+
+def _read_rig(day: Path, count: int, noise: ImuNoise) -> Rig:
+    """The rectified cameras in the frame of the navigation unit."""
+    between = read_calibration(day / "calib_cam_to_cam.txt")
+    velo_T_imu = read_calibration(day / "calib_imu_to_velo.txt").pose()
+    cam0_T_velo = read_calibration(day / "calib_velo_to_cam.txt").pose()
+    rectified_T_cam0 = CalibrationFile(
+        between.path, {"R": between.numbers("R_rect_00", 9).tolist(), "T": [0.0, 0.0, 0.0]}
+    ).pose()
+    rectified_T_imu = rectified_T_cam0.compose(cam0_T_velo).compose(velo_T_imu)
+    mounted = []
+    for name in GREY[:count]:
+        projection = between.numbers(f"P_rect_{name}", 12).reshape(3, 4)
+        camera, camera_T_rectified = rectified_camera(projection, *_size(between, f"S_rect_{name}"))
+        body_T_camera = camera_T_rectified.compose(rectified_T_imu).inverse()
+        mounted.append(RigCamera(camera, body_T_camera, 0.0, f"image_{name}"))
+    return Rig(tuple(mounted), noise)
+
+
+def _rectification(day: Path, camera: str, stream: FileImages) -> Callable[[Image], Image] | None:
+    """How the images of a camera are rectified; None if they are already."""
+    path = day / "calib_cam_to_cam.txt"
+    first = stream.read(0)
+    if isinstance(first, Fault) or not path.is_file():
+        return None
+    calibration = read_calibration(path)
+    taken, rectified = (_size(calibration, f"{key}_{camera}") for key in ("S", "S_rect"))
+    if first.shape[::-1] == rectified or first.shape[::-1] != taken:
+        return None
+    return rectifier(
+        calibration.numbers(f"K_{camera}", 9).reshape(3, 3),
+        calibration.numbers(f"D_{camera}", 5),
+        calibration.numbers(f"R_rect_{camera}", 9).reshape(3, 3),
+        calibration.numbers(f"P_rect_{camera}", 12).reshape(3, 4)[:, :3],
+        taken,
+        rectified,
+    )
+
+
+def _size(calibration: CalibrationFile, key: str) -> tuple[int, int]:
+    width, height = calibration.numbers(key, 2)
+    return int(width), int(height)

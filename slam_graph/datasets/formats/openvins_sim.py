@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated measurements dumped from OpenVINS: tracks, IMU, exact calibration and start state.
+
+The folder holds ``calib.yaml``, ``imu.csv`` and ``tracks.csv`` (raw, distorted pixels), and may
+hold ``groundtruth.csv`` and ``init_state.csv``. Times are seconds with nine decimals, read as text
+so that no nanosecond is lost. Quaternions are x y z w of `world_R_body`.
+
+The small files of a simulation dumped from OpenVINS: calibration, true states, start state.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.streams.csv_rows import (
+    STAMP_TEXT,
+    Rows,
+    count_rows,
+    parse,
+    read_rows,
+    require_rows,
+    stamp_from_seconds,
+    stamps_from_seconds,
+)
+from slam_graph.datasets.streams.imu_stream import clean_blocks
+from slam_graph.datasets.streams.track_frames import (
+    TRACK_ROW,
+    StampCounter,
+    TrackTable,
+    frames_from_tables,
+)
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.calibration_yaml import read_yaml
+from slam_graph.sensors.euroc_calibration import read_camera
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
+STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"
+
+DEFAULT_SIGMAS = {"q": 0.017, "p": 0.05, "v": 0.01, "bg": 0.02, "ba": 0.02}
+"""Prior of the start state where the file does not state one: rad, m, m/s, rad/s, m/s²."""
+
+COVARIANCE_ORDER = ("q", "p", "v", "ba", "bg")
+"""Blocks of `NavState.covariance`."""
+
+
+def read_rig(path: Path) -> Rig:
+    """The exact calibration of the simulation (``calib.yaml``).
+
+    Its time offset is OpenVINS': t_imu = t_camera + offset, which is ours.
+    """
+    content = read_yaml(path)
+    offset = content.get("cam_imu_time_offset_s")
+    offset_s = 0.0 if offset is None else offset.number()
+    cameras = []
+    for entry in content.require("cameras").elements():
+        name = f"cam{entry.require('id').text()}"
+        pose = entry.require("T_imu_cam").pose()
+        cameras.append(RigCamera(read_camera(entry), pose, offset_s, name))
+    if not cameras:
+        raise DataError(f"{path}: no cameras in this file")
+    imu = content.require("imu")
+    noise = ImuNoise(
+        gyro_noise_density=imu.require("gyro_noise_density").number(),
+        gyro_random_walk=imu.require("gyro_random_walk").number(),
+        accel_noise_density=imu.require("accel_noise_density").number(),
+        accel_random_walk=imu.require("accel_random_walk").number(),
+        rate_hz=imu.require("rate_hz").number(),
+    )
+    return Rig(tuple(cameras), noise)
+
+
+def read_states(path: Path) -> Trajectory:
+    """States over time: rows of time, position, quaternion x y z w, velocity and biases.
+
+    Raises:
+        DataError: if the file is missing or empty, or a row cannot be read.
+    """
+    blocks = [_parse_states(rows) for rows in read_rows(path)]
+    if not blocks:
+        raise DataError(f"{path}: no data rows in this file")
+    stamps = np.concatenate([block[0] for block in blocks])
+    values = np.concatenate([block[1] for block in blocks])
+    return Trajectory(
+        stamps,
+        values[:, :3].copy(),
+        values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True),
+        values[:, 7:10].copy(),
+        values[:, 10:13].copy(),
+        values[:, 13:].copy(),
+    )
+
+
+def read_start(path: Path) -> NavState:
+    """The start state, and how well it is known, from ``init_state.csv``."""
+    states = read_states(path)
+    assert states.velocities is not None
+    assert states.gyro_biases is not None
+    assert states.accel_biases is not None
+    return NavState(
+        stamp_ns=int(states.stamps_ns[0]),
+        world_T_body=states.pose(0),
+        velocity=states.velocities[0],
+        gyro_bias=states.gyro_biases[0],
+        accel_bias=states.accel_biases[0],
+        covariance=_prior_covariance(path.read_text(encoding="utf-8")),
+    )
+
+
+def _parse_states(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (N,) in ns and values (N, 16): p, q, v, gyro bias, accel bias."""
+    table = parse(rows, STATE_ROW, STATE_COLUMNS)
+    return stamps_from_seconds(rows, table["stamp"]), table["values"]
+
+
+def _prior_covariance(text: str) -> NDArray[np.float64]:
+    """(15, 15) from a comment like ``prior sigma: q 0.017 rad, p 0.05 m, …``."""
+    _, _, stated = text.partition("prior sigma")
+    sigmas = DEFAULT_SIGMAS | {
+        name: float(value)
+        for name, value in re.findall(r"\b(q|p|v|bg|ba) ([0-9.]+(?:e[-+]?\d+)?)", stated)
+    }
+    return np.diag(np.repeat([sigmas[name] ** 2 for name in COVARIANCE_ORDER], 3))
+
+
+ROWS_PER_TRACK_BLOCK = 8192
+"""Some 16 frames of two cameras: large enough for fast parsing, half a megabyte of text."""
+
+IMU_ROW = [("stamp", STAMP_TEXT), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
+TRACK_COLUMNS = [("stamp", STAMP_TEXT), ("camera", "i8"), ("id", "i8"), ("pixel", "f8", (2,))]
+
+
+class OpenvinsSimulation(RecordedSequence):
+    """A folder of simulated measurements with exact calibration and start.
+
+    Args:
+        path: the folder.
+        cameras: use only the first so many.
+        calibration: a Kalibr camera chain to use instead of ``calib.yaml``.
+        groundtruth: file or folder to use instead of ``groundtruth.csv``.
+        diagnostics: where faults are counted.
+
+    Raises:
+        DataError: if a file is missing, or a row cannot be read.
+    """
+
+    format: ClassVar[str] = "openvins_sim"
+    content: ClassVar[Literal["images", "tracks"]] = "tracks"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        self.path = path
+        rig = read_rig(path / "calib.yaml") if calibration is None else read_kalibr(calibration)
+        self._known_cameras = len(rig.cameras)
+        rig = rig if cameras is None else rig.select(cameras)
+        super().__init__(path.resolve().name, rig, groundtruth, diagnostics)
+        own = path / "groundtruth.csv"
+        self._own_groundtruth = own if groundtruth is None and own.is_file() else None
+        self._tracks, self._imu_file = path / "tracks.csv", path / "imu.csv"
+        for file in (self._tracks, self._imu_file):
+            require_rows(file)
+
+    @property
+    def has_groundtruth(self) -> bool:
+        """Whether `groundtruth()` gives one."""
+        return self._own_groundtruth is not None or super().has_groundtruth
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples in one pass over the files."""
+        counter, latest = StampCounter(), ""
+        for rows in read_rows(self._tracks, ROWS_PER_TRACK_BLOCK):
+            for k, line in enumerate(rows.lines):
+                text = line.partition(",")[0]
+                if text != latest:
+                    counter.add(stamp_from_seconds(text, rows, k))
+                    latest = text
+        samples = count_rows(self._imu_file)[0]
+        return Extent(counter.frames, counter.first_ns, counter.latest_ns, samples)
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        blocks = ((rows, _parse_imu(rows)) for rows in read_rows(self._imu_file))
+        return clean_blocks(blocks, self.diagnostics, after_ns)
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Feature frames, with the normalised coordinates of the raw pixels."""
+        tables = self._tables(start_ns, end_ns)
+        return frames_from_tables(
+            tables, len(self.rig.cameras), self.diagnostics, str(self._tracks)
+        )
+
+    def groundtruth(self) -> Trajectory | None:
+        """The simulated truth: poses, velocities and biases."""
+        if self._own_groundtruth is None:
+            return super().groundtruth()
+        return read_states(self._own_groundtruth)
+
+    def initial_state(self) -> NavState | None:
+        """The start state of ``init_state.csv``, with the prior that its comment states."""
+        file = self.path / "init_state.csv"
+        return read_start(file) if file.is_file() else None
+
+    def _tables(self, start_ns: int | None, end_ns: int | None) -> Iterator[TrackTable]:
+        for rows in read_rows(self._tracks, ROWS_PER_TRACK_BLOCK):
+            parsed = parse(rows, TRACK_COLUMNS, "time [s], camera, feature, u, v")
+            unknown = (parsed["camera"] < 0) | (parsed["camera"] >= self._known_cameras)
+            if unknown.any():
+                raise DataError(
+                    f"{rows.where(int(unknown.argmax()))}: camera {parsed['camera'][unknown][0]}, "
+                    f"but the calibration has {self._known_cameras}, counted from 0"
+                )
+            stamps = stamps_from_seconds(rows, parsed["stamp"])
+            inside = within(stamps, start_ns, end_ns)
+            table = np.zeros(int(inside.sum()), TRACK_ROW)
+            table["stamp"] = stamps[inside]
+            for name in ("camera", "id", "pixel"):
+                table[name] = parsed[name][inside]
+            yield self._undistort(table)
+            if end_ns is not None and stamps[-1] > end_ns:
+                return
+
+    def _undistort(self, table: TrackTable) -> TrackTable:
+        for index, mounted in enumerate(self.rig.cameras):
+            mine = table["camera"] == index
+            table["normalized"][mine] = mounted.camera.undistort(table["pixel"][mine])
+        return table
+
+
+def _parse_imu(rows: Rows) -> ImuData:
+    table = parse(rows, IMU_ROW, "time [s], gyro xyz, accel xyz")
+    return ImuData(stamps_from_seconds(rows, table["stamp"]), table["gyro"], table["accel"])

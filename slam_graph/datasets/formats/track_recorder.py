@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Record what a front end found, for `recording` to replay; `recording_format` has the files."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import mkdtemp
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from slam_graph.datasets.formats import track_format as layout
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.kalibr_calibration import write_kalibr
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
+from slam_graph.sensors.rig import Rig
+
+
+class TrackRecorder:
+    """Writes the packets of a front end to a folder; a context manager.
+
+    Everything is written beside the folder and moved there at the end, so a recording is whole or
+    not there: an exception inside the ``with`` block leaves nothing behind.
+
+    Args:
+        path: folder to make; it must not exist.
+        rig: the cameras that frames will have observations of, and the IMU.
+        name: of the recording, default that of the folder.
+        groundtruth: true trajectory to keep with it.
+        initial_state: known start to keep with it.
+
+    Raises:
+        DataError: if the folder exists already.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        name: str | None = None,
+        groundtruth: Trajectory | None = None,
+        initial_state: NavState | None = None,
+    ) -> None:
+        if path.exists():
+            raise DataError(f"{path}: exists already; remove it or record to another folder")
+        self.path = path
+        self.rig = rig
+        self.name = name if name is not None else path.name
+        self._groundtruth = groundtruth
+        self._initial_state = initial_state
+        self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
+        self._latest_ns: int | None = None
+        self._descriptor_bytes: int | None = None
+        self._record = layout.frame_record(len(rig.cameras))
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._folder = Path(mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
+        self._files = ExitStack()
+        self._frames = self._open(layout.FRAMES)
+        self._features = self._open(layout.FEATURES)
+        self._imu = self._open(layout.IMU)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._files.close()
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+        """Append a packet.
+
+        Args:
+            imu: the samples since the packet before, as in `Packet`.
+            frame: the features found at a time later than that of the frame before.
+
+        Raises:
+            DataError: if the frame is not later, or has another number of cameras than the rig.
+        """
+        if len(frame.cameras) != len(self.rig.cameras):
+            raise DataError(
+                f"{self.path}: a frame with {len(frame.cameras)} cameras cannot be recorded for a "
+                f"rig with {len(self.rig.cameras)}"
+            )
+        if self._latest_ns is not None and frame.stamp_ns <= self._latest_ns:
+            raise DataError(
+                f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
+                f"{self._latest_ns}"
+            )
+        self._write_descriptors(frame.cameras[0])
+        self._latest_ns = frame.stamp_ns
+        samples = np.empty(len(imu), layout.IMU_RECORD)
+        samples["stamp"], samples["gyro"], samples["accel"] = imu.stamps_ns, imu.gyro, imu.accel
+        self._imu.write(samples.tobytes())
+        row = np.empty(1, self._record)
+        row["stamp"], row["counts"] = frame.stamp_ns, [len(seen) for seen in frame.cameras]
+        self._frames.write(row.tobytes())
+        for seen in frame.cameras:
+            self._features.write(_pack(seen).tobytes())
+        self._counts["frames"] += 1
+        self._counts["imu_samples"] += len(imu)
+        self._counts["features"] += sum(len(seen) for seen in frame.cameras)
+
+    def _write_descriptors(self, seen: FeatureObservations) -> None:
+        """Append the descriptors of the first camera; the first features say how long they are."""
+        if len(seen) == 0:
+            return
+        descriptors = seen.descriptors
+        width = 0 if descriptors is None else descriptors.shape[1]
+        if self._descriptor_bytes is None:
+            self._descriptor_bytes = width
+            if width:
+                self._descriptors = self._open(layout.DESCRIPTORS)
+        if width != self._descriptor_bytes:
+            raise DataError(
+                f"{self.path}: descriptors of {width} bytes cannot be recorded after some of "
+                f"{self._descriptor_bytes}"
+            )
+        if descriptors is not None:
+            self._descriptors.write(np.ascontiguousarray(descriptors, np.uint8).tobytes())
+
+    def _open(self, name: str) -> BinaryIO:
+        return self._files.enter_context((self._folder / name).open("wb"))
+
+    def _finish(self) -> None:
+        """Write the small files, and move the folder to its place."""
+        meta: dict[str, Any] = {
+            "format": layout.FORMAT_NAME,
+            "version": layout.FORMAT_VERSION,
+            "name": self.name,
+            "cameras": len(self.rig.cameras),
+            **self._counts,
+            "descriptor_bytes": self._descriptor_bytes or 0,
+        }
+        write_kalibr(self.rig, self._folder / layout.CALIBRATION)
+        if self._groundtruth is not None:
+            layout.save_trajectory(self._folder / layout.GROUNDTRUTH, self._groundtruth)
+        if self._initial_state is not None:
+            layout.save_state(self._folder / layout.INITIAL_STATE, self._initial_state)
+        (self._folder / layout.META).write_text(yaml.safe_dump(meta, sort_keys=False))
+        self._folder.chmod(0o755)
+        self._folder.rename(self.path)
+
+
+def _pack(seen: FeatureObservations) -> NDArray[np.void]:
+    rows = np.empty(len(seen), layout.FEATURE_RECORD)
+    rows["id"], rows["pixel"], rows["normalized"] = seen.ids, seen.pixels, seen.normalized
+    return rows

@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""TUM RGB-D: colour images of a Kinect with motion capture; neither a gyroscope nor an IMU.
+
+Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. ``rgb.txt`` lists
+time [s] and file of the images, ``groundtruth.txt`` the poses of the colour camera's optical frame.
+The images are undistorted with the published calibration as they are read.
+``depth.txt`` and the depth images are not read, nor is ``accelerometer.txt``, which is of no use
+without a gyroscope.
+
+Images brought into the frame of a pinhole without distortion, where no camera model fits them.
+
+KITTI's unsynchronised images and those of TUM RGB-D are calibrated with five coefficients of
+Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets.formats.euroc import ordered_images
+from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.streams.csv_rows import read_rows, stamp_from_seconds
+from slam_graph.datasets.streams.image_sequence import ImageSequence
+from slam_graph.datasets.streams.images import FileImages, Image
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import Rig, RigCamera
+
+Size = tuple[int, int]
+
+
+def rectifier(
+    K: FloatArray,
+    coefficients: FloatArray,
+    rectified_R_camera: FloatArray,
+    rectified_K: FloatArray,
+    size: Size,
+    rectified_size: Size,
+) -> Callable[[Image], Image]:
+    """What turns images of a distorted camera into rectified ones.
+
+    Images of another size than `size` are handed back as they are, to be found by their size.
+
+    Args:
+        K: (3, 3) of the camera as it is.
+        coefficients: (5,) k1, k2, p1, p2, k3.
+        rectified_R_camera: (3, 3) rotation into the rectified frame.
+        rectified_K: (3, 3) of the rectified camera.
+        size: width and height of the images as they are.
+        rectified_size: width and height of the rectified images.
+    """
+    maps = cv2.initUndistortRectifyMap(
+        K, coefficients, rectified_R_camera, rectified_K, rectified_size, cv2.CV_16SC2
+    )
+    return partial(_remap, maps[0], maps[1], size)
+
+
+def _remap(whole: NDArray[Any], fraction: NDArray[Any], size: Size, image: Image) -> Image:
+    if image.shape[::-1] != size:
+        return image
+    return np.asarray(cv2.remap(image, whole, fraction, cv2.INTER_LINEAR), np.uint8)
+
+
+SIZE = (640, 480)
+
+CAMERAS = {
+    "1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+"""fx, fy, cx, cy and k1, k2, p1, p2, k3 of the colour cameras, as the benchmark publishes them for
+freiburg1 to freiburg3; the images of the third come undistorted."""
+
+
+def is_tum_rgbd(path: Path) -> bool:
+    """Whether this is the folder of a sequence."""
+    return (path / "rgb.txt").is_file() and (path / "rgb").is_dir()
+
+
+class TumRgbdSequence(ImageSequence):
+    """A sequence of TUM RGB-D, its colour images in grey; the body frame is the camera's.
+
+    Args:
+        path: the folder with ``rgb.txt``.
+        cameras: 1 or None.
+        calibration: a Kalibr camera chain; needed where the name of the folder does not say whether
+            it is freiburg1, freiburg2 or freiburg3.
+        groundtruth: file or folder to use instead of ``groundtruth.txt``.
+        diagnostics: where faults are counted.
+
+    Raises:
+        DataError: if a part of the recording is missing or cannot be read.
+    """
+
+    format: ClassVar[str] = "tum_rgbd"
+    has_imu = False
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        self.path = path.resolve()
+        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        images = _list_images(path, diagnostics)
+        if calibration is not None:
+            rig = read_kalibr(calibration, needs_imu=False).select(1)
+        else:
+            rig = _known_rig(self.path, images)
+        truth = path / "groundtruth.txt"
+        super().__init__(
+            self.path.name,
+            rig if cameras is None else rig.select(cameras),
+            [images],
+            groundtruth or (truth if truth.is_file() else None),
+            diagnostics,
+        )
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """Nothing: there is no gyroscope."""
+        return iter(())
+
+    def measure(self) -> Extent:
+        """Count frames."""
+        stamps = self._groups.stamps_ns
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), 0)
+
+
+def _known_rig(path: Path, images: FileImages) -> Rig:
+    """The published calibration; the images are undistorted with it as they are read."""
+    found = re.search(r"freiburg([123])|fr([123])(?!\d)", path.name)
+    if found is None:
+        raise DataError(
+            f"{path}: the name does not say which camera it is (freiburg1, freiburg2, freiburg3); "
+            "give --calibration"
+        )
+    fx, fy, cx, cy, coefficients = CAMERAS[found[1] or found[2]]
+    camera = Camera(fx, fy, cx, cy, "none", (), *SIZE)
+    if any(coefficients):
+        K = camera.K
+        images.process = rectifier(K, np.array(coefficients), np.eye(3), K, SIZE, SIZE)
+    return Rig((RigCamera(camera, gtsam.Pose3(), 0.0, images.name),))
+
+
+def _list_images(path: Path, diagnostics: Diagnostics) -> FileImages:
+    stamps: list[int] = []
+    files: list[Path] = []
+    for rows in read_rows(path / "rgb.txt"):
+        for k, line in enumerate(rows.lines):
+            stamp, _, name = line.strip().partition(" ")
+            if not name:
+                raise DataError(f"{rows.where(k)}: expected time [s] and file name")
+            stamps.append(stamp_from_seconds(stamp, rows, k))
+            files.append(path / name.strip())
+    if not stamps:
+        raise DataError(f"{path / 'rgb.txt'}: no images listed in this file")
+    return ordered_images("rgb", np.array(stamps, np.int64), files, path / "rgb.txt", diagnostics)

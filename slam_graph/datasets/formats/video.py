@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A video of one camera, with a table of the times of its frames, and with or without an IMU."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.formats.loose_files import (
+    LooseFiles,
+    find_files,
+    is_usable_rate,
+    read_stamps,
+    regular_stamps,
+)
+from slam_graph.datasets.sequence import Extent, FrameStream
+from slam_graph.datasets.streams.image_sequence import (
+    LOOKED_AT,
+    GroupedSequence,
+    check_size,
+    require_size,
+)
+from slam_graph.datasets.streams.images import Fault, Image, prefetch
+from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors.measurements import CameraFrame, ImuData
+
+SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
+
+SILENT = "-8"
+"""FFmpeg's level of logging; what it has to say about a damaged video is found out anyway."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether this is a video, by its name."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+class VideoReader:
+    """Reads the frames of a video one after the other, as grey images.
+
+    Raises:
+        DataError: if the video cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", SILENT)
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+        if not self._capture.isOpened():
+            raise DataError(f"{path}: this video cannot be opened; it is damaged or not a video")
+        self._next = 0
+
+    @property
+    def count(self) -> int | None:
+        """How many frames the container says that there are; None if it does not."""
+        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        return int(count) if 0 < count < 1e9 else None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """How many frames come in a second, by the container; None if it does not say.
+
+        Of a stream that does not know its length the rate is FFmpeg's guess.
+        """
+        rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
+        return rate_hz if self.count is not None and is_usable_rate(rate_hz) else None
+
+    def skip_to(self, index: int) -> bool:
+        """Go on to a frame, not before the next one; whether there is one."""
+        while self._next <= index:
+            if not self._capture.grab():
+                return False
+            self._next += 1
+        return True
+
+    def read(self, index: int) -> Image | None:
+        """A frame, not before the next one; None if the video ends before it."""
+        if not self.skip_to(index):
+            return None
+        whole, image = self._capture.retrieve()
+        if not whole:
+            return None
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        return np.asarray(grey, np.uint8)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._capture.release()
+
+
+class VideoSequence(GroupedSequence):
+    """A video of one camera.
+
+    The times of its frames are in a table (see `loose_files`), one for each frame. Without one,
+    they come at the rate that is told, or that the container tells (`stamps_assumed`), the first
+    one at time 0.
+
+    Args:
+        path: the video.
+        cameras: 1 or None.
+        calibration: a Kalibr camera chain; without it the file ``NAME.yaml`` beside the video.
+        groundtruth: file or folder with the ground truth.
+        diagnostics: where faults are counted.
+        sources: files ``stamps`` and ``imu`` to use instead of ``NAME.csv`` and ``NAME.imu.csv``
+            beside the video, or ``rate`` in Hz.
+
+    Raises:
+        DataError: if a part of the recording is missing or cannot be read.
+    """
+
+    format: ClassVar[str] = "video"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+        sources: Mapping[str, str] | None = None,
+    ) -> None:
+        self.path = path
+        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        with closing(VideoReader(path)) as video:
+            beside = {
+                "stamps": [path.with_suffix(".csv"), path.with_suffix(".txt")],
+                "imu": [path.with_suffix(".imu.csv")],
+                "calibration": [path.with_suffix(".yaml")],
+            }
+            files = find_files(path, sources or {}, beside, calibration)
+            rig = files.rig if cameras is None else files.rig.select(cameras)
+            super().__init__(path.stem, rig, ["video"], groundtruth, diagnostics)
+            self.has_imu = files.imu is not None
+            self._imu = files.imu
+            rate_hz = files.rate_hz if files.rate_hz is not None else video.rate_hz
+            count = video.count if video.count is not None else _count_frames(path)
+            looked_at = [video.read(k) for k in range(LOOKED_AT)]
+        first = [image for image in looked_at if image is not None]
+        if not first:
+            raise DataError(f"{path}: no frame of this video can be read")
+        require_size(first, rig.cameras[0].camera, path.name)
+        stamps = self._stamps(files, count, rate_hz)
+        self._kept = in_order(stamps, partial(self._dropped, stamps))
+        self._groups = group_by_time([stamps[self._kept]], 0)
+
+    @property
+    def groups(self) -> Groups:
+        """The frames by their times."""
+        return self._groups
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples."""
+        stamps = self._groups.stamps_ns
+        samples = 0 if self._imu is None else self._imu.count()
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Frames with their images, the next ones decoded in a thread.
+
+        They end where the video does, also if its container or the table of times promised more
+        (`video_ended_early`).
+        """
+        wanted = self._range(start_ns, end_ns)
+        if not self.decode:
+            for k in wanted:
+                yield CameraFrame(int(self._groups.stamps_ns[k]), (None,))
+            return
+        with closing(VideoReader(self.path)) as video:
+            jobs = (partial(video.read, int(self._kept[k])) for k in wanted)
+            with closing(prefetch(jobs)) as results:
+                for k, image in zip(wanted, results, strict=True):
+                    if image is None:
+                        what = f"ends before frame {self._kept[k]}, {self._kept[-1] + 1} expected"
+                        self.diagnostics.warn("video_ended_early", f"{self.path}: {what}")
+                        return
+                    yield self._report(k, [self._checked(image, k)])
+
+    def _checked(self, image: Image, index: int) -> Image | Fault:
+        where: Callable[[], str] = lambda: f"{self.path}: frame {self._kept[index]}"  # noqa: E731
+        return check_size(image, self.rig.cameras[0].camera, where)
+
+    def _stamps(self, files: LooseFiles, count: int, rate_hz: float | None) -> NDArray[np.int64]:
+        """Times (N,) of the frames."""
+        if files.stamps is not None:
+            stamps, _ = read_stamps(files.stamps)
+            if len(stamps) != count:
+                what = f"{len(stamps)} times, {self.path.name} has {count} frames"
+                what += "; taken in their order as far as both go"
+                self.diagnostics.warn("stamps_differ", f"{files.stamps}: {what}")
+            return stamps[:count]
+        if rate_hz is None:
+            raise DataError(
+                f"{self.path}: no times of the frames, and the container tells no frame rate; give "
+                "--source stamps=FILE or --source rate=HZ"
+            )
+        if files.rate_hz is None:
+            what = f"no times of the frames; taken as {rate_hz:.6g} a second, from time 0"
+            self.diagnostics.warn("stamps_assumed", f"{self.path}: {what}")
+        return regular_stamps(count, rate_hz)
+
+    def _dropped(self, stamps: NDArray[np.int64], k: int, _: int) -> None:
+        what = f"frame {k} at {stamps[k]} dropped, not in the order of time"
+        self.diagnostics.warn("camera_out_of_order", f"{self.path}: {what}")
+
+
+def _count_frames(path: Path) -> int:
+    """Go through a whole video to count its frames."""
+    with closing(VideoReader(path)) as video:
+        return next(k for k in range(2**62) if not video.skip_to(k))

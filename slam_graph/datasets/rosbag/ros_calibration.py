@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration that a bag carries: intrinsics in `CameraInfo`, mounting in the static transforms."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from slam_graph.datasets.rosbag.bag import Bag
+from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
+from slam_graph.datasets.rosbag.topics import Topics
+from slam_graph.errors import DataError
+from slam_graph.sensors.camera import Camera, Distortion
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+MODELS: dict[str, Distortion] = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "radtan",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+}
+
+STATIC_TOPIC = "/tf_static"
+
+
+def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
+    """The rig of a bag, from the `CameraInfo` beside each image topic and ``/tf_static``.
+
+    Without an IMU the body frame is that of the first camera.
+
+    Raises:
+        DataError: if a part is missing; it names ``--calibration`` as the way out.
+    """
+    first = topics.imu or topics.cameras[0]
+    body = str(_first(bag, first).header.frame_id)
+    transforms = _static_transforms(bag)
+    mounted = []
+    for k, topic in enumerate(topics.cameras):
+        info = _info(bag, topic)
+        camera = _camera(bag, info, rectified="rect" in topic.rpartition("/")[2])
+        body_T_camera = _path(bag, transforms, body, str(info.header.frame_id))
+        mounted.append(RigCamera(camera, body_T_camera, 0.0, f"cam{k}"))
+    return Rig(tuple(mounted), noise)
+
+
+def _first(bag: Bag, topic: str) -> Any:
+    """The first message of a topic, which has one."""
+    messages = bag.messages([topic])
+    try:
+        return next(messages).decode()
+    finally:
+        messages.close()
+
+
+def _info(bag: Bag, topic: str) -> Any:
+    """The calibration of the camera that publishes images under a topic."""
+    base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
+    beside = f"{base.rpartition('/')[0]}/camera_info"
+    if bag.topics.get(beside) != CAMERA_INFO:
+        raise DataError(f"{bag.path}: no calibration, '{beside}' is missing; give --calibration")
+    return _first(bag, beside)
+
+
+def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
+    """Intrinsics of a `CameraInfo`; ROS 1 writes its matrices in capitals."""
+    K, D, P = (
+        np.asarray(getattr(info, name if hasattr(info, name) else name.upper()), np.float64)
+        for name in "kdp"
+    )
+    size = (int(info.width), int(info.height))
+    fx, fy, cx, cy = (P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]).tolist()
+    if rectified or not np.any(D):
+        return Camera(fx, fy, cx, cy, "none", (), *size)
+    model = MODELS.get(info.distortion_model)
+    if model is None or np.any(D[4:]):
+        given = f"{info.distortion_model} with {len(D)} coefficients"
+        raise DataError(
+            f"{bag.path}: the distortion of CameraInfo is {given}; known: plumb_bob with k3 = 0, "
+            "equidistant; give --calibration"
+        )
+    return Camera(fx, fy, cx, cy, model, tuple(D[:4].tolist()), *size)
+
+
+def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:
+    """parent_T_child by parent and child, and the inverse by child and parent."""
+    known: dict[str, dict[str, gtsam.Pose3]] = {}
+    if bag.topics.get(STATIC_TOPIC) != TRANSFORMS:
+        return known
+    for message in bag.messages([STATIC_TOPIC]):
+        for stamped in message.decode().transforms:
+            parent, child = _plain(stamped.header.frame_id), _plain(stamped.child_frame_id)
+            move, turn = stamped.transform.translation, stamped.transform.rotation
+            rotation = gtsam.Rot3.Quaternion(turn.w, turn.x, turn.y, turn.z)
+            pose = gtsam.Pose3(rotation, np.array([move.x, move.y, move.z]))
+            known.setdefault(parent, {})[child] = pose
+            known.setdefault(child, {})[parent] = pose.inverse()
+    return known
+
+
+def _path(
+    bag: Bag, transforms: dict[str, dict[str, gtsam.Pose3]], begin: str, end: str
+) -> gtsam.Pose3:
+    """begin_T_end, along the static transforms."""
+    begin, end = _plain(begin), _plain(end)
+    reached = {begin: gtsam.Pose3()}
+    queue = deque([begin])
+    while queue:
+        frame = queue.popleft()
+        for other, pose in transforms.get(frame, {}).items():
+            if other not in reached:
+                reached[other] = reached[frame].compose(pose)
+                queue.append(other)
+    if end not in reached:
+        raise DataError(
+            f"{bag.path}: {STATIC_TOPIC} does not connect the IMU ('{begin}') with the camera "
+            f"('{end}'); give --calibration"
+        )
+    return reached[end]
+
+
+def _plain(frame: str) -> str:
+    return frame.lstrip("/")

@@ -1,0 +1,302 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A ROS bag as a sequence: images and IMU streamed in the order of their header stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import islice
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.rosbag.bag import Bag, Message
+from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
+from slam_graph.datasets.rosbag.ros_calibration import read_bag_rig
+from slam_graph.datasets.rosbag.topics import find_topics
+from slam_graph.datasets.sequence import Extent, FrameStream
+from slam_graph.datasets.streams.image_sequence import (
+    LOOKED_AT,
+    STEREO_TOLERANCE_S,
+    GroupedSequence,
+    check_size,
+    require_size,
+)
+from slam_graph.datasets.streams.images import Fault, Image, prefetch
+from slam_graph.datasets.streams.imu_stream import ImuCleaner
+from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import ImuNoise
+
+SAMPLES_PER_BLOCK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class _Index:
+    """The images of a bag by their stamps.
+
+    Attributes:
+        received_ns: for each camera the times at which all its messages were recorded.
+        kept: for each camera which of its messages are used: those in the order of time.
+        groups: frames, with indices into `kept`.
+        imu_samples: number of messages of the IMU.
+    """
+
+    received_ns: list[NDArray[np.int64]]
+    kept: list[NDArray[np.intp]]
+    groups: Groups
+    imu_samples: int
+
+    def frame_of(self) -> list[dict[int, int]]:
+        """For each camera the frame of each message that is in one."""
+        frames: list[dict[int, int]] = [{} for _ in self.kept]
+        for frame, members in enumerate(self.groups.members.tolist()):
+            for camera, member in enumerate(members):
+                if member != ABSENT:
+                    frames[camera][int(self.kept[camera][member])] = frame
+        return frames
+
+
+class RosBagSequence(GroupedSequence):
+    """A bag with images and an IMU.
+
+    The whole bag is gone through once for its stamps before the first frame is delivered. Messages
+    without a stamp get the time at which they were recorded (`stamp_missing`). A bag that is
+    damaged somewhere is used up to there (`bag_damaged`).
+
+    Args:
+        path: a ``.bag``, ``.mcap`` or ``.db3`` file, or the folder of a ROS 2 bag.
+        cameras: use only the first so many.
+        calibration: a Kalibr camera chain; without it `CameraInfo` and ``/tf_static`` are used.
+        groundtruth: file or folder with the ground truth.
+        diagnostics: where faults are counted.
+        sources: topics by ``imu``, ``cam0``, … and ``groundtruth`` (a topic of poses of the body).
+
+    Raises:
+        DataError: if a topic or the calibration is missing, or the bag cannot be read.
+    """
+
+    format: ClassVar[str] = "rosbag"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: int | None = None,
+        calibration: Path | None = None,
+        groundtruth: Path | None = None,
+        diagnostics: Diagnostics | None = None,
+        sources: Mapping[str, str] | None = None,
+    ) -> None:
+        self.path = path
+        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        self._bag = Bag(path)
+        topics = find_topics(self._bag, sources or {}, calibration)
+        self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
+        unknown = ImuNoise()
+        if calibration is not None:
+            rig = read_kalibr(calibration, fallback=unknown, needs_imu=topics.imu is not None)
+        else:
+            count = len(topics.cameras) if cameras is None else cameras
+            used = replace(topics, cameras=topics.cameras[:count])
+            with self._bag.kept_open():
+                rig = read_bag_rig(self._bag, used, unknown)
+        if topics.imu is not None and rig.imu is unknown:
+            what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
+            diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
+        if len(topics.cameras) < len(rig.cameras) or (
+            len(topics.cameras) > len(rig.cameras) and calibration is not None
+        ):
+            raise DataError(
+                f"{path}: {len(rig.cameras)} cameras are calibrated, images are on "
+                f"{', '.join(topics.cameras)}; choose with --topic cam0=…"
+            )
+        rig = rig if cameras is None else rig.select(cameras)
+        self._cameras = topics.cameras[: len(rig.cameras)]
+        super().__init__(path.stem, rig, self._cameras, groundtruth, diagnostics)
+        self.has_imu = topics.imu is not None
+        if groundtruth is None and topics.groundtruth is not None:
+            self.own_groundtruth = self._read_poses
+        with self._bag.kept_open():
+            for k, topic in enumerate(self._cameras):
+                self._check_first_images(topic, k)
+
+    @property
+    def groups(self) -> Groups:
+        """Which images belong together."""
+        return self._index.groups
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples."""
+        stamps = self.groups.stamps_ns
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self._index.imu_samples)
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        if self._imu_topic is None:
+            return
+        cleaner = ImuCleaner(self.diagnostics, after_ns)
+        with closing(self._until_damage([self._imu_topic])) as messages:
+            while block := list(islice(messages, SAMPLES_PER_BLOCK)):
+                stamps = np.array([self._stamp_ns(message) for message in block], np.int64)
+                values = np.array([self._inertial(message) for message in block])
+                where: Callable[[int], str] = lambda k, block=block: self._where(block[k])  # type: ignore[misc]  # noqa: E731
+                cleaned = cleaner.clean(ImuData(stamps, values[:, :3], values[:, 3:]), where)
+                if len(cleaned):
+                    yield cleaned
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Frames with their images, the next ones decoded in a thread.
+
+        Images are read in the order in which they were recorded. A frame is delivered when it is
+        complete and all frames before it are delivered.
+        """
+        wanted = self._range(start_ns, end_ns)
+        waiting = {frame: self._members(frame) for frame in wanted}
+        images: dict[int, list[Image | Fault | None]] = {}
+        following = iter(wanted)
+        current = next(following, None)
+        with closing(prefetch(self._jobs(wanted))) as results:
+            for frame, camera, image in results:
+                images.setdefault(frame, [None] * len(self._cameras))[camera] = image
+                waiting[frame] -= 1
+                while current is not None and waiting[current] == 0:
+                    yield self._report(current, images.pop(current))
+                    current = next(following, None)
+
+    def _members(self, frame: int) -> int:
+        return int(np.count_nonzero(self.groups.members[frame] != ABSENT))
+
+    def _jobs(self, wanted: range) -> Iterator[Callable[[], tuple[int, int, Image | Fault | None]]]:
+        """What decodes each image of the wanted frames."""
+        if not wanted:
+            return
+        frame_of, index = self._index.frame_of(), self._index
+        times = [
+            int(index.received_ns[camera][message])
+            for camera, frames in enumerate(frame_of)
+            for message, frame in frames.items()
+            if frame in wanted
+        ]
+        since_ns, until_ns = min(times), max(times)
+        passed = [int(np.count_nonzero(received < since_ns)) for received in index.received_ns]
+        with closing(self._bag.messages(self._cameras, since_ns, until_ns)) as messages:
+            for message in messages:
+                camera = self._cameras.index(message.topic)
+                frame = frame_of[camera].get(passed[camera])
+                passed[camera] += 1
+                if frame is not None and frame in wanted:
+                    yield partial(self._decode, frame, camera, message)
+
+    def _decode(
+        self, frame: int, camera: int, message: Message
+    ) -> tuple[int, int, Image | Fault | None]:
+        """An image with its place; runs in the thread, so it counts nothing itself."""
+        return frame, camera, self._read(message, camera) if self.decode else None
+
+    def _read(self, message: Message, camera: int) -> Image | Fault:
+        model = self.rig.cameras[camera].camera
+        return check_size(self._image(message), model, lambda: self._where(message))
+
+    def _check_first_images(self, topic: str, camera: int) -> None:
+        """Refuse images of another size than calibrated, or of an encoding that is not known."""
+        with closing(self._bag.messages([topic])) as messages:
+            images = [self._image(message) for message in islice(messages, LOOKED_AT)]
+        faults = [image for image in images if isinstance(image, Fault)]
+        if len(faults) == len(images) and "unknown encoding" in faults[0].message:
+            raise DataError(faults[0].message)
+        require_size(images, self.rig.cameras[camera].camera, topic)
+
+    def _image(self, message: Message) -> Image | Fault:
+        try:
+            return image_of(message.decode(), self._where(message))
+        except DataError as error:
+            return Fault("image_unreadable", str(error))
+
+    def _inertial(self, message: Message) -> list[float]:
+        """Rate and specific force; NaN where the message is damaged."""
+        try:
+            return inertial_of(message.decode())
+        except DataError:
+            return [np.nan] * 6
+
+    @cached_property
+    def _index(self) -> _Index:
+        """Go through the whole bag for the stamps of its images."""
+        received: list[list[int]] = [[] for _ in self._cameras]
+        stamps: list[list[int]] = [[] for _ in self._cameras]
+        samples = 0
+        inertial = [] if self._imu_topic is None else [self._imu_topic]
+        for message in self._until_damage([*self._cameras, *inertial]):
+            if message.topic == self._imu_topic:
+                samples += 1
+                continue
+            camera = self._cameras.index(message.topic)
+            received[camera].append(message.received_ns)
+            stamps[camera].append(self._stamp_ns(message))
+        all_stamps = [np.array(column, np.int64) for column in stamps]
+        kept = [self._in_order(*camera) for camera in zip(self._cameras, all_stamps, strict=True)]
+        used = [column[rows] for column, rows in zip(all_stamps, kept, strict=True)]
+        groups = self._group(used, STEREO_TOLERANCE_S)
+        return _Index([np.array(column, np.int64) for column in received], kept, groups, samples)
+
+    def _in_order(self, topic: str, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Which images of a camera do not break the order of time."""
+
+        def dropped(k: int, _: int) -> None:
+            what = f"{topic}: image at {stamps_ns[k]} dropped, not in the order of time"
+            self.diagnostics.warn("camera_out_of_order", f"{self.path}: {what}")
+
+        return in_order(stamps_ns, dropped)
+
+    def _until_damage(self, topics: list[str]) -> Generator[Message, None, None]:
+        """Messages up to where the bag is damaged, if it is."""
+        try:
+            yield from self._bag.messages(topics)
+        except DataError as error:
+            self.diagnostics.warn("bag_damaged", f"{error}; what comes before is used")
+
+    def _stamp_ns(self, message: Message) -> int:
+        """The stamp of a message; where it has none, the time at which it was recorded."""
+        stamp_ns = self._bag.header_stamp_ns(message)
+        if stamp_ns > 0:
+            return stamp_ns
+        self.diagnostics.warn(
+            "stamp_missing", f"{self._where(message)}: no stamp, the time of recording is taken"
+        )
+        return message.received_ns
+
+    def _where(self, message: Message) -> str:
+        return f"{self.path}: {message.topic} recorded at {message.received_ns}"
+
+    def _read_poses(self) -> Trajectory:
+        """The ground truth that was named."""
+        topic = self._truth_topic
+        assert topic is not None
+        stamps: list[int] = []
+        values: list[list[float]] = []
+        for message in self._until_damage([topic]):
+            stamp_ns = self._stamp_ns(message)
+            pose = pose_of(message.decode(), self._bag.topics[topic])
+            if not np.all(np.isfinite(pose)) or np.linalg.norm(pose[3:]) < 0.5:
+                self.diagnostics.warn("groundtruth_not_finite", f"{self._where(message)}: dropped")
+            elif stamps and stamp_ns <= stamps[-1]:
+                self.diagnostics.warn(
+                    "groundtruth_out_of_order", f"{self._where(message)}: dropped"
+                )
+            else:
+                stamps.append(stamp_ns)
+                values.append(pose)
+        if not stamps:
+            raise DataError(f"{self.path}: no usable pose on '{topic}'")
+        poses = np.array(values)
+        quaternions = poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        return Trajectory(np.array(stamps, np.int64), poses[:, :3].copy(), quaternions)

@@ -1,0 +1,273 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What recordings of images share: a stream of images for each camera, brought together by time."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from copy import copy
+from functools import partial
+from pathlib import Path
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence
+from slam_graph.datasets.streams.images import Fault, Image, prefetch
+from slam_graph.datasets.streams.imu_stream import ImuFile
+from slam_graph.datasets.streams.pairing import ABSENT, Groups, group_by_time
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.measurements import CameraFrame, ImuData
+from slam_graph.sensors.rig import Rig
+
+STEREO_TOLERANCE_S = 0.003
+"""Images at most this far apart are one frame; EuRoC's pairs differ by some hundred nanoseconds."""
+
+LOOKED_AT = 3
+"""How many images of a camera are looked at when a recording is opened: one of another size than
+the calibration is a fault of the image, three are a calibration for other images."""
+
+
+class ImageStream(Protocol):
+    """The images of one camera.
+
+    Attributes:
+        name: of the camera, for messages.
+        stamps_ns: (N,) int64, strictly increasing.
+    """
+
+    name: str
+    stamps_ns: NDArray[np.int64]
+
+    def read(self, index: int) -> Image | Fault:
+        """One image, of any size, or what is wrong with it; may be called in another thread."""
+        ...
+
+    def missing(self, index: int) -> Fault | None:
+        """What is wrong with one image as far as can be told without reading it."""
+        ...
+
+    def where(self, index: int) -> str:
+        """Where one image stands, for messages."""
+        ...
+
+
+class GroupedSequence(RecordedSequence):
+    """A recording of images, grouped into frames by their stamps.
+
+    Frames carry None for the image of a camera that has none at that time (counted as
+    `camera_frame_missing`), or one that is damaged or not of the calibrated size
+    (`image_unreadable`, `image_wrong_size`).
+
+    Args:
+        name: of the recording.
+        rig: its calibration.
+        camera_names: of the cameras of the rig, for messages.
+        groundtruth: file or folder with the ground truth, or None.
+        diagnostics: where faults are counted.
+
+    Attributes:
+        decode: whether images are decoded; they are all None otherwise.
+    """
+
+    content: ClassVar[Literal["images", "tracks"]] = "images"
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        camera_names: Sequence[str],
+        groundtruth: Path | None,
+        diagnostics: Diagnostics | None,
+    ) -> None:
+        super().__init__(name, rig, groundtruth, diagnostics)
+        self.decode = True
+        self._camera_names = camera_names
+
+    def without_images(self) -> GroupedSequence:
+        """The same recording, its frames without images: quick to run through."""
+        twin = copy(self)
+        twin.decode = False
+        return twin
+
+    @property
+    @abstractmethod
+    def groups(self) -> Groups:
+        """Which images belong together."""
+
+    def _range(self, start_ns: int | None, end_ns: int | None) -> range:
+        """The frames within [start_ns, end_ns]."""
+        stamps = self.groups.stamps_ns
+        first = 0 if start_ns is None else int(np.searchsorted(stamps, start_ns))
+        last = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
+        return range(first, last)
+
+    def _group(self, stamps: Sequence[NDArray[np.int64]], tolerance_s: float) -> Groups:
+        groups = group_by_time(stamps, round(tolerance_s * 1e9))
+        for stamp in groups.skipped:
+            self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
+        return groups
+
+    def _report(self, index: int, images: Sequence[Image | Fault | None]) -> CameraFrame:
+        """Count what is wrong with a frame, and deliver the rest of it."""
+        stamp_ns = int(self.groups.stamps_ns[index])
+        for camera, member in enumerate(self.groups.members[index].tolist()):
+            image = images[camera]
+            if member == ABSENT:
+                name = self._camera_names[camera]
+                self.diagnostics.warn("camera_frame_missing", f"{name} has no image at {stamp_ns}")
+            elif isinstance(image, Fault):
+                self.diagnostics.warn(image.kind, image.message)
+        return CameraFrame(stamp_ns, tuple(None if isinstance(i, Fault) else i for i in images))
+
+
+class ImageSequence(GroupedSequence):
+    """A recording of images that can be read in any order.
+
+    Args:
+        name: of the recording.
+        rig: its calibration.
+        streams: the images of each camera of the rig.
+        groundtruth: file or folder with the ground truth, or None.
+        diagnostics: where faults are counted.
+        stereo_tolerance_s: largest time difference of images that are one frame.
+
+    Raises:
+        DataError: if the calibration is for images of another size.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        streams: Sequence[ImageStream],
+        groundtruth: Path | None,
+        diagnostics: Diagnostics | None,
+        stereo_tolerance_s: float = STEREO_TOLERANCE_S,
+    ) -> None:
+        super().__init__(name, rig, [s.name for s in streams], groundtruth, diagnostics)
+        self._streams = streams
+        for mounted, stream in zip(rig.cameras, streams, strict=True):
+            count = min(len(stream.stamps_ns), LOOKED_AT)
+            images = (stream.read(k) for k in range(count))
+            require_size(images, mounted.camera, stream.name)
+        self._groups = self._group([s.stamps_ns for s in streams], stereo_tolerance_s)
+
+    @property
+    def groups(self) -> Groups:
+        """Which images belong together."""
+        return self._groups
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Frames with their images, the next ones decoded in a thread."""
+        wanted = self._range(start_ns, end_ns)
+        jobs = (partial(self._read_frame, k) for k in wanted)
+        with closing(prefetch(jobs)) as results:
+            for k, images in zip(wanted, results, strict=True):
+                yield self._report(k, images)
+
+    def _read_frame(self, index: int) -> list[Image | Fault | None]:
+        """The images of one frame; runs in the thread, so it counts nothing itself."""
+        images: list[Image | Fault | None] = []
+        for camera, member in enumerate(self._groups.members[index].tolist()):
+            if member == ABSENT:
+                images.append(None)
+            elif self.decode:
+                images.append(self._read_image(camera, member))
+            else:
+                images.append(self._streams[camera].missing(member))
+        return images
+
+    def _read_image(self, camera: int, member: int) -> Image | Fault:
+        stream, model = self._streams[camera], self.rig.cameras[camera].camera
+        return check_size(stream.read(member), model, partial(stream.where, member))
+
+
+class FileImageSequence(ImageSequence):
+    """A recording of images whose IMU, if it has one, is a CSV file.
+
+    Args:
+        name: of the recording.
+        rig: its calibration.
+        streams: the images of each camera of the rig.
+        imu: its file; None without an IMU.
+        groundtruth: file or folder with the ground truth, or None.
+        diagnostics: where faults are counted.
+        stereo_tolerance_s: largest time difference of images that are one frame.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rig: Rig,
+        streams: Sequence[ImageStream],
+        imu: ImuFile | None,
+        groundtruth: Path | None,
+        diagnostics: Diagnostics | None,
+        stereo_tolerance_s: float = STEREO_TOLERANCE_S,
+    ) -> None:
+        super().__init__(name, rig, streams, groundtruth, diagnostics, stereo_tolerance_s)
+        self.has_imu = imu is not None
+        self._imu = imu
+        if imu is not None:
+            imu.require()
+        elif len(self._groups.stamps_ns) == 0:
+            raise DataError(f"{name}: neither images nor an IMU in this recording")
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples."""
+        samples = 0 if self._imu is None else self._imu.count()
+        stamps = self._groups.stamps_ns
+        if len(stamps):
+            return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
+        assert self._imu is not None
+        return Extent(0, *self._imu.ends_ns(), samples)
+
+
+def check_size(image: Image | Fault, camera: Camera, where: Callable[[], str]) -> Image | Fault:
+    """The image, or a fault if it is not of the size that its camera is calibrated for."""
+    if isinstance(image, Fault) or image.shape == (camera.height, camera.width):
+        return image
+    got, expected = f"{image.shape[1]}x{image.shape[0]}", f"{camera.width}x{camera.height}"
+    return Fault("image_wrong_size", f"{where()}: {got}, the calibration says {expected}")
+
+
+def require_size(images: Iterable[Image | Fault], camera: Camera, name: str) -> None:
+    """Refuse a calibration for images of another size.
+
+    Nobody can tell whether smaller images were scaled or cut out, so nothing is guessed.
+
+    Args:
+        images: the first ones of a recording.
+        camera: its calibration.
+        name: of the camera, for the message.
+
+    Raises:
+        DataError: if the images are all of the same size, but of another one.
+    """
+    calibrated = (camera.width, camera.height)
+    sizes = set()
+    for image in images:
+        if not isinstance(image, Fault):
+            sizes.add((image.shape[1], image.shape[0]))
+        if calibrated in sizes:
+            return
+    if len(sizes) != 1:
+        return
+    (size,) = sizes
+    scales = {have / want for have, want in zip(size, calibrated, strict=True)}
+    hint = f" ({scales.pop():g} times as large)" if len(scales) == 1 else ""
+    raise DataError(
+        f"{name}: images are {size[0]}x{size[1]}{hint}, the calibration is for "
+        f"{calibrated[0]}x{calibrated[1]}; it is not rescaled by guess: give the one of these "
+        "images with --calibration"
+    )

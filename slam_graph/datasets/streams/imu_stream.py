@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The IMU stream of a recording: blocks of samples, cleaned of what cannot be integrated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.datasets.streams.csv_rows import Rows, count_rows, parse, read_rows, require_rows
+from slam_graph.datasets.streams.pairing import in_order
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.sensors.measurements import ImuData
+
+GAP_PERIODS = 5.0
+"""A pause longer than this many sampling periods counts as a gap. One or two lost samples do not
+hurt preintegration; five are 25 ms at 200 Hz, half the time between two frames."""
+
+INTEGER_STAMPS = [("stamp", "i8"), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
+
+
+@dataclass
+class ImuCleaner:
+    """Drops samples that cannot be used, counts them, and reports gaps.
+
+    Counted kinds: `imu_not_finite`, `imu_duplicate` (the stamp of the latest sample again),
+    `imu_out_of_order`, `imu_gap`.
+
+    Attributes:
+        diagnostics: where faults are counted.
+        after_ns: samples before this time are left out without a word.
+        latest_ns: stamp of the last sample that was kept.
+        period_ns: median sampling period of the first block, what gaps are measured by.
+    """
+
+    diagnostics: Diagnostics
+    after_ns: int | None = None
+    latest_ns: int | None = None
+    period_ns: float = field(default=np.inf)
+
+    def clean(self, data: ImuData, where: Callable[[int], str]) -> ImuData:
+        """The usable samples of the next block.
+
+        Args:
+            data: samples in the order of the file, stamps in any order.
+            where: gives file and line of a sample, for the log.
+        """
+        wanted = np.ones(len(data), bool)
+        if self.after_ns is not None:
+            wanted = data.stamps_ns >= self.after_ns
+        finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
+        for k in np.flatnonzero(wanted & ~finite):
+            self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: sample dropped")
+        candidates = np.flatnonzero(wanted & finite)
+        kept = self._in_order(data.stamps_ns, candidates, where)
+        self._report_gaps(data.stamps_ns[kept], lambda k: where(int(kept[k])))
+        return ImuData(data.stamps_ns[kept], data.gyro[kept], data.accel[kept])
+
+    def _in_order(
+        self,
+        stamps_ns: NDArray[np.int64],
+        candidates: NDArray[np.intp],
+        where: Callable[[int], str],
+    ) -> NDArray[np.intp]:
+        """The candidates without those that break the order of time."""
+        stamps = stamps_ns[candidates]
+
+        def dropped(k: int, latest: int) -> None:
+            kind = "imu_duplicate" if stamps[k] == latest else "imu_out_of_order"
+            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]}"
+            self.diagnostics.warn(kind, f"{sample} dropped, not in the order of time")
+
+        return candidates[in_order(stamps, dropped, self.latest_ns)]
+
+    def _report_gaps(self, stamps: NDArray[np.int64], where: Callable[[int], str]) -> None:
+        if len(stamps) == 0:
+            return
+        if not np.isfinite(self.period_ns) and len(stamps) > 1:
+            self.period_ns = float(np.median(np.diff(stamps)))
+        latest = stamps[0] if self.latest_ns is None else self.latest_ns
+        pauses = np.diff(stamps, prepend=latest)
+        for k in np.flatnonzero(pauses > GAP_PERIODS * self.period_ns):
+            self.diagnostics.warn(
+                "imu_gap",
+                f"{where(int(k))}: no sample for {pauses[k] * 1e-9:.3f} s before {stamps[k]}",
+            )
+        self.latest_ns = int(stamps[-1])
+
+
+def clean_blocks(
+    blocks: Iterator[tuple[Rows, ImuData]], diagnostics: Diagnostics, after_ns: int | None
+) -> Iterator[ImuData]:
+    """Run a stream of parsed blocks through one `ImuCleaner`."""
+    cleaner = ImuCleaner(diagnostics, after_ns)
+    for rows, data in blocks:
+        cleaned = cleaner.clean(data, rows.where)
+        if len(cleaned):
+            yield cleaned
+
+
+@dataclass(frozen=True)
+class ImuFile:
+    """The samples of an IMU in a CSV file.
+
+    Attributes:
+        path: of the file.
+        parse: turns its rows into samples.
+    """
+
+    path: Path
+    parse: Callable[[Rows], ImuData]
+
+    def require(self) -> None:
+        """Refuse a file that cannot be read or has no samples."""
+        require_rows(self.path)
+
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned samples from `after_ns` on."""
+        blocks = ((rows, self.parse(rows)) for rows in read_rows(self.path))
+        return clean_blocks(blocks, diagnostics, after_ns)
+
+    def count(self) -> int:
+        """How many samples there are, before faulty ones are dropped."""
+        return count_rows(self.path)[0]
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        _, first, last = count_rows(self.path)
+        begin, end = self.parse(Rows(self.path, [first, last], [1, 1])).stamps_ns.tolist()
+        return begin, end
+
+
+def parse_imu_rows(rows: Rows) -> ImuData:
+    """Samples of rows (stamp in ns, gyro xyz in rad/s, accel xyz in m/s²): EuRoC's order."""
+    table = parse(rows, INTEGER_STAMPS, "stamp [ns], gyro xyz, accel xyz")
+    return ImuData(table["stamp"], table["gyro"], table["accel"])

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept of a run in an experiment: a JSON file of numbers and an NPZ file of series.
+
+Series of the NPZ file, all of them over the N frames that have a true pose, the K that have a
+covariance too, or all F that were read:
+
+- `time_s`, `distance_m` (N,): since the first frame; along the true path;
+- `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
+- `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
+- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (S,): Gauss-Newton steps of the S
+  frames that took some, and the dimension of the state in them;
+- `nis_time_s`, `nis_ratio`, and `nis_COLUMN` (I,): innovations of the I frames of which something
+  was predicted (`slam_graph.backend.cost.gating.Innovations`), and NIS over what is expected of it;
+- `frame_time_s`, `ms_STAGE` (F,): milliseconds of each stage; NaN where it did not run.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.errors import DataError
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.association import synchronize
+from slam_graph.evaluation.consistency import nees
+from slam_graph.evaluation.report import truth_from_estimate
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.results.result_files import appearing, write_text
+from slam_graph.results.run_result import RunResult
+
+SCHEMA_VERSION = 2
+
+ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3")
+
+Series = dict[str, NDArray[Any]]
+Table = dict[str, Any]
+
+
+def write_result(path: Path, result: RunResult, about: Table) -> None:
+    """Write a run; the JSON file comes last, so that it is there only with its series.
+
+    Args:
+        path: of the JSON file.
+        result: the run.
+        about: names the run.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    with appearing(path.with_suffix(".npz")) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **series_of(result))  # type: ignore[arg-type]  # its last keyword
+    metrics = {**result.metrics, "peak_memory_mb": peak_memory_mb()}
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        **about,
+        "metrics": metrics,
+        "mean_steps": float(result.steps.steps.mean()) if len(result.steps) else None,
+        "config": result.config.model_dump(mode="json"),
+    }
+    write_text(path, [json.dumps(table, indent=1, allow_nan=False), "\n"])
+
+
+def read_result(path: Path) -> Table | None:
+    """The JSON file of a run, or None if it is not there or not of this version."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError):
+        return None
+    valid = isinstance(table, dict) and table.get("schema_version") == SCHEMA_VERSION
+    return table if valid and path.with_suffix(".npz").is_file() else None
+
+
+def read_series(path: Path) -> Series:
+    """The series beside the JSON file of a run."""
+    with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def series_of(result: RunResult) -> Series:
+    """All series of a run; those that the ground truth does not allow are left out."""
+    series: Series = {
+        f"ms_{stage}": result.timing.column(stage) for stage in result.timing.stages()
+    }
+    series["frame_time_s"] = (result.timing.stamps_ns - result.start_ns) * 1e-9
+    series["step_time_s"] = (result.steps.stamps_ns - result.start_ns) * 1e-9
+    series["steps"] = result.steps.steps
+    series["cost_before"], series["cost_after"] = result.steps.costs.T
+    series["columns"] = result.steps.columns
+    series |= _innovation_series(result)
+    truth = result.truth_of_run()
+    if truth is not None and len(result.history) > 0:
+        series |= _error_series(truth, result)
+        series |= _nees_series(truth, result)
+    return series
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident size of this process so far, which other processes have no part in.
+
+    `getrusage` would not do: a process inherits the peak of the one that started it.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    peaks = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
+    return float(peaks[0]) / 1024.0 if peaks else None
+
+
+def _error_series(truth: Trajectory, result: RunResult) -> Series:
+    try:
+        true, estimate = synchronize(truth, result.trajectory)
+    except DataError:
+        return {}
+    steps = np.linalg.norm(np.diff(true.positions, axis=0), axis=1)
+    series: Series = {
+        "time_s": (estimate.stamps_ns - result.start_ns) * 1e-9,
+        "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
+    }
+    for mode in ALIGNMENTS:
+        try:
+            translation = ape(true, estimate, "trans_part", mode)
+        except DataError:
+            continue  # what never moves cannot be aligned
+        series[f"translation_m_{mode}"] = translation.values
+        series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
+    return series
+
+
+def _nees_series(truth: Trajectory, result: RunResult) -> Series:
+    estimate = result.trajectory
+    try:
+        similarity, _ = truth_from_estimate(truth, estimate, result.start_was_given)
+    except DataError:
+        return {}
+    values = nees(estimate, result.history.pose_covariances(), truth, similarity)
+    return {
+        "nees_time_s": (values.stamps_ns - result.start_ns) * 1e-9,
+        "nees_orientation": values.orientation,
+        "nees_position": values.position,
+        "nees_pose": values.pose,
+    }
+
+
+def _innovation_series(result: RunResult) -> Series:
+    columns = result.innovations.columns()
+    expected = columns["expected"]
+    ratio = np.full(len(expected), np.nan)
+    np.divide(columns["passed_distance"], expected, out=ratio, where=expected > 0)
+    return {
+        "nis_time_s": (result.innovations.stamps_ns - result.start_ns) * 1e-9,
+        "nis_ratio": ratio,
+        **{f"nis_{name}": values for name, values in columns.items()},
+    }

@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Front ends on one recording: what their tracks are like, and what an algorithm makes of them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from slam_graph.config import RunConfig
+from slam_graph.datasets.sequence import Sequence
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
+from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
+from slam_graph.pipeline.run import run
+from slam_graph.pipeline.tracking import TrackedPacket, Tracking
+from slam_graph.results.run_logs import TimingLog
+
+
+@dataclass(frozen=True)
+class FrontendReport:
+    """What a front end made of a recording.
+
+    Attributes:
+        name: of the front end.
+        tracks: the quality of its tracks.
+        inliers: share of the associated features that pass outlier rejection.
+        counts: mean counts a frame.
+        ms: mean milliseconds a frame of each stage; `total` is all of the front end.
+        ate_m: position error of an algorithm on these tracks after alignment; None without one, or
+            without ground truth.
+        status: how the run of the algorithm ended; empty without one.
+    """
+
+    name: str
+    tracks: TrackSummary
+    inliers: float
+    counts: dict[str, float]
+    ms: dict[str, float]
+    ate_m: float | None = None
+    status: str = ""
+
+    def table(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return asdict(self)
+
+
+def track(
+    sequence: Sequence,
+    config: RunConfig,
+    name: str,
+    watch: Callable[[TrackedPacket], None] = lambda tracked: None,
+) -> FrontendReport:
+    """Run the front end alone.
+
+    Args:
+        sequence: of images.
+        config: `frontend`, `seed`, `start_s` and `duration_s` matter.
+        name: for the report.
+        watch: is shown every packet.
+
+    Raises:
+        DataError: if the recording holds no images.
+    """
+    info = sequence.info()
+    if info.content != "images" or info.frames == 0:
+        raise DataError(f"{info.name}: holds no images; there is nothing to track")
+    quality = TrackQuality(sequence.rig, sequence.groundtruth())
+    frontend = build_frontend(sequence.rig, config.frontend, config.seed, sequence.diagnostics)
+    start_ns = info.start_ns + round(config.start_s * 1e9)
+    end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
+    packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
+    counts: Counter[str] = Counter()
+    timing = TimingLog()
+    with closing(Tracking(packets, frontend, overlap=False).run()) as tracking:
+        for tracked in tracking:
+            quality.write(tracked.packet.imu, tracked.features)
+            counts.update({k: int(v) for k, v in tracked.frame_stats.items() if k[-3:] != "_ms"})
+            timing.append(tracked.features.stamp_ns, tracked.clock.milliseconds)
+            watch(tracked)
+    return _report(name, quality, counts, timing)
+
+
+def track_and_estimate(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
+    """Run the whole pipeline, whose back end tells the front end what it knows.
+
+    Args:
+        sequence: of images.
+        config: all settings.
+        name: for the report.
+    """
+    quality = TrackQuality(sequence.rig, sequence.groundtruth())
+    result = run(sequence, config, recorder=quality)
+    accuracy = result.metrics.get("accuracy") or {}
+    ate_m = accuracy.get("se3", {}).get("ate", {}).get("translation_m", {}).get("rmse")
+    return _report(name, quality, result.features, result.timing, ate_m, result.status)
+
+
+def _report(
+    name: str,
+    quality: TrackQuality,
+    counts: Counter[str],
+    timing: TimingLog,
+    ate_m: float | None = None,
+    status: str = "",
+) -> FrontendReport:
+    frames = max(len(timing), 1)
+    good = counts["tracked"] - counts["recovered"]
+    bad = counts["rejected_ransac"] + counts["rejected_map"]
+    ms = {"total": float(np.mean(timing.column("frontend")))} if len(timing) else {}
+    for stage in timing.stages():
+        if stage.startswith("frontend."):
+            values = timing.column(stage)
+            ms[stage.removeprefix("frontend.")] = float(np.nansum(values)) / frames
+    return FrontendReport(
+        name,
+        quality.summary(),
+        good / (good + bad) if good + bad else math.nan,
+        {key: value / frames for key, value in sorted(counts.items()) if value},
+        ms,
+        ate_m,
+        status,
+    )
+
+
+def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
+    """The settings of front ends that are given as METHOD or METHOD/DETECTOR.
+
+    Returns:
+        by name, overrides for `load_config`.
+
+    Raises:
+        ConfigError: if there is no such method.
+    """
+    settings = {}
+    for name in names:
+        method, _, detector = name.partition("/")
+        if method not in FRONTENDS:
+            raise ConfigError(f"unknown front end '{method}'; known: {', '.join(FRONTENDS)}")
+        settings[name] = [f"frontend.method={method}"]
+        settings[name] += [f"frontend.detector={detector}"] if detector else []
+    return settings

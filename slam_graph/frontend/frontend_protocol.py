@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The protocol that every front end fulfils, and what it hears of the back end.
+
+What a front end counts and times in a frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.frontend.tracked_features import Mask
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
+
+
+class FrameStats(defaultdict[str, float]):
+    """Counts and milliseconds (`…_ms`) of a frame, by name; zero for what did not occur."""
+
+    def __init__(self) -> None:
+        super().__init__(float)
+
+    def add(self, name: str, number: int) -> None:
+        """Count some more."""
+        self[name] += number
+
+    def count(self, **fates: Mask) -> None:
+        """Count features by what became of them."""
+        for fate, features in fates.items():
+            self.add(fate, int(np.count_nonzero(features)))
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time of a block to a stage."""
+        start = time.perf_counter()
+        yield
+        self[stage] += (time.perf_counter() - start) * 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """What the back end knows after a frame.
+
+    Attributes:
+        state: its estimate; None as long as there is none.
+        rejected: (N,) ids of features that its χ² gate rejected.
+        ids: (M,) ids of features whose position is estimated, ascending.
+        points: (M, 3) these positions in the world.
+    """
+
+    state: NavState | None = None
+    rejected: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @staticmethod
+    def of(
+        state: NavState | None,
+        rejected: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        points: NDArray[np.float64],
+    ) -> Feedback:
+        """The same from features in any order."""
+        order = np.argsort(ids, kind="stable")
+        return Feedback(state, rejected, ids[order], points[order])
+
+
+@runtime_checkable
+class Frontend(Protocol):
+    """Turns what cameras record into features with identities.
+
+    Attributes:
+        frame_stats: counts and milliseconds (`…_ms`) of the last frame, by name.
+    """
+
+    frame_stats: dict[str, float]
+
+    def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
+        """The features of the next frame.
+
+        Ids increase and are never used again for another feature.
+
+        Args:
+            frame: what the cameras recorded.
+            imu: the samples since the frame before, as in `Packet`; None where there are none.
+        """
+        ...
+
+    def drop(self, ids: NDArray[np.int64]) -> None:
+        """Do not report these features any more: the back end rejected them."""
+        ...
+
+    def hear(self, feedback: Feedback) -> None:
+        """Take note of what the back end made of an earlier frame."""
+        ...

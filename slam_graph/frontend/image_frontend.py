@@ -1,0 +1,223 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The front end for images: features followed in time and matched across the rig."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.frontend.association import Associator
+from slam_graph.frontend.camera_tracker import CameraTracker
+from slam_graph.frontend.extraction import CornerExtractor, camera_mask
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
+from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
+from slam_graph.frontend.matching import DescriptorMatching
+from slam_graph.frontend.motion import ImuMotion
+from slam_graph.frontend.prediction import PointPredictor
+from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
+from slam_graph.frontend.tracked_features import Image, Tracks
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
+from slam_graph.sensors.rig import Rig
+
+FEW_FEATURES = 15
+"""Fewer features than this left of a frame with more are worth a warning."""
+
+
+class ImageFrontend:
+    """Follows features of the first camera and finds them in the cameras that see the same.
+
+    A camera that sees little of what an earlier one sees has features of its own.
+
+    Attributes:
+        frame_stats: of the last frame: features by fate (`tracked`, `new`, `recovered`, `stereo`,
+            and those lost by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
+            `lost_merged`, `rejected_ransac`, `rejected_map`, `rejected_gate`, `rejected_new`,
+            `rejected_stereo`), and milliseconds per stage (`prepare_ms`, `temporal_ms`,
+            `ransac_ms`, `detect_ms`, `stereo_ms`).
+    """
+
+    def __init__(
+        self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
+    ) -> None:
+        """Prepare for the first frame.
+
+        Args:
+            rig: calibrated cameras.
+            config: options.
+            seed: decides the random samples of RANSAC.
+            diagnostics: where faults are counted.
+
+        Raises:
+            ConfigError: if a mask cannot be read or does not fit its camera, or a method needs a
+                library that is not installed.
+        """
+        self._rig = rig
+        self._config = config
+        self._diagnostics = diagnostics
+        self._stats = FrameStats()
+        self._motion = ImuMotion()
+        self._feedback = Feedback()
+        self._gated = 0
+        self._references = reference_cameras(rig)
+        masks = _masks(rig, config)
+        rng = np.random.default_rng(seed)
+        self._trackers: list[CameraTracker] = []
+        self._matchers: dict[int, StereoMatcher] = {}
+        for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
+            camera, reference = mounted.camera, self._references[i]
+            extractor = CornerExtractor(config, camera.width, camera.height, mask)
+            associator: Associator = CornerTracking(extractor, config)
+            if reference == i:
+                associator = _associator(camera, extractor, config, mask)
+            else:
+                # a camera that is matched follows its features by itself only in an emergency
+                pose = rig.cameras[reference].body_T_camera
+                self._matchers[i] = StereoMatcher(
+                    camera,
+                    mounted.body_T_camera.between(pose),
+                    LucasKanade(config),
+                    extractor,
+                    config,
+                )
+            predictor = PointPredictor(mounted, self._motion, config)
+            self._trackers.append(
+                CameraTracker(mounted, extractor, associator, predictor, config, self._stats, rng)
+            )
+        self._clahe = cv2.createCLAHE(config.clahe_clip_limit, config.clahe_tiles)
+        self._tracks = [Tracks.empty() for _ in rig.cameras]
+        self._next_id = 0
+        self.frame_stats: dict[str, float] = {}
+
+    def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
+        """The features of the next frame; those of the frame before keep their ids.
+
+        Where the image of a camera is missing, its features wait in its last image; where the
+        reference has none, the other cameras go on by themselves.
+
+        Raises:
+            DataError: if the frame has not one image per camera of the size that the rig says.
+        """
+        self._stats.clear()
+        self._stats.add("rejected_gate", self._gated)
+        self._gated = 0
+        if imu is not None:
+            self._motion.add(imu)
+        with self._stats.timed("prepare_ms"):
+            images = [self._equalize(image) for image in self._checked(frame)]
+        first_new_id = self._next_id
+        for i, image in enumerate(images):
+            if image is not None and (
+                self._references[i] == i or images[self._references[i]] is None
+            ):
+                self._follow(i, image, frame.stamp_ns)
+        for i, image in enumerate(images):
+            reference = self._references[i]
+            if image is not None and reference != i and images[reference] is not None:
+                self._tracks[i] = self._match(i, image, frame.stamp_ns, first_new_id)
+        self.frame_stats = dict(self._stats)
+        return FeatureFrame(
+            frame.stamp_ns,
+            tuple(
+                FeatureObservations.empty() if image is None else tracks.observations()
+                for image, tracks in zip(images, self._tracks, strict=True)
+            ),
+        )
+
+    def drop(self, ids: NDArray[np.int64]) -> None:
+        """Forget features in all cameras, e.g. those that the back end rejected."""
+        self._tracks = [tracks.select(~np.isin(tracks.ids, ids)) for tracks in self._tracks]
+        for tracker in self._trackers:
+            tracker.forget(ids)
+
+    def hear(self, feedback: Feedback) -> None:
+        """Note state and map of the back end, and drop what it rejected if so configured."""
+        self._feedback = feedback
+        self._motion.state = feedback.state or self._motion.state
+        if self._config.drop_rejected and len(feedback.rejected):
+            followed = np.unique(np.concatenate([tracks.ids for tracks in self._tracks]))
+            self._gated += int(np.count_nonzero(np.isin(followed, feedback.rejected)))
+            self.drop(feedback.rejected)
+
+    def _checked(self, frame: CameraFrame | FeatureFrame) -> tuple[Image | None, ...]:
+        """The images of a frame, after a look at their number and sizes."""
+        if isinstance(frame, FeatureFrame):
+            raise DataError(
+                f"frame {frame.stamp_ns} holds features, not images: there is nothing to track; "
+                "replay them"
+            )
+        cameras = self._rig.cameras
+        if len(frame.images) != len(cameras):
+            raise DataError(
+                f"frame {frame.stamp_ns} has {len(frame.images)} images, the rig has "
+                f"{len(cameras)} cameras"
+            )
+        for rig_camera, image in zip(cameras, frame.images, strict=True):
+            size = (rig_camera.camera.height, rig_camera.camera.width)
+            if image is not None and image.shape != size:
+                raise DataError(
+                    f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has shape "
+                    f"{image.shape}, its calibration says {size} (height, width)"
+                )
+        return frame.images
+
+    def _equalize(self, image: Image | None) -> Image | None:
+        """An image with its contrast equalised, as configured."""
+        if image is None or self._config.equalization == "none":
+            return image
+        if self._config.equalization == "histogram":
+            return np.asarray(cv2.equalizeHist(image), np.uint8)
+        return np.asarray(self._clahe.apply(image), np.uint8)
+
+    def _follow(self, index: int, image: Image, stamp_ns: int) -> None:
+        """Follow the features of a camera into its next image, and find new ones if it may."""
+        before = self._tracks[index]
+        tracker = self._trackers[index]
+        after = tracker.follow(before, image, stamp_ns, self._feedback)
+        if self._references[index] == index:
+            self._stats.add("tracked", len(after))
+            if len(after) < FEW_FEATURES <= len(before):
+                self._diagnostics.warn(
+                    "few_features", f"{len(after)} of {len(before)} features could be followed"
+                )
+            after = tracker.replenish(before, after, self._next_id)
+            self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
+        self._tracks[index] = after
+
+    def _match(self, index: int, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
+        """The features of the reference camera that another camera sees too."""
+        with self._stats.timed("stereo_ms"):
+            matcher = self._matchers[index]
+            reference = self._tracks[self._references[index]]
+            matches = matcher.match(reference, image, stamp_ns, first_new_id)
+            self._stats.add("stereo", matcher.counts.matched)
+            self._stats.add("rejected_stereo", matcher.counts.rejected)
+            return matches
+
+
+def _associator(
+    camera: Camera, extractor: CornerExtractor, config: FrontendConfig, mask: Image | None
+) -> Associator:
+    """What follows features: Lucas-Kanade, or the descriptor that the method names."""
+    if config.method == "klt":
+        return CornerTracking(extractor, config)
+    return DescriptorMatching(camera, extractor, config, mask)
+
+
+def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
+    """The mask of each camera: what is told, and what a wide lens cannot use."""
+    if len(config.masks) > len(rig.cameras):
+        raise ConfigError(
+            f"frontend.masks lists {len(config.masks)} masks, "
+            f"the rig has {len(rig.cameras)} cameras"
+        )
+    paths = [*config.masks, *[None] * (len(rig.cameras) - len(config.masks))]
+    return [
+        camera_mask(mounted.camera, path, config.window_px)
+        for mounted, path in zip(rig.cameras, paths, strict=True)
+    ]

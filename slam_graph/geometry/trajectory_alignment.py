@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Alignment of an estimated trajectory with a reference: yaw, SE(3) or Sim(3) in closed form.
+
+What a sensor cannot observe decides how much may be aligned: a visual-inertial system does not
+know its position and heading (`yaw`), a stereo camera alone its whole pose (`se3`), a single
+camera alone its scale too (`sim3`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+
+AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
+ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
+
+RELATIVE_RANK = 1e-14
+"""A singular value below this fraction of the largest one counts as zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """The map p ↦ scale · rotation · p + translation.
+
+    Attributes:
+        rotation: (3, 3), `reference_R_estimate`.
+        translation: (3,) in metres of the reference.
+        scale: metres of the reference per metre of the estimate.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: float = 1.0
+
+    @staticmethod
+    def identity() -> Similarity:
+        """The map that changes nothing."""
+        return Similarity(np.eye(3), np.zeros(3))
+
+    def apply(self, trajectory: Trajectory) -> Trajectory:
+        """The trajectory seen from the reference's world; biases stay, they live in the body."""
+        linear = self.scale * self.rotation
+        velocities = trajectory.velocities
+        turned = Rotation.from_matrix(self.rotation) * Rotation.from_quat(trajectory.quaternions)
+        return replace(
+            trajectory,
+            positions=trajectory.positions @ linear.T + self.translation,
+            quaternions=turned.as_quat(),
+            velocities=None if velocities is None else velocities @ linear.T,
+        )
+
+
+def umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = False) -> Similarity:
+    """The least-squares similarity from the points of an estimate to those of a reference.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+    PAMI 1991, eq. (40) to (42).
+
+    Args:
+        reference: (N, 3) points, N ≥ 3.
+        estimate: (N, 3) the same points in another frame.
+        with_scale: estimate the scale too (Sim(3)); otherwise it is 1 (SE(3)).
+
+    Raises:
+        DataError: if the points lie on one line or coincide: their rotation is undefined.
+    """
+    mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
+    centred = estimate - mean_estimate
+    covariance = (reference - mean_reference).T @ centred / len(reference)
+    U, d, Vt = np.linalg.svd(covariance)
+    if len(reference) < 3 or d[1] <= RELATIVE_RANK * max(float(d[0]), np.finfo(float).tiny):
+        raise DataError(
+            f"cannot align {len(reference)} positions that lie on one line or coincide; "
+            "use --align none or yaw, or a recording that moves"
+        )
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    rotation = (U * signs) @ Vt
+    variance = float(np.mean(np.sum(centred**2, axis=1)))
+    scale = float(d @ signs) / variance if with_scale else 1.0
+    return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
+
+
+def align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
+    """The least-squares rotation about world z and translation (4 degrees of freedom).
+
+    With C = Σ r eᵀ over centred points, Σ |r - Rz(ψ) e|² is least where
+    tan ψ = (C₁₀ - C₀₁) / (C₀₀ + C₁₁).
+
+    Args:
+        reference: (N, 3) points.
+        estimate: (N, 3) the same points in a frame whose z axis is vertical too.
+
+    Raises:
+        DataError: if no point is off the vertical through the mean: the heading is undefined.
+    """
+    mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
+    C = (reference - mean_reference).T @ (estimate - mean_estimate)
+    sine, cosine = C[1, 0] - C[0, 1], C[0, 0] + C[1, 1]
+    if np.hypot(sine, cosine) == 0.0:
+        raise DataError(
+            f"cannot align the yaw of {len(reference)} positions above one another; "
+            "use --align none, or a recording that moves"
+        )
+    rotation = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()
+    return Similarity(rotation, mean_reference - rotation @ mean_estimate)
+
+
+def align_first_pose(reference: Trajectory, estimate: Trajectory) -> Similarity:
+    """Yaw and translation that lay the first pose of the estimate onto that of the reference.
+
+    Unlike a least-squares fit it leaves the errors that grow from the start as they are, which is
+    what a consistency test compares with a covariance that starts at zero.
+    """
+    difference = (
+        Rotation.from_quat(reference.quaternions[0])
+        * Rotation.from_quat(estimate.quaternions[0]).inv()
+    ).as_matrix()
+    yaw = np.arctan2(difference[1, 0] - difference[0, 1], difference[0, 0] + difference[1, 1])
+    rotation = Rotation.from_euler("z", yaw).as_matrix()
+    return Similarity(rotation, reference.positions[0] - rotation @ estimate.positions[0])
+
+
+def align(reference: FloatArray, estimate: FloatArray, mode: AlignmentMode) -> Similarity:
+    """The map of `mode` from the positions of an estimate to those of the reference.
+
+    Args:
+        reference: (N, 3) positions.
+        estimate: (N, 3) positions at the same times.
+        mode: `scale` corrects the scale of Sim(3) alone, neither rotation nor translation.
+    """
+    if mode == "none":
+        return Similarity.identity()
+    if mode == "yaw":
+        return align_yaw(reference, estimate)
+    similarity = umeyama(reference, estimate, with_scale=mode != "se3")
+    if mode == "scale":
+        return Similarity(np.eye(3), np.zeros(3), similarity.scale)
+    return similarity

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Verification of loop candidates: matches of descriptors, then a relative pose that they agree on.
+
+The relative pose is that from which the second keyframe sees the points of the first one: P3P in
+RANSAC, refined on the inliers (OpenCV).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray, skew
+from slam_graph.loop_closure.loop_config import VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
+from slam_graph.sensors.rig import RigCamera
+
+FLOOR_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3)
+"""No relative pose is better known than this: rad, then m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """A loop closure.
+
+    Attributes:
+        first, second: numbers of the keyframes, the earlier one first.
+        first_T_second: relative pose of the bodies.
+        covariance: (6, 6) of it in GTSAM's tangent: rotation (rad), translation (m).
+        inliers, matches: how many matches agree with it, of how many.
+        pairs: (inliers, 2) rows of what matches and agrees, in the first and the second.
+    """
+
+    first: int
+    second: int
+    first_T_second: gtsam.Pose3
+    covariance: FloatArray
+    inliers: int
+    matches: int
+    pairs: IntArray
+
+
+def match(first: Descriptors, second: Descriptors, max_bits: int) -> IntArray:
+    """Pairs (M, 2) of descriptors that are each other's nearest and differ in few bits."""
+    if len(first) == 0 or len(second) == 0:
+        return np.zeros((0, 2), np.int64)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first, second)
+    rows = [(m.queryIdx, m.trainIdx) for m in matches if m.distance <= max_bits]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+class LoopVerifier:
+    """Decides whether two keyframes show the same place.
+
+    Args:
+        mounted: the first camera.
+        config: what it takes.
+    """
+
+    def __init__(self, mounted: RigCamera, config: VerificationConfig) -> None:
+        self._config = config
+        self._body_T_camera = mounted.body_T_camera
+        self._focal_px = float(np.sqrt(mounted.camera.fx * mounted.camera.fy))
+
+    def verify(
+        self, keyframes: list[Keyframe], first: int, second: int, gravity: bool = True
+    ) -> Loop | None:
+        """The loop closure between two keyframes, or None if there is none.
+
+        Args:
+            keyframes: all.
+            first: number of the earlier one.
+            second: number of the later one.
+            gravity: whether roll and pitch of the keyframes are known.
+        """
+        config = self._config
+        a, b = keyframes[first], keyframes[second]
+        known = np.flatnonzero(np.isfinite(a.points).all(axis=1))
+        pairs = match(a.descriptors[known], b.descriptors, config.max_descriptor_bits)
+        if len(pairs) < config.min_inliers:
+            return None
+        points, rays = a.points[known[pairs[:, 0]]], b.normalized[pairs[:, 1]]
+        found = self._pose(points, rays)
+        if found is None:
+            return None
+        pose, inliers = found
+        if inliers.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
+            return None
+        if gravity and tilt(a.world_T_body, b.world_T_body, pose) > config.max_tilt_rad:
+            return None
+        covariance = self._covariance(points[inliers], pose)
+        agreeing = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
+        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), agreeing)
+
+    def _pose(
+        self, points: FloatArray, rays: FloatArray
+    ) -> tuple[gtsam.Pose3, NDArray[np.bool_]] | None:
+        """first_T_second from points (M, 3) of the first and where (M, 2) the second sees them."""
+        cv2.setRNGSeed(0)  # OpenCV draws from one global generator
+        error = self._config.max_error_px / self._focal_px
+        found, rotation, translation, rows = cv2.solvePnPRansac(
+            points,
+            rays,
+            np.eye(3),
+            None,
+            iterationsCount=self._config.ransac_iterations,
+            reprojectionError=error,
+            confidence=0.999,
+            flags=cv2.SOLVEPNP_AP3P,
+        )
+        if not found or rows is None or len(rows) < self._config.min_inliers:
+            return None
+        chosen = rows[:, 0]
+        rotation, translation = cv2.solvePnPRefineLM(
+            points[chosen], rays[chosen], np.eye(3), None, rotation, translation
+        )
+        seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
+        matrix = cv2.Rodrigues(rotation)[0]
+        ahead = (points @ matrix.T + translation.T)[:, 2] > 0
+        camera_T_first = gtsam.Pose3(gtsam.Rot3(matrix), translation[:, 0])
+        first_T_second = camera_T_first.inverse().compose(self._body_T_camera.inverse())
+        return first_T_second, (np.linalg.norm(seen - rays, axis=1) < error) & ahead
+
+    def _covariance(self, points: FloatArray, pose: gtsam.Pose3) -> FloatArray:
+        """(6, 6) of the relative pose from points (M, 3) that agree with it."""
+        body = (points - pose.translation()) @ pose.rotation().matrix()
+        camera_R_body = self._body_T_camera.rotation().matrix().T
+        x, y, z = ((body - self._body_T_camera.translation()) @ camera_R_body.T).T
+        zero = np.zeros_like(x)
+        by_camera = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(
+            2, 0, 1
+        )
+        turn = skew(body)
+        by_pose = np.concatenate([turn, np.tile(-np.eye(3), (len(points), 1, 1))], axis=2)
+        J = (by_camera @ camera_R_body @ by_pose).reshape(-1, 6)
+        sigma = self._config.sigma_px / self._focal_px
+        return np.asarray(sigma**2 * np.linalg.inv(J.T @ J) + np.diag(FLOOR_SIGMAS**2))
+
+
+def tilt(first: gtsam.Pose3, second: gtsam.Pose3, first_T_second: gtsam.Pose3) -> float:
+    """By how much, in rad, a relative pose contradicts what two poses know of the vertical."""
+    up = np.array([0.0, 0.0, 1.0])
+    in_first = first.rotation().matrix().T @ up
+    carried = first_T_second.rotation().matrix() @ second.rotation().matrix().T @ up
+    return float(np.arccos(np.clip(in_first @ carried, -1.0, 1.0)))

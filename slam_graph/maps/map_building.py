@@ -1,0 +1,182 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""From the keyframes of a run to a map: observations become features with one place in the world.
+
+A feature is a track, or several that loop closures have matched. It lies where the keyframes that
+have triangulated it say on average, near ones counting more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_verification import Loop
+from slam_graph.loop_closure.place_recognition import Vocabulary
+from slam_graph.maps.map_model import (
+    NO_FEATURE,
+    Links,
+    MapRecording,
+    SlamMap,
+    common_look,
+)
+from slam_graph.pose_graph.graph import Poses
+from slam_graph.sensors.rig import Rig
+from slam_graph.version import __version__
+
+
+def build_map(
+    keyframes: list[Keyframe],
+    poses: Poses,
+    recording: MapRecording,
+    loops: list[Loop],
+    places: PlaceConfig,
+    verification: VerificationConfig,
+    gravity_aligned: bool = True,
+    seed: int = 0,
+) -> SlamMap:
+    """The map of one recording.
+
+    Args:
+        keyframes: K, at least one, in the order of time.
+        poses: K best estimates world_T_body.
+        recording: where they come from.
+        loops: closures that hold: what they match becomes one feature.
+        places: how the vocabulary is trained.
+        verification: how far from its feature an observation may be.
+        gravity_aligned: whether z of the world is up.
+        seed: of the training.
+    """
+    offsets = np.cumsum([0, *(len(k.descriptors) for k in keyframes)])
+    features = _numbered(keyframes, loops, offsets)
+    empty = np.zeros((0, 3))
+    whole = SlamMap(
+        (recording,),
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        __version__,
+        gravity_aligned,
+        np.zeros(len(keyframes), np.int64),
+        np.array([k.stamp_ns for k in keyframes], np.int64),
+        poses,
+        empty,
+        keyframes[0].descriptors[:0],
+        offsets.astype(np.int64),
+        features,
+        np.concatenate([k.normalized for k in keyframes]),
+        np.concatenate([k.descriptors for k in keyframes]),
+        links_of(loops),
+        trained([k.descriptors for k in keyframes], places, seed),
+    )
+    body_points = np.concatenate([k.points for k in keyframes])
+    return with_features(whole, features, body_points, verification.max_error_px)
+
+
+def trained(documents: list[NDArray[np.uint8]], places: PlaceConfig, seed: int) -> Vocabulary:
+    """The vocabulary of the descriptors (N, B) of all keyframes."""
+    return Vocabulary.train(
+        documents,
+        places.words,
+        places.training_descriptors,
+        places.training_iterations,
+        np.random.default_rng(seed),
+    )
+
+
+def links_of(loops: list[Loop]) -> Links:
+    """Loop closures as links."""
+    if not loops:
+        return Links.none()
+    matrices = np.array([loop.first_T_second.matrix() for loop in loops])
+    return Links(
+        np.array([(loop.first, loop.second) for loop in loops], np.int64),
+        Poses(matrices[:, :3, :3], matrices[:, :3, 3]),
+        np.array([loop.covariance for loop in loops]),
+    )
+
+
+def with_features(
+    whole: SlamMap, features: IntArray, body_points: FloatArray, max_error_px: float
+) -> SlamMap:
+    """The map with its features placed anew, from what each observation says of its point.
+
+    Observations that are off their feature become unknown, and features that are then not seen,
+    or of which nobody knows a point, leave.
+
+    Args:
+        whole: its observations and poses are used.
+        features: (N,) number of the feature of each observation, -1 for none.
+        body_points: (N, 3) its point in the body frame then; NaN where it is not known.
+        max_error_px: how far off its feature an observation may be.
+    """
+    features = features.copy()
+    points = _placed(whole, features, body_points)
+    features[~_fits(whole, features, points, max_error_px)] = NO_FEATURE
+    used, compact = np.unique(features, return_inverse=True)
+    first = int(np.searchsorted(used, 0))
+    features, points = compact.reshape(-1) - first, points[used[first:]]
+    looks = common_look(whole.descriptors, features, len(points))
+    return replace(whole, features=features, points=points, feature_descriptors=looks)
+
+
+def together(count: int, pairs: IntArray) -> IntArray:
+    """(count,) the group of each of some things, of which pairs (M, 2) are the same."""
+    links = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def _numbered(keyframes: list[Keyframe], loops: list[Loop], offsets: IntArray) -> IntArray:
+    """(N,) number of the feature of each observation: its track, and those matched with it."""
+    ids = np.concatenate([k.ids for k in keyframes])
+    tracked = ids >= 0
+    _, track = np.unique(ids, return_inverse=True)
+    # a corner without a track is one of its own, which a loop may join to others
+    track = np.where(tracked, track.reshape(-1), track.max(initial=0) + 1 + np.arange(len(ids)))
+    rows = [offsets[[loop.first, loop.second]] + loop.pairs for loop in loops]
+    pairs = track[np.concatenate([np.zeros((0, 2), np.int64), *rows])]
+    return together(int(track.max(initial=-1)) + 1, pairs)[track]
+
+
+def _placed(whole: SlamMap, features: IntArray, body_points: FloatArray) -> FloatArray:
+    """(P, 3) world positions of features 0 to P - 1; NaN where no observation has a point."""
+    count = int(features.max(initial=-1)) + 1
+    known = np.flatnonzero((features >= 0) & np.isfinite(body_points).all(axis=1))
+    at, local = whole.keyframe_of[known], body_points[known]
+    world = np.einsum("nij,nj->ni", whole.poses.rotations[at], local)
+    world += whole.poses.translations[at]
+    weights = 1.0 / np.maximum(np.sum(local**2, axis=1), 1e-6)
+    total = np.bincount(features[known], weights, count)
+    sums = [np.bincount(features[known], weights * axis, count) for axis in world.T]
+    return np.asarray(np.column_stack(sums) / np.where(total > 0, total, np.nan)[:, None])
+
+
+def _fits(
+    whole: SlamMap, features: IntArray, points: FloatArray, max_error_px: float
+) -> NDArray[np.bool_]:
+    """(N,) whether each observation sees its feature where it is."""
+    fits = np.zeros(len(features), np.bool_)
+    for number, recording in enumerate(whole.recordings):
+        rows = np.flatnonzero((features >= 0) & (whole.recording_of[whole.keyframe_of] == number))
+        at = whole.keyframe_of[rows]
+        body = points[features[rows]] - whole.poses.translations[at]
+        body = np.einsum("nji,nj->ni", whole.poses.rotations[at], body)
+        ahead, seen = seen_from(recording.rig, body)
+        off = np.linalg.norm(seen - whole.normalized[rows], axis=1)
+        camera = recording.rig.cameras[0].camera
+        fits[rows] = ahead & (off * np.sqrt(camera.fx * camera.fy) < max_error_px)
+    return fits
+
+
+def seen_from(rig: Rig, body: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which points (N, 3) of the body frame are ahead of the first camera, and where (N, 2)."""
+    mount = rig.cameras[0].body_T_camera
+    local = (body - mount.translation()) @ mount.rotation().matrix()
+    ahead = local[:, 2] > 0
+    return ahead, local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]

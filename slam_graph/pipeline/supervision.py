@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Watching over a run: is the estimate sane, and how did the run end?"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import numpy as np
+
+from slam_graph.backend.build_estimator import EstimatorLike
+from slam_graph.backend.cost.gating import Innovations
+from slam_graph.config import LimitsConfig
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import EstimationError, SlamGraphError
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.results.run_result import RunResult
+from slam_graph.sensors.measurements import FeatureFrame
+
+LONGEST_GAP_S = 0.5
+"""How much of the time between two frames of which features were tested counts at most."""
+
+logger = logging.getLogger(__name__)
+
+
+class DivergenceError(EstimationError):
+    """The estimate left all that is possible."""
+
+
+def estimate(estimator: EstimatorLike, features: FeatureFrame) -> NavState | None:
+    """The state at a frame.
+
+    Raises:
+        DivergenceError: if the linear algebra fails, which a sane state does not bring about.
+    """
+    try:
+        return estimator.add_frame(features)
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DivergenceError(
+            f"diverged at frame {features.stamp_ns}: the equations cannot be solved ({reason})"
+        ) from error
+
+
+def check_sane(state: NavState, limits: LimitsConfig) -> None:
+    """Refuse a state that cannot be true.
+
+    Raises:
+        DivergenceError: naming what is beyond its limit.
+    """
+    parts = (
+        state.world_T_body.matrix().ravel(),
+        state.velocity,
+        state.gyro_bias,
+        state.accel_bias,
+        np.zeros(0) if state.covariance is None else np.diag(state.covariance),
+    )
+    if not all(np.isfinite(part).all() for part in parts):
+        raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
+    sigma_m = 0.0
+    if state.covariance is not None:
+        sigma_m = float(np.sqrt(np.max(np.diag(state.covariance)[3:6])))
+    for what, value, limit in (
+        ("speed of {} m/s", float(np.linalg.norm(state.velocity)), limits.max_speed),
+        ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
+        ("gyroscope bias of {} rad/s", float(np.abs(state.gyro_bias).max()), limits.max_gyro_bias),
+        (
+            "accelerometer bias of {} m/s²",
+            float(np.abs(state.accel_bias).max()),
+            limits.max_accel_bias,
+        ),
+    ):
+        if value > limit:
+            raise DivergenceError(
+                f"diverged at frame {state.stamp_ns}: {what.format(f'{value:.3g}')} "
+                f"(the limit is {limit:g})"
+            )
+
+
+class Agreement:
+    """Whether the images still agree with the state, by what the gate makes of them.
+
+    If state and covariance are right the χ² gate rejects a few percent of the features. Where it
+    rejects most of them for seconds, the state is wrong and surer of itself than it should be, and
+    nothing will bring it back: the features that would are those that are rejected.
+
+    Time counts as long as images are tested only, and for one gap between two tests little: after a
+    pause, as of blank images, an estimate has its time to recover.
+    """
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
+        self._tests: deque[tuple[float, int, int]] = deque()
+        self._tested_s = 0.0
+        self._last_ns: int | None = None
+
+    def check(self, stamp_ns: int, innovations: Innovations) -> None:
+        """Take what was tested in the next frame.
+
+        Raises:
+            DivergenceError: if too much was rejected for too long.
+        """
+        if innovations.tested == 0:
+            return
+        if self._last_ns is not None:
+            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, LONGEST_GAP_S)
+        self._last_ns = stamp_ns
+        self._tests.append((self._tested_s, innovations.tested, innovations.rejected))
+        begin_s = self._tested_s - self._limits.disagreement_s
+        while len(self._tests) > 1 and self._tests[1][0] <= begin_s:
+            self._tests.popleft()
+        if self._tests[0][0] > begin_s:
+            return
+        tested, rejected = (sum(test[k] for test in self._tests) for k in (1, 2))
+        share = rejected / tested
+        if share > self._limits.max_rejected_share:
+            raise DivergenceError(
+                f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
+                f"what was seen in {self._limits.disagreement_s:g} s was rejected (the limit is "
+                f"{self._limits.max_rejected_share:.0%})"
+            )
+
+
+@contextmanager
+def outcome(
+    result: RunResult, estimator: EstimatorLike, diagnostics: Diagnostics
+) -> Iterator[None]:
+    """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
+    began = time.perf_counter()
+    try:
+        yield
+        _judge(result, estimator)
+    except KeyboardInterrupt as interrupt:
+        result.status, result.message = "interrupted", "interrupted before the end"
+        result.error = interrupt
+    except DivergenceError as error:
+        result.status, result.message, result.error = "diverged", str(error), error
+    except SlamGraphError as error:
+        result.status, result.message, result.error = "failed", str(error), error
+    except Exception as error:
+        logger.exception("internal error")
+        result.status, result.error = "failed", error
+        result.message = f"internal error: {type(error).__name__}: {error}"
+    result.wall_s = time.perf_counter() - began
+    result.warnings = +diagnostics.counts
+    level = logging.INFO if result.status == "ok" else logging.ERROR
+    logger.log(level, "%s", result.message or f"{result.frames} frames in {result.wall_s:.1f} s")
+
+
+def _judge(result: RunResult, estimator: EstimatorLike) -> None:
+    """Whether a run that came to its end reached what was asked for."""
+    asked = result.config.min_coverage
+    if not estimator.initialized:
+        result.status = "not_initialized"
+        result.message = (
+            f"never initialised in {result.frames} frames: waiting for {estimator.waiting_for}"
+        )
+    elif result.coverage < asked:
+        result.status = "low_coverage"
+        result.message = (
+            f"the estimate covers {result.coverage:.1%} of the {result.recorded_s:.1f} s asked "
+            f"for, less than min_coverage = {asked:.1%}"
+        )
+
+
+@contextmanager
+def interrupts_between_frames() -> Iterator[Callable[[], None]]:
+    """Let Ctrl-C take effect when a frame is done, not in the middle of its book-keeping.
+
+    A second Ctrl-C takes effect at once. Outside the main thread, which alone gets signals, this
+    changes nothing.
+
+    Yields:
+        To be called after each frame; raises KeyboardInterrupt if there was one.
+    """
+    pending = False
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        nonlocal pending
+        if pending:
+            raise KeyboardInterrupt
+        pending = True
+
+    def frame_done() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield frame_done
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield frame_done
+        frame_done()
+    finally:
+        signal.signal(signal.SIGINT, before)

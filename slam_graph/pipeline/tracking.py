@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The front end at work: reading and tracking, in a thread beside the back end or in turn with it.
+
+While the back end works on frame k, the front end tracks frame k + 1. So what the back end found in
+frame k reaches the front end before frame k + 2, in either mode: results are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+from slam_graph.frontend.frontend_protocol import Feedback, Frontend
+from slam_graph.results.run_logs import Stopwatch, milliseconds
+from slam_graph.sensors.measurements import FeatureFrame, Packet
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPacket:
+    """A packet and what the front end made of it.
+
+    Attributes:
+        packet: as it was read.
+        features: found in its frame.
+        frame_stats: counts and milliseconds of the front end.
+        clock: has timed reading and front end, and goes on with the back end.
+    """
+
+    packet: Packet
+    features: FeatureFrame
+    frame_stats: dict[str, float]
+    clock: Stopwatch
+
+
+class Tracking:
+    """Tracks the packets of a sequence one after the other.
+
+    Args:
+        packets: to track; read in the thread of the front end.
+        frontend: does it.
+        overlap: whether to track the next packet in a thread while the caller works on this one.
+    """
+
+    def __init__(self, packets: Iterator[Packet], frontend: Frontend, overlap: bool) -> None:
+        self._packets = packets
+        self._frontend = frontend
+        self._overlap = overlap
+        self._feedback: Feedback | None = None
+
+    def tell(self, feedback: Feedback) -> None:
+        """What the back end found in the packet that was handed out last."""
+        self._feedback = feedback
+
+    def run(self) -> Generator[TrackedPacket, None, None]:
+        """The packets, to be closed when no more are wanted.
+
+        A fault in one is raised when its turn comes, not while it is read ahead.
+        """
+        if self._overlap:
+            yield from self._ahead()
+            return
+        feedback = None
+        while (tracked := self._track(feedback)) is not None:
+            feedback, self._feedback = self._feedback, None
+            yield tracked
+
+    def _ahead(self) -> Generator[TrackedPacket, None, None]:
+        with ThreadPoolExecutor(1, thread_name_prefix="slam_graph-frontend") as pool:
+            future = pool.submit(self._track, None)
+            while (tracked := future.result()) is not None:
+                feedback, self._feedback = self._feedback, None
+                future = pool.submit(partial(self._track, feedback))
+                tracked.clock.restart()
+                yield tracked
+
+    def _track(self, feedback: Feedback | None) -> TrackedPacket | None:
+        """Read and track the next packet; None at the end."""
+        clock = Stopwatch()
+        if feedback is not None:
+            self._frontend.hear(feedback)
+        packet = next(self._packets, None)
+        if packet is None:
+            return None
+        clock.lap("read")
+        features = self._frontend.track(packet.frame, packet.imu)
+        stats = dict(self._frontend.frame_stats)
+        clock.lap("frontend", milliseconds(stats))
+        return TrackedPacket(packet, features, stats, clock)

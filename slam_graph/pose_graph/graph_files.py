@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading and writing pose graphs: g2o files, 2D and 3D, and TORO's.
+
+| line | values behind the ids |
+|---|---|
+| `VERTEX_SE2`, `VERTEX2` | x y θ |
+| `VERTEX_SE3:QUAT` | x y z qx qy qz qw |
+| `VERTEX3` | x y z roll pitch yaw |
+| `EDGE_SE2` | x y θ, upper triangle of the information by rows |
+| `EDGE2`, `ODOMETRY` | x y θ, information as TORO orders it: xx xy yy θθ xθ yθ |
+| `EDGE_SE3:QUAT` | x y z qx qy qz qw, upper triangle of the information by rows |
+| `EDGE3` | x y z roll pitch yaw, upper triangle of the information by rows |
+
+What can be wrong with the lines of a pose graph: refused with file and line, or counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.streams.csv_rows import Rows, parse
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
+
+
+def check_numbers(rows: Rows, numbers: FloatArray) -> None:
+    """Make sure that all numbers are finite.
+
+    Raises:
+        DataError: naming the first line where one is not.
+    """
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if len(bad):
+        raise DataError(f"{rows.where(bad[0])}: a number is not finite")
+
+
+def drop_repeated(rows: Rows, ids: IntArray, diagnostics: Diagnostics) -> IntArray:
+    """The rows of vertices by increasing id, only the first of each id; others are counted."""
+    _, first = np.unique(ids, return_index=True)
+    for row in np.setdiff1d(np.arange(len(ids)), first):
+        diagnostics.warn(
+            "pose_graph_repeated_vertex",
+            f"{rows.where(row)}: vertex {ids[row]} again; its first estimate is used",
+        )
+    return first.astype(np.int64)
+
+
+def rows_of_keys(keys: IntArray, ids: IntArray, rows: Rows) -> IntArray:
+    """(M, 2) rows of the poses that edges refer to by their ids.
+
+    Raises:
+        DataError: naming the line of the first edge to a vertex that is not there.
+    """
+    found = np.minimum(np.searchsorted(keys, ids), len(keys) - 1)
+    missing = np.argwhere(keys[found] != ids)
+    if len(missing):
+        edge, end = missing[0]
+        raise DataError(f"{rows.where(edge)}: edge to vertex {ids[edge, end]}, which is not there")
+    return found.astype(np.int64)
+
+
+def connected(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGraph:
+    """The graph without edges from a pose to itself, checked; parts without a link are counted.
+
+    Raises:
+        DataError: if an information matrix is not positive definite, or no edge is left.
+    """
+    _check_information(graph.information, rows)
+    loops = graph.edges[:, 0] == graph.edges[:, 1]
+    for row in np.flatnonzero(loops).tolist():
+        diagnostics.warn("pose_graph_edge_to_itself", f"{rows.where(row)}: left out")
+    graph = graph.keep_edges(~loops) if loops.any() else graph
+    if len(graph.edges) == 0:
+        raise DataError(f"{rows.path}: no edges between two poses")
+    for part in range(1, len(graph.anchors)):
+        size, key = np.count_nonzero(graph.components == part), graph.keys[graph.anchors[part]]
+        diagnostics.warn(
+            "pose_graph_not_connected",
+            f"{rows.path}: {size} poses from {key} on have no link to the first; "
+            f"pose {key} is held where it is",
+        )
+    return graph
+
+
+def _check_information(information: FloatArray, rows: Rows) -> None:
+    """Make sure that all information matrices are positive definite."""
+    try:
+        np.linalg.cholesky(information)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(information)[:, 0]
+        edge = int(np.argmin(smallest))
+        raise DataError(
+            f"{rows.where(edge)}: the information matrix is not positive definite "
+            f"(smallest eigenvalue {smallest[edge]:.3g})"
+        ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What a kind of line holds.
+
+    Attributes:
+        dimension: 2 or 3.
+        ids: 1 of a vertex, 2 of an edge.
+        rotation: how the rotation is written.
+        order: for each entry of the upper triangle of the information, by rows, its place in the
+            file.
+    """
+
+    dimension: int
+    ids: int
+    rotation: Literal["angle", "quaternion", "rpy"]
+    order: tuple[int, ...] = ()
+
+    @property
+    def pose_size(self) -> int:
+        """How many numbers a pose has."""
+        return self.dimension + {"angle": 1, "quaternion": 4, "rpy": 3}[self.rotation]
+
+    def expected(self) -> str:
+        """The line in words."""
+        ids = "two ids" if self.ids == 2 else "an id"
+        information = f", {len(self.order)} of the information" if self.order else ""
+        return f"{ids}, {self.pose_size} numbers of the pose{information}"
+
+
+BY_ROWS_2D = tuple(range(6))
+TORO_2D = (0, 1, 4, 2, 5, 3)
+BY_ROWS_3D = tuple(range(21))
+
+LINES = {
+    "VERTEX_SE2": Line(2, 1, "angle"),
+    "VERTEX2": Line(2, 1, "angle"),
+    "VERTEX_SE3:QUAT": Line(3, 1, "quaternion"),
+    "VERTEX3": Line(3, 1, "rpy"),
+    "EDGE_SE2": Line(2, 2, "angle", BY_ROWS_2D),
+    "EDGE2": Line(2, 2, "angle", TORO_2D),
+    "ODOMETRY": Line(2, 2, "angle", TORO_2D),
+    "EDGE_SE3:QUAT": Line(3, 2, "quaternion", BY_ROWS_3D),
+    "EDGE3": Line(3, 2, "rpy", BY_ROWS_3D),
+}
+
+
+QUATERNION_TOLERANCE = 0.1
+"""How far the length of a quaternion may be from 1: files have few digits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """All lines of a file that begin with one word.
+
+    Attributes:
+        rows: the lines and their numbers.
+        ids: (L, 1 or 2).
+        poses: of the vertices, or measured.
+        information: (L, k, k) of edges; (0, k, k) of vertices.
+    """
+
+    rows: Rows
+    ids: IntArray
+    poses: Poses
+    information: FloatArray
+
+
+def read_pose_graph(
+    path: Path | str,
+    diagnostics: Diagnostics | None = None,
+    rotation_information: RotationInformation = "angle",
+) -> PoseGraph:
+    """Read a pose graph.
+
+    What does not change the problem is repaired and counted in `diagnostics`; lines of unknown
+    kinds are left out and counted.
+
+    Raises:
+        DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
+            has an edge to a missing vertex, numbers that are not finite, or an information matrix
+            that is not positive definite.
+    """
+    path, diagnostics = Path(path), diagnostics or Diagnostics()
+    blocks = [_parse(rows, tag) for tag, rows in _by_kind(path, diagnostics).items()]
+    vertices = [block for block in blocks if block.ids.shape[1] == 1]
+    between = [block for block in blocks if block.ids.shape[1] == 2]
+    if not between:
+        raise DataError(f"{path}: no edges; known are lines that begin with {', '.join(LINES)}")
+    if len({block.poses.dimension for block in blocks}) > 1:
+        raise DataError(f"{path}: 2D and 3D poses in one file")
+    rows, ids, measured, information = _joined(between)
+    keys, estimates = np.unique(ids), None
+    if vertices:
+        vertex_rows, vertex_ids, poses, _ = _joined(vertices)
+        kept = drop_repeated(vertex_rows, vertex_ids[:, 0], diagnostics)
+        keys, estimates = vertex_ids[kept, 0], poses.select(kept)
+    edges = rows_of_keys(keys, ids, rows)
+    graph = PoseGraph(
+        keys, estimates, edges, measured, information, rotation_information, path.stem
+    )
+    return connected(graph, rows, diagnostics)
+
+
+def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
+    """The lines of a file by their first word; unknown ones are counted."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    kinds: dict[str, Rows] = {}
+    for number, line in enumerate(lines, 1):
+        tag = line.split(None, 1)[0] if line and not line.isspace() else "#"
+        if tag in LINES:
+            rows = kinds.get(tag)
+            if rows is None:
+                rows = kinds[tag] = Rows(path, [], [])
+            rows.lines.append(line)
+            rows.numbers.append(number)
+        elif not tag.startswith("#"):
+            diagnostics.warn(
+                "pose_graph_line_ignored", f"{path}:{number}: '{tag[:40]}' is left out"
+            )
+    return kinds
+
+
+def _parse(rows: Rows, tag: str) -> Block:
+    """Numbers of all lines of one kind."""
+    line = LINES[tag]
+    size, entries = line.pose_size, len(line.order)
+    if tag in ("EDGE2", "EDGE3") and len(rows.lines[0].split()) == 1 + line.ids + size:
+        entries = 0  # TORO lets the information be left out: it is the identity then
+    dtype = [("tag", "S16"), ("ids", np.int64, (line.ids,)), ("numbers", float, (size + entries,))]
+    table = parse(rows, dtype, f"{tag}, {line.expected()}", delimiter=None)
+    ids, numbers = table["ids"], table["numbers"]
+    check_numbers(rows, numbers)
+    k = 3 * (line.dimension - 1)
+    information = np.tile(np.eye(k), (len(ids) if line.ids == 2 else 0, 1, 1))
+    if entries:
+        information = _information(numbers[:, size:], line.order)
+    return Block(rows, ids, _poses(rows, numbers[:, :size], line), information)
+
+
+def _information(entries: FloatArray, order: tuple[int, ...]) -> FloatArray:
+    """(L, k, k) symmetric matrices from their upper triangles.
+
+    Some writers put the triangle of a 2D edge by rows behind TORO's `EDGE2`: where TORO's order
+    would say that nothing is known of y or θ, it is meant by rows.
+    """
+    if order == TORO_2D and not (entries[:, 2:4] > 0).any(axis=0).all():
+        order = BY_ROWS_2D
+    k = 3 if len(order) == 6 else 6
+    full = np.zeros((len(entries), k, k))
+    above = np.triu_indices(k)
+    full[:, *above] = entries[:, order]
+    full[:, *above[::-1]] = entries[:, order]
+    return full
+
+
+def _poses(rows: Rows, numbers: FloatArray, line: Line) -> Poses:
+    """Poses from the numbers of a file."""
+    translations, angles = numbers[:, : line.dimension], numbers[:, line.dimension :]
+    if line.rotation == "angle":
+        cos, sin = np.cos(angles[:, 0]), np.sin(angles[:, 0])
+        return Poses(np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2), translations)
+    if line.rotation == "rpy":
+        return Poses(Rotation.from_euler("xyz", angles).as_matrix(), translations)
+    length = np.linalg.norm(np.clip(angles, -2.0, 2.0), axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(bad):
+        raise DataError(f"{rows.where(int(bad[0]))}: the quaternion is not of unit length")
+    return Poses(Rotation.from_quat(angles).as_matrix(), translations)
+
+
+def _joined(blocks: list[Block]) -> tuple[Rows, IntArray, Poses, FloatArray]:
+    """Blocks as one, in the order of the file."""
+    path = blocks[0].rows.path
+    numbers = np.concatenate([block.rows.numbers for block in blocks])
+    order = np.argsort(numbers, kind="stable")
+    lines = [line for block in blocks for line in block.rows.lines]
+    poses = Poses(
+        np.concatenate([block.poses.rotations for block in blocks]),
+        np.concatenate([block.poses.translations for block in blocks]),
+    )
+    information = np.concatenate([block.information for block in blocks])
+    return (
+        Rows(path, [lines[k] for k in order], numbers[order].tolist()),
+        np.concatenate([block.ids for block in blocks])[order],
+        poses.select(order),
+        information[order] if len(information) else information,
+    )
+
+
+def g2o_lines(graph: PoseGraph, poses: Poses) -> Iterator[str]:
+    """The lines of a g2o file with given poses; reading it gives the same numbers back."""
+    d = graph.dimension
+    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if d == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    for key, pose in zip(graph.keys.tolist(), _numbers(poses).tolist(), strict=True):
+        yield f"{vertex} {key} {' '.join(map(repr, pose))}\n"
+    above = np.triu_indices(3 * (d - 1))
+    numbers = np.hstack([_numbers(graph.measured), graph.information[:, *above]])
+    ends = graph.keys[graph.edges].tolist()
+    for (i, j), row in zip(ends, numbers.tolist(), strict=True):
+        yield f"{edge} {i} {j} {' '.join(map(repr, row))}\n"
+
+
+def _numbers(poses: Poses) -> NDArray[np.float64]:
+    """(N, 3) x y θ, or (N, 7) x y z qx qy qz qw."""
+    if poses.dimension == 2:
+        return np.column_stack([poses.translations, poses.angles()])
+    turns = Rotation.from_matrix(poses.rotations).as_quat(canonical=True)
+    return np.hstack([poses.translations, turns])

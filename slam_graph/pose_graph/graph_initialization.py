@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""First estimates of the poses of a graph, from its edges alone or as the file has them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import gtsam
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.pose_graph.chordal import (
+    factorized,
+    nearest_rotations,
+    rotation_rows,
+    translation_rows,
+)
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+
+Initialization = Literal["chordal", "lago", "odometry", "file"]
+
+LOOP_CLOSURE_LENGTH = 1e6
+"""Length of a loop closure in the tree of `odometry`, where a step of odometry has 1."""
+
+
+def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) -> Poses:
+    """First estimates.
+
+    Args:
+        graph: the pose graph.
+        how: chordal: rotations without their constraint, projected, then translations (Carlone,
+            Tron, Daniilidis and Dellaert 2015). lago: angles first, in 2D (Carlone, Aragues,
+            Castellanos and Bona 2014). odometry: along a tree, of consecutive poses where there are
+            any. file: as the file has them.
+        diagnostics: counts where odometry had to do.
+
+    Raises:
+        DataError: if the file has no estimates, or `lago` is asked for in 3D.
+    """
+    if how == "file":
+        if graph.estimates is None:
+            raise DataError(f"{graph.name}: the file has no estimates; use another initialization")
+        return graph.estimates
+    if how == "odometry":
+        return along_tree(graph)
+    if how == "lago" and graph.dimension == 3:
+        raise DataError(f"{graph.name}: lago is for 2D; use the chordal initialization")
+    try:
+        rotations = chordal_rotations(graph) if how == "chordal" else lago_rotations(graph)
+        return Poses(rotations, translations_given(graph, rotations))
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        diagnostics.warn(
+            "pose_graph_not_initialized", f"{how}: {str(error).strip()}; odometry is used"
+        )
+        return along_tree(graph)
+
+
+def chordal_rotations(graph: PoseGraph) -> FloatArray:
+    """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on rotations."""
+    d, n = graph.dimension, len(graph.keys)
+    rows = rotation_rows(graph, graph.precisions[0])[:, n:]
+    held = (d * graph.anchors[:, None] + np.arange(d)).ravel()
+    first = graph.anchor_poses().rotations.transpose(0, 2, 1).reshape(-1, d)
+    transposed = _solved(rows, held, first).reshape(n, d, d)
+    return nearest_rotations(transposed.transpose(0, 2, 1))
+
+
+def lago_rotations(graph: PoseGraph) -> FloatArray:
+    """(N, 2, 2) rotations by LAGO: angles as a linear problem after unwrapping along a tree."""
+    problem, first = gtsam.NonlinearFactorGraph(), graph.anchor_poses().rotations
+    angles = np.arctan2(graph.measured.rotations[:, 1, 0], graph.measured.rotations[:, 0, 0])
+    sigmas = 1.0 / np.sqrt(graph.information[:, 2, 2])
+    for (i, j), angle, sigma in zip(
+        graph.edges.tolist(), angles.tolist(), sigmas.tolist(), strict=True
+    ):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, sigma]))
+        problem.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(0.0, 0.0, angle), noise))
+    _lago_applies(graph)
+    unit = gtsam.noiseModel.Unit.Create(3)
+    problem.addPriorPose2(
+        0, gtsam.Pose2(0.0, 0.0, np.arctan2(first[0, 1, 0], first[0, 0, 0])), unit
+    )
+    found = gtsam.lago.initializeOrientations(problem)
+    theta = np.array([found.at(k)[0] for k in range(len(graph.keys))])
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+
+
+def _lago_applies(graph: PoseGraph) -> None:
+    """LAGO walks from pose 0 along consecutive poses, and does not return if a link is missing.
+
+    Raises:
+        RuntimeError: if one is.
+    """
+    steps = np.unique(graph.edges[graph.is_odometry].min(axis=1))
+    if len(steps) != len(graph.keys) - 1:
+        raise RuntimeError("not every pose has an edge to the next one")
+
+
+def translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
+    """(N, d) translations that fit given rotations best, a linear problem."""
+    n, d = len(graph.keys), graph.dimension
+    rows = translation_rows(graph, graph.precisions[1])
+    side_by_side = rotations.transpose(1, 0, 2).reshape(d, -1)
+    offsets = rows[:, n:] @ side_by_side.T
+    return _solved(rows[:, :n], graph.anchors, graph.anchor_poses().translations, -offsets)
+
+
+def _solved(
+    rows: csr_matrix, held: IntArray, values: FloatArray, right: FloatArray | None = None
+) -> FloatArray:
+    """Least-squares solution x (n, c) of rows · x = right, some entries of x held at values."""
+    count = rows.shape[1]
+    free = np.setdiff1d(np.arange(count), held)
+    x = np.zeros((count, values.shape[1]))
+    x[held] = values
+    if len(free) == 0:
+        return x
+    residual = (0.0 if right is None else right) - rows @ x
+    columns = rows.tocsc()[:, free]
+    x[free] = factorized(columns.T @ columns).solve(columns.T @ residual)
+    if not np.isfinite(x).all():
+        raise np.linalg.LinAlgError("the linear problem has no unique solution")
+    return x
+
+
+def along_tree(graph: PoseGraph) -> Poses:
+    """Poses composed along a spanning tree that prefers edges between consecutive poses."""
+    poses = Poses.identity(len(graph.keys), graph.dimension)
+    at_anchors = graph.anchor_poses()
+    poses.rotations[graph.anchors] = at_anchors.rotations
+    poses.translations[graph.anchors] = at_anchors.translations
+    forth, back, ends = graph.measured, graph.measured.inverse(), graph.edges
+    for child, parent, row in _tree(graph):
+        step = back if ends[row, 0] == child else forth
+        R = poses.rotations[parent]
+        poses.rotations[child] = R @ step.rotations[row]
+        poses.translations[child] = poses.translations[parent] + R @ step.translations[row]
+    return Poses(nearest_rotations(poses.rotations), poses.translations)
+
+
+def tree_edges(graph: PoseGraph) -> IntArray:
+    """Rows of the edges of that tree, which hold the graph together."""
+    return np.array([row for _, _, row in _tree(graph)], dtype=np.int64)
+
+
+def _tree(graph: PoseGraph) -> list[tuple[int, int, int]]:
+    """Triples (pose, the one before it in the tree, edge), each after that of the one before."""
+    n = len(graph.keys)
+    lengths = np.where(graph.is_odometry, 1.0, LOOP_CLOSURE_LENGTH)
+    ends, first = np.unique(np.sort(graph.edges, axis=1), axis=0, return_index=True)
+    links = coo_matrix((lengths[first], tuple(ends.T)), shape=(n, n))
+    tree = minimum_spanning_tree(links.tocsr())
+    edge_of = dict(zip(map(tuple, ends.tolist()), first.tolist(), strict=True))
+    found = []
+    for anchor in graph.anchors.tolist():
+        nodes, before = breadth_first_order(tree, anchor, directed=False)
+        pairs = [(node, int(before[node])) for node in nodes[1:].tolist()]
+        found += [(node, last, edge_of[min(node, last), max(node, last)]) for node, last in pairs]
+    return found

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A pose graph as GTSAM has it: factors, values, errors. The key of a pose is its row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+
+_LOSSES: dict[str, Callable[[float], Any]] = {
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
+    "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
+    "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
+    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create,
+}
+
+ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+"""Entries of a tangent in 3D: GTSAM's order from that of files. In 2D they are the same."""
+
+
+def edge_factors(
+    graph: PoseGraph, rows: Iterable[int], loss: str = "none", width: float = 1.0
+) -> list[gtsam.NonlinearFactor]:
+    """Between factors of some edges, under a robust loss of a given width on the whitened length.
+
+    Of `dcs`, width is the Φ of Agarwal et al. 2013, which is compared with the squared length.
+    """
+    between: Any = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
+    information = graph.angle_information
+    if graph.dimension == 3:
+        information = information[:, ROTATION_FIRST[:, None], ROTATION_FIRST]
+    estimator = None if loss == "none" else robust_estimator(loss, width)
+    gaussian, robust = gtsam.noiseModel.Gaussian.Information, gtsam.noiseModel.Robust.Create
+    poses, ends = native(graph.measured), graph.edges.tolist()
+    factors: list[gtsam.NonlinearFactor] = []
+    for row in rows:
+        noise: Any = gaussian(information[row], False)
+        if estimator is not None:
+            noise = robust(estimator, noise)
+        factors.append(between(*ends[row], poses[row], noise))
+    return factors
+
+
+def robust_estimator(loss: str, width: float) -> Any:
+    """The M-estimator of a robust loss."""
+    return _LOSSES[loss](width)
+
+
+def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.NonlinearFactor]:
+    """Priors that take the first pose of each connected part as the definition of its frame.
+
+    They cost nothing where edges agree with them, so that they move nothing but the gauge.
+
+    Args:
+        graph: the pose graph.
+        held: without any freedom, so that covariances are those relative to the first pose.
+    """
+    prior, k = (gtsam.PriorFactorPose2, 3) if graph.dimension == 2 else (gtsam.PriorFactorPose3, 6)
+    noise = (
+        gtsam.noiseModel.Constrained.All(k)
+        if held
+        else gtsam.noiseModel.Isotropic.Precision(k, typical_information(graph))
+    )
+    poses = native(graph.anchor_poses())
+    return [
+        prior(key, pose, noise) for key, pose in zip(graph.anchors.tolist(), poses, strict=True)
+    ]
+
+
+def typical_information(graph: PoseGraph) -> float:
+    """The median of the diagonals of the information, which conditions a gauge well."""
+    return float(np.median(np.diagonal(graph.angle_information, axis1=1, axis2=2)))
+
+
+def factor_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """Factors as a graph."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
+
+
+def values_of(poses: Poses) -> gtsam.Values:
+    """Poses as GTSAM's values."""
+    values = gtsam.Values()
+    for key, pose in enumerate(native(poses)):
+        values.insert(key, pose)
+    return values
+
+
+def poses_of(values: gtsam.Values, dimension: int) -> Poses:
+    """GTSAM's values, of keys 0 to N - 1, as poses."""
+    if dimension == 2:
+        x, y, theta = np.asarray(gtsam.utilities.extractPose2(values)).T
+        cos, sin = np.cos(theta), np.sin(theta)
+        rotations = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+        return Poses(rotations, np.column_stack([x, y]))
+    rows = np.asarray(gtsam.utilities.extractPose3(values))
+    return Poses(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
+
+
+def edge_chi2(factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values) -> FloatArray:
+    """(M,) squared whitened residuals of factors without a robust loss."""
+    return np.array([2.0 * factor.error(values) for factor in factors])
+
+
+def native(poses: Poses) -> list[Any]:
+    """Poses as a list of `Pose2` or `Pose3`."""
+    R, t = poses.rotations, poses.translations
+    if poses.dimension == 2:
+        angles = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+        return list(map(gtsam.Pose2, *t.T.tolist(), angles.tolist()))
+    return list(map(gtsam.Pose3, map(gtsam.Rot3, R), t))

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a run was in a map, frame by frame, and what ground truth says about it."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.errors import DataError
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.association import synchronize
+from slam_graph.evaluation.report import accuracy_report
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry.trajectory_alignment import Similarity, align_yaw, umeyama
+from slam_graph.maps.map_model import SlamMap
+from slam_graph.maps.pose_filter import MapPoseFilter
+
+POSE_WIDTH = 7
+LEAST_SHARED = 3
+"""So many keyframes of a map must have a truth for the map to be aligned by them."""
+
+
+class LocalizationLog:
+    """A growing table with a row for each frame of a run that had an estimate.
+
+    Args:
+        known: the map.
+
+    Attributes:
+        known: the map.
+        seconds: that localization took in all.
+        counts: of comparisons with the map.
+    """
+
+    def __init__(self, known: SlamMap) -> None:
+        self.known = known
+        self.seconds = 0.0
+        self.counts: dict[str, int] = {}
+        self._stamps_ns = array("q")
+        self._located = array("b")
+        self._sigmas = array("d")
+        self._poses = array("d")
+
+    def append(self, stamp_ns: int, estimate: MapPoseFilter | None, located: bool) -> None:
+        """Add a frame, with the estimate if there is one, and whether it is good enough."""
+        self._stamps_ns.append(stamp_ns)
+        self._located.append(located)
+        if estimate is None:
+            self._sigmas.append(np.nan)
+            self._poses.extend([np.nan] * POSE_WIDTH)
+            return
+        self._sigmas.append(estimate.position_sigma)
+        quaternion: Any = estimate.pose.rotation().toQuaternion()  # unknown to the stubs
+        self._poses.extend([*estimate.pose.translation(), *quaternion.coeffs()])
+
+    def count(self, **counts: int) -> None:
+        """Note how often things happened."""
+        self.counts |= counts
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """(N,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    @property
+    def located(self) -> NDArray[np.bool_]:
+        """(N,) whether the pose in the map was known then."""
+        return np.array(self._located, dtype=np.bool_)
+
+    def trajectory(self) -> Trajectory:
+        """Poses in the world of the map, of the frames where they are known."""
+        rows = np.array(self._poses, dtype=np.float64).reshape(-1, POSE_WIDTH)[self.located]
+        return Trajectory(self.stamps_ns[self.located], rows[:, :3], rows[:, 3:])
+
+    def csv_lines(self) -> Iterator[str]:
+        """A table of all frames."""
+        yield "stamp_ns,located,sigma_position_m\n"
+        for stamp_ns, located, sigma in zip(
+            self._stamps_ns, self._located, self._sigmas, strict=True
+        ):
+            text = "" if np.isnan(sigma) else f"{sigma:.6g}"
+            yield f"{stamp_ns},{located},{text}\n"
+
+    def table(self, start_ns: int, frames: int, truth: Trajectory | None) -> dict[str, Any]:
+        """What became of it, for `metrics.json`.
+
+        Args:
+            start_ns: when the run began.
+            frames: that were read.
+            truth: the true trajectory, as far as it is known.
+        """
+        stamps_ns = self.stamps_ns[self.located]
+        return {
+            "map": [recording.name for recording in self.known.recordings],
+            "frames": frames,
+            "located": len(stamps_ns),
+            "located_share": len(stamps_ns) / max(frames, 1),
+            "first_s": float(stamps_ns[0] - start_ns) * 1e-9 if len(stamps_ns) else None,
+            **self.counts,
+            "ms_per_frame": 1e3 * self.seconds / max(frames, 1),
+            "accuracy": self._accuracy(truth),
+        }
+
+    def _accuracy(self, truth: Trajectory | None) -> dict[str, Any] | None:
+        """Errors under each alignment; `map`: aligned by the map's own keyframes."""
+        located = self.trajectory()
+        if truth is None or len(located) == 0:
+            return None
+        by_map: dict[str, Any]
+        try:
+            similarity = map_alignment(truth, self.known)
+            by_map = accuracy_report(truth, similarity.apply(located))["none"]
+        except DataError as error:
+            by_map = {"unavailable": str(error)}
+        return {"map": by_map, **accuracy_report(truth, located)}
+
+
+def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
+    """The map from the world of a map to that of the truth, by keyframes whose truth is known.
+
+    Yaw and position are aligned, and the whole pose if z of the map is not up.
+
+    Raises:
+        DataError: if the truth does not cover the map's keyframes.
+    """
+    pairs = []
+    for keyframes in known.trajectories():
+        try:
+            pairs.append(synchronize(truth, keyframes))
+        except DataError:
+            continue
+    if sum(len(true) for true, _ in pairs) < LEAST_SHARED:
+        raise DataError(f"the truth covers fewer than {LEAST_SHARED} keyframes of the map")
+    true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
+    return align_yaw(true, own) if known.gravity_aligned else umeyama(true, own)
+
+
+def errors_in_map(
+    truth: Trajectory, located: Trajectory, similarity: Similarity
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of position (N,) in metres and orientation (N,) in degrees of poses in a map.
+
+    Args:
+        truth: the true trajectory.
+        located: poses in the map.
+        similarity: from the world of the map to that of the truth.
+
+    Raises:
+        DataError: if the two share no time.
+    """
+    moved = similarity.apply(located)
+    return ape(truth, moved, "trans_part").values, ape(truth, moved, "angle_deg").values

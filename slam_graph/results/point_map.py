@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The points of the world that a run has estimated, and their PLY file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.results.result_files import appearing
+
+POINT_COLOUR = (200, 200, 200)
+CAMERA_COLOUR = (220, 30, 30)
+
+RECENT = 10_000
+"""How many features are held where they can be replaced at once, before they are packed."""
+
+
+class PointMap:
+    """The last estimate of every feature; 32 bytes for each but the recent ones."""
+
+    def __init__(self) -> None:
+        self._recent: dict[int, tuple[float, float, float]] = {}
+        self._ids = np.zeros(0, np.int64)
+        self._points = np.zeros((0, 3))
+
+    def __len__(self) -> int:
+        self._pack()
+        return len(self._ids)
+
+    def update(self, ids: IntArray, points: FloatArray) -> None:
+        """Take over the positions (N, 3) in the world of features (N,)."""
+        self._recent.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
+        if len(self._recent) > RECENT:
+            self._pack()
+
+    def points(self) -> FloatArray:
+        """(N, 3) in the world, in metres."""
+        self._pack()
+        return self._points
+
+    def _pack(self) -> None:
+        """Move what is recent into the arrays, in the place of what was known of it before."""
+        ids = np.array(list(self._recent), dtype=np.int64)
+        points = np.array(list(self._recent.values()), dtype=np.float64).reshape(-1, 3)
+        kept = ~np.isin(self._ids, ids)
+        self._ids = np.concatenate([self._ids[kept], ids])
+        self._points = np.concatenate([self._points[kept], points])
+        self._recent = {}
+
+
+def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None) -> None:
+    """Write points (N, 3) as a binary PLY point cloud; points that are not finite are left out.
+
+    Args:
+        path: of the file.
+        points: of the world.
+        centres: (M, 3) of cameras, if they are to be shown: then points are grey and these red.
+    """
+    finite = points[np.isfinite(points).all(axis=1)]
+    fields: list[tuple[str, str, int]] = [("place", "<f8", 3)]
+    lines = [f"property double {axis}" for axis in "xyz"]
+    if centres is not None:
+        fields.append(("colour", "u1", 3))
+        lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    places = finite if centres is None else np.concatenate([finite, centres])
+    vertices = np.empty(len(places), fields)
+    vertices["place"] = places
+    if centres is not None:
+        vertices["colour"][: len(finite)] = POINT_COLOUR
+        vertices["colour"][len(finite) :] = CAMERA_COLOUR
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *lines,
+        "end_header",
+    ]
+    with appearing(path) as partial:
+        partial.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())

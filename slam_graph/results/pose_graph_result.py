@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All that an optimisation of a pose graph found out, and its files."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.config import dump_yaml
+from slam_graph.geometry.trajectory import tum_lines
+from slam_graph.pose_graph.certificate import Certificate
+from slam_graph.pose_graph.graph import Poses
+from slam_graph.pose_graph.graph_cost import chi2_table
+from slam_graph.pose_graph.graph_files import g2o_lines
+from slam_graph.pose_graph.graph_initialization import along_tree
+from slam_graph.pose_graph.gtsam_graph import edge_chi2, edge_factors, values_of
+from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy, PoseGraphSolution
+from slam_graph.results.metrics import finite, versions
+from slam_graph.results.result_files import appearing, write_text
+
+SCHEMA_VERSION = 1
+"""Counts up whenever a key changes its name or meaning."""
+
+Table = dict[str, Any]
+
+
+@dataclass(eq=False)
+class PoseGraphResult:
+    """What an optimisation found out.
+
+    Attributes:
+        policy: how it was done.
+        solution: the estimates.
+        certificate: whether they are the global optimum, if that was asked for.
+        covariances: (N, k, k) of all poses, if they were asked for.
+        seconds: wall time of each part.
+        warnings: counted faults and repairs.
+    """
+
+    policy: PoseGraphPolicy
+    solution: PoseGraphSolution
+    certificate: Certificate | None = None
+    covariances: FloatArray | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    warnings: Counter[str] = field(default_factory=Counter)
+
+    @cached_property
+    def before(self) -> Poses:
+        """The poses as they were: those of the file, or odometry."""
+        graph = self.solution.graph
+        return along_tree(graph) if graph.estimates is None else graph.estimates
+
+    @cached_property
+    def metrics(self) -> Table:
+        """The content of `metrics.json`; JSON can hold every value of it."""
+        solution, graph = self.solution, self.solution.graph
+        chi2 = {
+            "before": chi2_table(graph, self.before),
+            "start": chi2_table(graph, solution.start, solution.weights),
+            "after": chi2_table(graph, solution.poses, solution.weights),
+        }
+        table: Table = finite(
+            {
+                "schema_version": SCHEMA_VERSION,
+                "graph": {
+                    "name": graph.name,
+                    "dimension": graph.dimension,
+                    "poses": len(graph.keys),
+                    "edges": len(graph.edges),
+                    "loop_closures": int(np.count_nonzero(~graph.is_odometry)),
+                    "connected_parts": len(graph.anchors),
+                },
+                "method": self.policy.gauss_newton.method,
+                "robust": self.policy.cost.robust,
+                "cost": solution.minimum.cost,
+                "steps": solution.minimum.steps,
+                "converged": solution.minimum.converged,
+                "rejected_edges": int(np.count_nonzero(solution.weights < 0.5)),
+                "chi2": chi2,
+                "certificate": self._certificate(),
+                "timing_s": self.seconds,
+                "warnings": dict(sorted(self.warnings.items())),
+                "versions": versions(),
+            }
+        )
+        return table
+
+    def _certificate(self) -> Table | None:
+        if self.certificate is None:
+            return None
+        found = self.certificate
+        table = {name: getattr(found, name) for name in found.__slots__ if name != "poses"}
+        return {**table, "gap": found.gap}
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write all files into a folder, each whole or not at all.
+
+        Returns:
+            The files.
+        """
+        solution, graph = self.solution, self.solution.graph
+        texts = {
+            "optimized.g2o": g2o_lines(graph, solution.poses),
+            "trajectory.tum": tum_lines(graph.trajectory(solution.poses)),
+            "edges.csv": self._edge_lines(),
+            "config.yaml": [dump_yaml(self.policy)],
+            "metrics.json": [json.dumps(self.metrics, indent=2, allow_nan=False), "\n"],
+        }
+        if self.covariances is not None:
+            texts["covariances.csv"] = self._covariance_lines(self.covariances)
+        if self.certificate is not None:
+            texts["certified.g2o"] = g2o_lines(graph, self.certificate.poses)
+        for name, lines in texts.items():
+            write_text(folder / name, lines)
+        self._draw(folder / "pose_graph.png")
+        return [folder / name for name in (*texts, "pose_graph.png")]
+
+    def _edge_lines(self) -> Iterator[str]:
+        """Edges as CSV: ids, χ² in GTSAM's convention, weight."""
+        graph, solution = self.solution.graph, self.solution
+        plain = edge_factors(graph, range(len(graph.edges)))
+        squared = edge_chi2(plain, values_of(solution.poses))
+        yield "from,to,chi2,weight\n"
+        rows = zip(
+            graph.keys[graph.edges].tolist(),
+            squared.tolist(),
+            solution.weights.tolist(),
+            strict=True,
+        )
+        for (i, j), value, weight in rows:
+            yield f"{i},{j},{value:.9g},{weight:.6g}\n"
+
+    def _covariance_lines(self, covariances: FloatArray) -> Iterator[str]:
+        """Covariances as CSV: id, and the upper triangle by rows."""
+        names = (
+            ("x", "y", "theta") if covariances.shape[1] == 3 else ("x", "y", "z", "rx", "ry", "rz")
+        )
+        above = np.triu_indices(len(names))
+        yield (
+            ",".join(["id", *(f"{names[i]}_{names[j]}" for i, j in zip(*above, strict=True))])
+            + "\n"
+        )
+        entries = covariances[:, *above].tolist()
+        for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
+            yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
+
+    def _draw(self, path: Path) -> None:
+        from slam_graph.visualization.pose_graph_plot import plot_pose_graph
+
+        graph, weights = self.solution.graph, self.solution.weights
+        title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"
+        with appearing(path) as partial:
+            plot_pose_graph(
+                partial,
+                title,
+                self.before.translations,
+                self.solution.poses.translations,
+                graph.edges,
+                weights < 0.5,
+            )

@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""How long each stage of each frame took.
+
+The size of each frame's problem, how many steps it took, and what they did to the cost.
+
+How far the images of each frame were from what was predicted of them.
+
+How an estimated calibration came about: its parameters at every frame.
+"""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.gating import Innovations
+from slam_graph.sensors.calibration_estimate import CalibrationEstimate
+
+
+class StepLog:
+    """A growing table with a row for each frame in which steps were taken."""
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._steps = array("l")
+        self._columns = array("l")
+        self._costs = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def append(self, stamp_ns: int, costs: Sequence[float], columns: int) -> None:
+        """Add a frame.
+
+        Args:
+            stamp_ns: its time.
+            costs: before the first step and after each; at least one.
+            columns: dimension of the state.
+        """
+        self._columns.append(columns)
+        self._stamps_ns.append(stamp_ns)
+        self._steps.append(len(costs) - 1)
+        self._costs.extend((costs[0], costs[-1]))
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(N,) numbers of steps that were taken."""
+        return np.array(self._steps, dtype=np.int64)
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        """(N,) dimensions of the state while the steps were taken."""
+        return np.array(self._columns, dtype=np.int64)
+
+    @property
+    def costs(self) -> NDArray[np.float64]:
+        """(N, 2) cost before the first step and after the last."""
+        return np.array(self._costs, dtype=np.float64).reshape(-1, 2)
+
+
+COLUMNS = tuple(field.name for field in fields(Innovations))
+
+
+class InnovationLog:
+    """A growing table with a row for each frame of which something was predicted."""
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._rows = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def append(self, stamp_ns: int, innovations: Innovations) -> None:
+        """Add a frame, unless nothing was tested in it."""
+        if innovations.tested:
+            self._stamps_ns.append(stamp_ns)
+            self._rows.extend(map(float, astuple(innovations)))
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    def columns(self) -> dict[str, FloatArray]:
+        """(N,) values of each attribute of `Innovations`, by its name."""
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(COLUMNS))
+        return dict(zip(COLUMNS, rows.T, strict=True))
+
+
+class CalibrationLog:
+    """A growing table with a row for each frame; empty where nothing is calibrated.
+
+    Attributes:
+        latest: the last estimate, None before the first.
+    """
+
+    def __init__(self) -> None:
+        self.latest: CalibrationEstimate | None = None
+        self._rows: list[tuple[int, list[float]]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def append(self, estimate: CalibrationEstimate) -> None:
+        """Add the estimate at the next frame."""
+        self.latest = estimate
+        parameters = estimate.parameters()
+        values = [parameter.value for parameter in parameters]
+        self._rows.append((estimate.stamp_ns, values + [p.sigma for p in parameters]))
+
+    def table(self) -> dict[str, dict[str, Any]] | None:
+        """The last estimate: start, value and standard deviation of each parameter by its name."""
+        if self.latest is None:
+            return None
+        return {
+            parameter.name: {
+                "start": parameter.start,
+                "value": parameter.value,
+                "sigma": parameter.sigma,
+            }
+            for parameter in self.latest.parameters()
+        }
+
+    def csv_lines(self) -> Iterator[str]:
+        """The table as CSV: values of all parameters, then their standard deviations."""
+        if self.latest is None:
+            return
+        names = [parameter.name for parameter in self.latest.parameters()]
+        yield ",".join(["stamp_ns", *names, *(f"sigma_{name}" for name in names)]) + "\n"
+        for stamp_ns, row in self._rows:
+            yield ",".join([str(stamp_ns), *(f"{value:.9g}" for value in row)]) + "\n"
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Milliseconds a frame of one stage, over the frames in which it ran.
+
+    Attributes:
+        mean_ms: arithmetic mean.
+        median_ms: middle value.
+        p95_ms: 95th percentile.
+        frames: number of frames in which the stage ran.
+    """
+
+    mean_ms: float
+    median_ms: float
+    p95_ms: float
+    frames: int
+
+
+class TimingLog:
+    """A growing table: one row a frame, one column a stage, in milliseconds.
+
+    Stages may appear at any frame; a stage that did not run in a frame is NaN there.
+    """
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._columns: dict[str, array[float]] = {}
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def append(self, stamp_ns: int, milliseconds: Mapping[str, float]) -> None:
+        """Add the times of the next frame."""
+        for stage in milliseconds.keys() - self._columns.keys():
+            self._columns[stage] = array("d", [np.nan] * len(self))
+        self._stamps_ns.append(stamp_ns)
+        for stage, column in self._columns.items():
+            column.append(milliseconds.get(stage, np.nan))
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    def column(self, stage: str) -> NDArray[np.float64]:
+        """(N,) milliseconds of a stage."""
+        return np.array(self._columns[stage])
+
+    def stages(self) -> list[str]:
+        """Names of all stages, in the order of the alphabet: `a.b` is a part of `a`."""
+        return sorted(self._columns)
+
+    def summary(self) -> dict[str, StageTime]:
+        """Statistics of each stage."""
+        table = {}
+        for stage in self.stages():
+            values = self.column(stage)
+            values = values[np.isfinite(values)]
+            if len(values):
+                p95 = float(np.percentile(values, 95))
+                table[stage] = StageTime(
+                    float(values.mean()), float(np.median(values)), p95, len(values)
+                )
+        return table
+
+    def csv_lines(self) -> Iterator[str]:
+        """The table as CSV, empty where a stage did not run."""
+        stages = self.stages()
+        yield ",".join(["stamp_ns", *(f"{stage}_ms" for stage in stages)]) + "\n"
+        columns = [self._columns[stage] for stage in stages]
+        for index, stamp_ns in enumerate(self._stamps_ns):
+            cells = (column[index] for column in columns)
+            text = ("" if np.isnan(cell) else f"{cell:.4f}" for cell in cells)
+            yield ",".join([str(stamp_ns), *text]) + "\n"
+
+
+class Stopwatch:
+    """Times the stages of one frame.
+
+    Attributes:
+        milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
+    """
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {"total": 0.0}
+        self._since = time.perf_counter()
+
+    def restart(self) -> None:
+        """Leave out the time since the last stage ended."""
+        self._since = time.perf_counter()
+
+    def lap(self, stage: str, parts: Mapping[str, float] | None = None) -> None:
+        """End a stage that began when the stage before it ended.
+
+        Args:
+            stage: its name.
+            parts: milliseconds of parts of it that were timed elsewhere.
+        """
+        now = time.perf_counter()
+        elapsed_ms = 1e3 * (now - self._since)
+        self.milliseconds[stage] = elapsed_ms
+        self.milliseconds["total"] += elapsed_ms
+        self.milliseconds |= {f"{stage}.{part}": value for part, value in (parts or {}).items()}
+        self._since = now
+
+
+def milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:
+    """The stages among what a front end counts: the keys that end in `_ms`, without that end."""
+    return {
+        key.removesuffix("_ms"): value for key, value in frame_stats.items() if key.endswith("_ms")
+    }

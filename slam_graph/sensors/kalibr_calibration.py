@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Kalibr's YAML, in and out: ``camchain-imucam`` files with the cameras, and the IMU's noise.
+
+Kalibr writes `T_cam_imu`, the pose of the IMU in the camera frame, which is the inverse of our
+`body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The IMU's
+noise stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the
+same file under ``imu0``, so that one file describes the rig.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import yaml
+
+from slam_graph.errors import DataError
+from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
+from slam_graph.sensors.euroc_calibration import (
+    camera_entry,
+    has_rolling_shutter,
+    read_camera,
+    read_imu_noise,
+)
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+IMU_KEY = "imu0"
+
+
+def read_kalibr(
+    path: Path,
+    imu_path: Path | None = None,
+    fallback: ImuNoise | None = None,
+    needs_imu: bool = True,
+) -> Rig:
+    """Read a rig from a Kalibr camera chain.
+
+    Args:
+        path: the ``camchain-imucam`` file.
+        imu_path: Kalibr's ``imu.yaml``. Without it the noise is taken from the key ``imu0`` of the
+            camera chain, else from a file ``imu.yaml`` beside it, else from `fallback`.
+        fallback: noise to take if no file has any; default that of EuRoC's IMU.
+        needs_imu: whether the cameras must be calibrated to the IMU; otherwise a chain that does
+            not say where it is has the body frame of its first camera.
+
+    Raises:
+        DataError: if a file or key is missing, or a value makes no sense; names file and line.
+    """
+    chain = read_yaml(path)
+    return Rig(chain_cameras(chain, needs_imu), _read_imu(path, chain, imu_path, fallback))
+
+
+def chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
+    """The cameras of a camera chain (see `read_kalibr`).
+
+    Raises:
+        DataError: if a key is missing, or a value makes no sense.
+    """
+    entries = {
+        int(found[1]): value
+        for name, value in chain.items()
+        if (found := re.fullmatch(r"cam(\d+)", name))
+    }
+    if not entries:
+        raise DataError(
+            f"{chain.path}: no camera (key 'cam0') in this file; is it a Kalibr camera chain?"
+        )
+    cameras: list[RigCamera] = []
+    for index in sorted(entries):
+        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None, needs_imu))
+    return tuple(cameras)
+
+
+def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
+    body_T_camera = _body_T_camera(entry, previous, needs_imu)
+    shift = entry.get("timeshift_cam_imu")
+    name = entry.get("name")
+    return RigCamera(
+        read_camera(entry),
+        body_T_camera,
+        0.0 if shift is None else shift.number(),
+        entry.key if name is None else name.text(),
+        has_rolling_shutter(entry),
+    )
+
+
+def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
+    direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
+    if direct is not None:
+        return direct.pose().inverse()
+    if link is not None and previous is not None:
+        return previous.body_T_camera.compose(link.pose().inverse())
+    if previous is None and not needs_imu:
+        return gtsam.Pose3()
+    raise DataError(
+        f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
+        "from calibrating cameras and IMU together"
+    )
+
+
+def _read_imu(
+    path: Path, chain: YamlValue, imu_path: Path | None, fallback: ImuNoise | None
+) -> ImuNoise:
+    beside = path.parent / "imu.yaml"
+    entry = chain.get(IMU_KEY) if imu_path is None else None
+    if entry is None and imu_path is None and beside.is_file():
+        imu_path = beside
+    if imu_path is not None:
+        whole = read_yaml(imu_path)
+        entry = whole.get(IMU_KEY) or whole
+    if entry is not None:
+        return read_imu_noise(entry)
+    return fallback if fallback is not None else ImuNoise()
+
+
+def write_kalibr(rig: Rig, path: Path) -> None:
+    """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    text = "# Kalibr camera chain: T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu\n"
+    beside.write_text(
+        text + yaml.safe_dump(kalibr_table(rig), sort_keys=False, default_flow_style=None)
+    )
+    beside.replace(path)
+
+
+def kalibr_table(rig: Rig) -> dict[str, Any]:
+    """The content of a Kalibr file with cameras and IMU."""
+    content: dict[str, Any] = {
+        f"cam{index}": _camera_entry(mounted) for index, mounted in enumerate(rig.cameras)
+    }
+    content[IMU_KEY] = {
+        "gyroscope_noise_density": float(rig.imu.gyro_noise_density),
+        "gyroscope_random_walk": float(rig.imu.gyro_random_walk),
+        "accelerometer_noise_density": float(rig.imu.accel_noise_density),
+        "accelerometer_random_walk": float(rig.imu.accel_random_walk),
+        "update_rate": float(rig.imu.rate_hz),
+    }
+    return content
+
+
+def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
+    camera = mounted.camera
+    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
+    return shutter | {
+        "name": mounted.name,
+        "camera_model": model,
+        "intrinsics": intrinsics,
+        "distortion_model": distortion,
+        "distortion_coeffs": coefficients,
+        "resolution": [int(camera.width), int(camera.height)],
+        "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist(),
+        "timeshift_cam_imu": float(mounted.time_offset_s),
+    }

@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A simulation as a sequence: everything that runs on a recording runs on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import IntArray
+from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.rig import Rig
+from slam_graph.simulation.imu_simulation import ImuSource
+from slam_graph.simulation.landmarks import Landmarks
+from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.moving_object import MovingBoard
+from slam_graph.simulation.rendering import Renderer
+from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
+from slam_graph.simulation.textures import paint
+from slam_graph.simulation.track_simulation import TrackSimulator
+from slam_graph.simulation.world import World
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """All that is known of a simulated flight before anything is measured.
+
+    Attributes:
+        rig: cameras and noise of the IMU.
+        motion: of the platform.
+        imu: the IMU stream with its true biases.
+        world: the walls.
+        exposures_ns: (N,) times of the frames on the clock of the IMU.
+    """
+
+    rig: Rig
+    motion: Motion
+    imu: ImuSource
+    world: World
+    exposures_ns: IntArray
+
+
+class SimulatedSequence(RecordedSequence):
+    """What a rig measures on a flight that is known exactly; nothing is stored, all is streamed.
+
+    Where the rig has a time offset, frames are stamped by the clock of its first camera.
+
+    Attributes:
+        config: all settings.
+        flight: what is true.
+    """
+
+    format: ClassVar[str] = "simulation"
+
+    def __init__(
+        self,
+        name: str,
+        config: SimulationConfig,
+        flight: Flight,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        super().__init__(name, flight.rig, None, diagnostics)
+        self.config = config
+        self.flight = flight
+        self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)
+
+    @property
+    def has_groundtruth(self) -> bool:
+        """It always has one."""
+        return True
+
+    def measure(self) -> Extent:
+        """How much will be simulated."""
+        stamps = self.flight.exposures_ns - self._offset_ns
+        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self.flight.imu.samples)
+
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The IMU stream from `after_ns` on."""
+        return self.flight.imu.blocks(after_ns)
+
+    def groundtruth(self) -> Trajectory:
+        """The truth at the times of the frames, on the clock of the IMU."""
+        stamps, motion = self.flight.exposures_ns, self.flight.motion
+        gyro_biases, accel_biases = self.flight.imu.biases(stamps)
+        return Trajectory(
+            stamps,
+            motion.positions(stamps),
+            motion.rotations(stamps).as_quat(),
+            motion.velocities(stamps),
+            gyro_biases,
+            accel_biases,
+        )
+
+    def initial_state(self) -> NavState:
+        """The state at the first frame: the truth, or with an error as its covariance says."""
+        start, first = self.config.known_start, self.flight.exposures_ns[:1]
+        sigmas = (
+            start.rotation_rad,
+            start.position_m,
+            start.velocity,
+            start.accel_bias,
+            start.gyro_bias,
+        )
+        spread, error = np.repeat(sigmas, 3), np.zeros(15)
+        if start.error:
+            rng = np.random.default_rng(random_stream(self.config.seed, "start"))
+            error = rng.normal(size=15) * spread
+        motion = self.flight.motion
+        R = gtsam.Rot3(motion.rotations(first).as_matrix()[0])
+        gyro_biases, accel_biases = self.flight.imu.biases(first)
+        return NavState(
+            int(first[0]),
+            gtsam.Pose3(R, motion.positions(first)[0]).retract(error[:6]),
+            motion.velocities(first)[0] + error[6:9],
+            gyro_biases[0] + error[12:],
+            accel_biases[0] + error[9:12],
+            np.diag(spread**2),
+        )
+
+
+class SimulatedTracks(SimulatedSequence):
+    """Feature tracks of landmarks."""
+
+    content: ClassVar[Literal["images", "tracks"]] = "tracks"
+
+    def __init__(
+        self,
+        name: str,
+        config: SimulationConfig,
+        flight: Flight,
+        landmarks: Landmarks,
+        diagnostics: Diagnostics | None = None,
+    ) -> None:
+        super().__init__(name, config, flight, diagnostics)
+        self.landmarks = landmarks
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Frames of features; those before `start_ns` are simulated too, and left out."""
+        flight, config = self.flight, self.config
+        simulator = TrackSimulator(
+            flight.rig, flight.world, self.landmarks, config.tracks, config.seed
+        )
+        stamps = flight.exposures_ns - self._offset_ns
+        until = flight.exposures_ns[within(stamps, None, end_ns)]
+        for frame in simulator.frames(flight.motion, until, self._offset_ns):
+            if start_ns is None or frame.stamp_ns >= start_ns:
+                yield frame
+
+
+class SimulatedImages(SimulatedSequence):
+    """Rendered images of a textured world."""
+
+    content: ClassVar[Literal["images", "tracks"]] = "images"
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Takes the images; the walls are painted when it is first asked for."""
+        flight, config = self.flight, self.config
+        board = self.board
+        sizes = [panel.size for panel in flight.world.panels]
+        texels_m = [config.images.texel_m] * len(sizes)
+        if board is not None:
+            sizes.append(board.size)
+            texels_m.append(board.config.texel_m)
+        atlas = paint(sizes, texels_m, config.seed)
+        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board)
+
+    @cached_property
+    def board(self) -> MovingBoard | None:
+        """What moves before the cameras, if anything."""
+        flight, config = self.flight, self.config.moving_object
+        if config is None:
+            return None
+        mounting = flight.rig.cameras[0].body_T_camera.matrix()
+        began_ns = int(flight.exposures_ns[0])
+        return MovingBoard.ahead_of(config, flight.motion, mounting, began_ns, self.config.seed)
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+        """Frames of images."""
+        exposures = self.flight.exposures_ns
+        wanted = exposures[within(exposures - self._offset_ns, start_ns, end_ns)]
+        for exposure_ns in wanted.tolist():
+            yield self.renderer.frame(self.flight.motion, exposure_ns, self._offset_ns)

@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated front end: landmarks followed from frame to frame by the cameras of a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
+from slam_graph.sensors.rig import Rig
+from slam_graph.simulation.appearance import Appearance
+from slam_graph.simulation.landmarks import Landmarks
+from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.simulation_config import TrackConfig, random_stream
+from slam_graph.simulation.views import View, camera_groups
+from slam_graph.simulation.world import World
+
+GRID = (8, 5)
+"""Cells of the image, across and down, that new features are spread over."""
+
+POINTS_PER_LOOK = 2048
+"""Landmarks that are searched for new features at a time."""
+
+POSES_AT_ONCE = 256
+
+
+@dataclass(eq=False)
+class _Tracks:
+    """The tracks that go on, of one group of cameras.
+
+    Attributes:
+        landmarks: (T,) their landmarks.
+        ids: (T,) of the features.
+        ages: (T,) in frames.
+        pixels: (T, 2) where the leading camera sees them, without noise.
+    """
+
+    landmarks: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    ages: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def keep(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> None:
+        """Only some of them go on."""
+        for name in ("landmarks", "ids", "ages", "pixels"):
+            setattr(self, name, getattr(self, name)[chosen])
+
+    def add(self, landmarks: IntArray, ids: IntArray, pixels: FloatArray) -> None:
+        """New ones begin."""
+        self.landmarks = np.concatenate([self.landmarks, landmarks])
+        self.ids = np.concatenate([self.ids, ids])
+        self.ages = np.concatenate([self.ages, np.ones(len(ids), np.int64)])
+        self.pixels = np.concatenate([self.pixels, pixels])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Where the platform is while a frame is taken."""
+
+    stamp_ns: int
+    rotation: FloatArray
+    position: FloatArray
+
+
+class TrackSimulator:
+    """Follows landmarks; memory does not grow with time.
+
+    Cameras that see much the same (a stereo pair) form a group: its first camera leads, finds
+    features and follows them while it sees them; the others observe those of them that they see.
+
+    Args:
+        rig: the cameras.
+        world: hides landmarks.
+        landmarks: what is seen.
+        config: number of features, noise, losses, outliers.
+        seed: of the simulation.
+    """
+
+    def __init__(
+        self, rig: Rig, world: World, landmarks: Landmarks, config: TrackConfig, seed: int
+    ) -> None:
+        self.views = [View.of(mounted, config) for mounted in rig.cameras]
+        self.groups = camera_groups(rig, self.views)
+        self._world = world
+        self._landmarks = landmarks
+        self._config = config
+        self._rng = np.random.default_rng(random_stream(seed, "tracks"))
+        self._appearance = Appearance(len(landmarks), config, seed) if config.descriptors else None
+        self._tracks = [_Tracks() for _ in self.groups]
+        self._next_id = 0
+        self._next_look = 0
+
+    def frames(
+        self, motion: Motion, exposures_ns: IntArray, offset_ns: int = 0
+    ) -> Iterator[FeatureFrame]:
+        """Frames in the order of time; to be gone through once.
+
+        Args:
+            motion: of the platform.
+            exposures_ns: (N,) times of exposure on the clock of the IMU.
+            offset_ns: what the clock of the IMU shows more than that of the cameras.
+        """
+        for first in range(0, len(exposures_ns), POSES_AT_ONCE):
+            stamps = exposures_ns[first : first + POSES_AT_ONCE]
+            rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
+            for stamp_ns, R, p in zip(stamps.tolist(), rotations, positions, strict=True):
+                seen = self._observe(_Pose(stamp_ns, R, p))
+                yield FeatureFrame(stamp_ns - offset_ns, tuple(seen))
+
+    def _observe(self, pose: _Pose) -> list[FeatureObservations]:
+        """One frame: tracks go on or end, new ones begin, and every camera observes them."""
+        seen = [FeatureObservations.empty()] * len(self.views)
+        for group, tracks in zip(self.groups, self._tracks, strict=True):
+            self._follow(tracks, self.views[group[0]], pose)
+            self._begin(tracks, self.views[group[0]], pose)
+            leading = self._measure(self.views[group[0]].camera, tracks.ids, tracks.pixels)
+            if self._appearance is not None:
+                leading = replace(leading, descriptors=self._appearance.of(tracks.landmarks))
+            seen[group[0]] = leading
+            for camera in group[1:]:
+                index, pixels = self._see(self.views[camera], pose, tracks.landmarks)
+                seen[camera] = self._measure(self.views[camera].camera, tracks.ids[index], pixels)
+        return seen
+
+    def _see(self, view: View, pose: _Pose, landmarks: IntArray) -> tuple[IntArray, FloatArray]:
+        """Which of some landmarks a camera sees (indices), and where."""
+        points, normals = self._landmarks.at(landmarks, pose.stamp_ns)
+        return view.see(pose.rotation, pose.position, points, normals, self._world)
+
+    def _follow(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
+        """Keep the tracks that are still in sight and not lost."""
+        config = self._config
+        index, pixels = self._see(leader, pose, tracks.landmarks)
+        held = self._rng.random(len(index)) >= config.loss
+        if config.max_length is not None:
+            held &= tracks.ages[index] < config.max_length
+        tracks.keep(index[held])
+        tracks.pixels = pixels[held]
+        tracks.ages += 1
+
+    def _begin(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
+        """Fill up with landmarks that are not followed, where the image is emptiest."""
+        total, looked = len(self._landmarks), 0
+        taken = [t.landmarks for t in self._tracks]
+        while looked < total and len(tracks.ids) < self._config.features:
+            count = min(POINTS_PER_LOOK, total - looked)
+            block = (self._next_look + np.arange(count)) % total
+            self._next_look, looked = (self._next_look + count) % total, looked + count
+            block = block[~np.isin(block, np.concatenate(taken))]
+            index, pixels = self._see(leader, pose, block)
+            chosen = self._spread(leader.camera, tracks.pixels, pixels)
+            landmarks = block[index[chosen]]
+            tracks.add(landmarks, self._new_ids(landmarks), pixels[chosen])
+
+    def _new_ids(self, landmarks: IntArray) -> IntArray:
+        if self._config.keep_ids:
+            return landmarks
+        self._next_id += len(landmarks)
+        return np.arange(self._next_id - len(landmarks), self._next_id)
+
+    def _spread(
+        self, camera: Camera, present: FloatArray, candidates: FloatArray
+    ) -> NDArray[np.intp]:
+        """Which candidates (indices) to take: those first whose cells have the fewest features."""
+        wanted = self._config.features - len(present)
+        if len(candidates) == 0:
+            return np.zeros(0, np.intp)
+        order = self._rng.permutation(len(candidates))
+        cells = _cells(camera, candidates[order])
+        occupied = np.bincount(_cells(camera, present), minlength=GRID[0] * GRID[1])
+        by_cell = np.argsort(cells, kind="stable")
+        first = np.searchsorted(cells[by_cell], cells[by_cell])
+        rank = np.empty(len(order), np.int64)
+        rank[by_cell] = np.arange(len(order)) - first
+        best = np.argsort(rank + occupied[cells], kind="stable")[:wanted]
+        return order[best]
+
+    def _measure(self, camera: Camera, ids: IntArray, exact: FloatArray) -> FeatureObservations:
+        """Observations with noise and wrong matches."""
+        pixels, config = exact, self._config
+        if config.outliers > 0 and len(ids) > 1:
+            wrong = np.flatnonzero(self._rng.random(len(ids)) < config.outliers)
+            shift = self._rng.integers(1, len(ids), len(wrong))
+            pixels = exact.copy()
+            pixels[wrong] = exact[(wrong + shift) % len(ids)]
+        if config.pixel_sigma > 0:
+            pixels = pixels + self._rng.normal(0.0, config.pixel_sigma, pixels.shape)
+        return FeatureObservations(ids.copy(), pixels.copy(), camera.undistort(pixels))
+
+
+def _cells(camera: Camera, pixels: FloatArray) -> IntArray:
+    """Numbers of the cells (N,) of pixels (N, 2)."""
+    scale = np.array([GRID[0] / camera.width, GRID[1] / camera.height])
+    cells = (pixels * scale).astype(np.int64)
+    return np.asarray(cells[:, 1] * GRID[0] + cells[:, 0])

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""States between, before and after those that are known, by the IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import IntArray
+from slam_graph.backend.cost.imu_factor import ImuBuffer, predict, preintegrate
+from slam_graph.geometry.interpolation import interpolate
+from slam_graph.geometry.trajectory import NavState, Trajectory
+
+MAX_HOLE_S = 1.0
+"""Between two causal states that are farther apart the IMU leads on."""
+
+
+def state_at(trajectory: Trajectory, row: int) -> NavState:
+    """One row of a trajectory with velocities and biases."""
+    assert trajectory.velocities is not None
+    assert trajectory.gyro_biases is not None
+    assert trajectory.accel_biases is not None
+    return NavState(
+        int(trajectory.stamps_ns[row]),
+        trajectory.pose(row),
+        trajectory.velocities[row],
+        trajectory.gyro_biases[row],
+        trajectory.accel_biases[row],
+    )
+
+
+def states_at(
+    known: Trajectory,
+    stamps_ns: IntArray,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> list[NavState]:
+    """States at some times: known ones interpolated, others from the nearest by the IMU.
+
+    Args:
+        known: causal estimate.
+        stamps_ns: (K,) ascending, at least one of them inside of `known`.
+        imu: samples over all of them.
+        params: gravity.
+    """
+    inside, valid = interpolate(known, stamps_ns, MAX_HOLE_S)
+    rows = np.cumsum(valid) - 1
+    states: dict[int, NavState] = {
+        k: state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
+    }
+    count, first = len(stamps_ns), int(np.argmax(valid))
+    for k in range(first - 1, -1, -1):
+        states[k] = predict_back(states[k + 1], int(stamps_ns[k]), imu, params)
+    for k in range(first + 1, count):
+        if k not in states:
+            states[k] = predict_on(states[k - 1], int(stamps_ns[k]), imu, params)
+    return [states[k] for k in range(count)]
+
+
+def predict_on(
+    state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
+) -> NavState:
+    """The state at a later time."""
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    pim = preintegrate(imu.between(state.stamp_ns, stamp_ns), bias, params)
+    return predict(state, pim, stamp_ns)
+
+
+def predict_back(
+    state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
+) -> NavState:
+    """The state at an earlier time: the dynamics solved for their beginning.
+
+    With ΔR, Δv and Δp preintegrated over T from there to here (Forster et al. 2017, eq. 33),
+    R = R' ΔRᵀ, v = v' - g T - R Δv, p = p' - v T - ½ g T² - R Δp.
+    """
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    pim = preintegrate(imu.between(stamp_ns, state.stamp_ns), bias, params)
+    seconds, gravity = pim.deltaTij(), params.n_gravity
+    rotation = state.world_T_body.rotation().compose(pim.deltaRij().inverse())
+    velocity = state.velocity - gravity * seconds - rotation.rotate(pim.deltaVij())
+    position = (
+        state.world_T_body.translation()
+        - velocity * seconds
+        - 0.5 * gravity * seconds**2
+        - rotation.rotate(pim.deltaPij())
+    )
+    pose = gtsam.Pose3(rotation, position)
+    return NavState(stamp_ns, pose, velocity, state.gyro_bias, state.accel_bias)
+
+
+def fill_in(
+    keyframes: list[NavState],
+    stamps_ns: IntArray,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> list[NavState]:
+    """States at all frames, from those of the keyframes.
+
+    From each keyframe the IMU leads on to the next one. What is missing there is laid on the way
+    in proportion to the time, so that both ends are met.
+
+    Args:
+        keyframes: at least one state.
+        stamps_ns: (N,) ascending times, those of the keyframes among them.
+        imu: samples over all of them.
+        params: gravity.
+    """
+    states: list[NavState] = []
+    at = np.searchsorted(stamps_ns, [state.stamp_ns for state in keyframes])
+    for k, (start, end) in enumerate(pairwise(keyframes)):
+        states.append(start)
+        inside = stamps_ns[at[k] + 1 : at[k + 1]].tolist()
+        if not inside:
+            continue
+        way = [start]
+        for stamp_ns in [*inside, end.stamp_ns]:
+            way.append(predict_on(way[-1], stamp_ns, imu, params))
+        missing = gtsam.Pose3.Logmap(way[-1].world_T_body.between(end.world_T_body))
+        faster = end.velocity - way[-1].velocity
+        for state in way[1:-1]:
+            part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
+            pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * missing))
+            velocity = state.velocity + part * faster
+            states.append(replace(state, world_T_body=pose, velocity=velocity))
+    return [*states, keyframes[-1]]
