@@ -72,14 +72,22 @@ slam-graph optimize results/MONDAY/latest --set prior.position_sigma=0.02
 ```
 """
 
+EXPERT = """\
+# Expert settings
+
+For development and experiments: the defaults hold for every recording that was tried, and a setting
+here may go when a constant does as well.
+"""
+
 BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
 def page() -> str:
     """The whole page, Markdown."""
     schema = RunConfig.model_json_schema()
-    defaults = load_config().model_dump(mode="json")
-    sections = [INTRODUCTION, *_sections(schema, schema["$defs"], defaults, "")]
+    run_defaults = load_config().model_dump(mode="json")
+    sections = [INTRODUCTION, *_sections(schema, schema["$defs"], run_defaults, "")]
+    expert = list(_sections(schema, schema["$defs"], run_defaults, "", expert=True))
     for heading, policy in (
         (POSE_GRAPHS, PoseGraphPolicy()),
         (BUNDLES, BalPolicy()),
@@ -88,20 +96,31 @@ def page() -> str:
         schema = policy.model_json_schema()
         defaults = policy.model_dump(mode="json")
         sections += [heading, *_sections(schema, schema["$defs"], defaults, "")]
+        expert += _sections(schema, schema["$defs"], defaults, "", expert=True)
+    if expert:
+        sections += [EXPERT, *expert]
     return "\n".join(sections)
 
 
 def _sections(
-    table: dict[str, Any], tables: dict[str, Any], defaults: dict[str, Any], path: str
+    table: dict[str, Any],
+    tables: dict[str, Any],
+    defaults: dict[str, Any],
+    path: str,
+    expert: bool = False,
 ) -> Iterator[str]:
-    """One section for a table of settings and for each table in it, depth first."""
+    """One section for a table of settings and for each table in it, depth first, of one tier."""
     settings = {name: _resolved(entry, tables) for name, entry in table["properties"].items()}
-    plain = {name: entry for name, entry in settings.items() if "properties" not in entry}
+    plain = {
+        name: entry
+        for name, entry in settings.items()
+        if "properties" not in entry and entry.get("expert", False) == expert
+    }
     if plain:
         yield "\n".join(_section(path, table, plain, defaults))
     for name, entry in settings.items():
         if "properties" in entry:
-            yield from _sections(entry, tables, defaults[name], f"{path}{name}.")
+            yield from _sections(entry, tables, defaults[name], f"{path}{name}.", expert)
 
 
 def _section(

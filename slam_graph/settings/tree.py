@@ -17,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from slam_graph.errors import ConfigError
+from slam_graph.settings.base import Settings
 
 KeyPath = tuple[str | int, ...]
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -119,23 +120,27 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
     path: KeyPath = fault["loc"]
     where, dotted = tree.locate(path), ".".join(str(part) for part in path)
     if fault["type"] == "extra_forbidden":
-        return f"{where}: unknown key '{dotted}'; {closest(str(path[-1]), _keys(model, path[:-1]))}"
+        table, key = _table(model, path[:-1]), str(path[-1])
+        if table is not None and key in table.moved:
+            return f"{where}: '{dotted}' {table.moved[key]}"
+        known = table.model_fields if table is not None else []
+        return f"{where}: unknown key '{dotted}'; {closest(key, known)}"
     if fault["type"] == "missing":
         return f"{where}: key '{dotted}' is missing"
     message = str(fault["msg"]).removeprefix("Value error, ")
     return f"{where}: {dotted}: {message[:1].lower()}{message[1:]}, got {fault['input']!r}"
 
 
-def _keys(model: type[BaseModel], path: KeyPath) -> list[str]:
-    """The known keys of the table at `path`."""
+def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:
+    """The type of the table at `path`; None where there is no table."""
     for part in path:
         info = model.model_fields.get(str(part))
         if info is None or not (
             isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
         ):
-            return []
+            return None
         model = info.annotation
-    return list(model.model_fields)
+    return model if issubclass(model, Settings) else None
 
 
 def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
