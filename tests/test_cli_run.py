@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from slam_graph import pipeline
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.pipeline.run import run as run_pipeline
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 
@@ -72,7 +72,7 @@ def test_json_is_all_of_stdout_and_the_settings_run_again(tmp_path: Path) -> Non
     first = json.loads(run(tmp_path, "demo", *SHORT, "--seed", "3", "--json").stdout)
     assert first["seed"] == 3
     folder = tmp_path / first["folder"]
-    again = pipeline.run(open_dataset("demo"), load_config(folder / "config.yaml"))
+    again = run_pipeline(open_dataset("demo"), load_config(folder / "config.yaml"))
     again.save(tmp_path / "again")
     rows = [(path / "trajectory.tum").read_text() for path in (folder, tmp_path / "again")]
     assert rows[0] == rows[1]

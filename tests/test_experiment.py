@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_graph import pipeline
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -27,6 +26,7 @@ from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
+from slam_graph.pipeline.run import run as run_pipeline
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")
@@ -82,7 +82,7 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
     (tracks,) = (folder / "tracks").iterdir()
     # the error of the start is drawn from its covariance, which is not to be reduced
     config = load_config(None, ["backend.initialization.fix_gauge=false"], algorithm="swf")
-    result = pipeline.run(open_dataset(tracks), config)
+    result = run_pipeline(open_dataset(tracks), config)
     truth = result.truth_of_run()
     assert truth is not None
     file = folder / "runs" / "sim_figure8_seed0" / "swf.npz"
