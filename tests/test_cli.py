@@ -185,6 +185,7 @@ def test_ape_and_rpe_print_tables_and_json(tmp_path: Path) -> None:
     assert answer("ape", *files, "-a", "-s")["alignment"] == "sim3"
     assert answer("ape", *files, "-s")["alignment"] == "scale"
     assert answer("rpe", *files, "--align", "yaw")["alignment"] == "yaw"
+    assert answer("ape", *files, "--t_max_diff", "0.01")["poses"] == 4
 
 
 def test_a_malformed_trajectory_is_exit_code_1(tmp_path: Path) -> None:

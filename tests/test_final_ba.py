@@ -17,7 +17,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets.registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import select
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping import final_adjustment
 from slam_graph.mapping.averaged_observations import nearest_keyframe

@@ -16,7 +16,7 @@ import numpy as np
 from slam_graph.config import RunConfig
 from slam_graph.datasets.base import SequenceInfo
 from slam_graph.errors import EstimationError
-from slam_graph.evaluation.association import select
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.history import StateHistory
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.mapping.final_adjustment import FinalBa
