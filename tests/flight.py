@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.camera import Camera
@@ -189,7 +189,7 @@ def scene(
     min_frames: int = 2,
 ) -> tuple[Observations, Geometry]:
     """The observations from some times, and the true poses and points that go with them."""
-    window = TrackWindow()
+    window = FeatureTracks()
     for number, t_s in enumerate(times_s.tolist()):
         window.add(number, features(flight, rig, points, t_s, rng, sigma_px))
     ids, lengths = window.lengths()

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegration_params
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
@@ -81,7 +81,7 @@ def test_alignment_bears_pixel_noise(cameras: int) -> None:
 @pytest.mark.parametrize("movers", [60, 130])
 def test_the_imu_tells_the_static_world_from_an_object(cameras: int, movers: int) -> None:
     """Even where most features are on the object, which moves as the room of another flight."""
-    rng, mounted, window = np.random.default_rng(5), rig(cameras), TrackWindow()
+    rng, mounted, window = np.random.default_rng(5), rig(cameras), FeatureTracks()
     flight, other = Flight(), Flight(position_rate=np.array([2.5, -1.2, 1.6]))
     still, moving = room(400, rng), room(movers * 4, rng)
     for number, t_s in enumerate(TIMES.tolist()):

@@ -65,7 +65,7 @@ class Estimator:
     ) -> None:
         self.rig = rig
         self.algorithm = algorithm
-        self.config = _with_loss(config or BackendConfig(), algorithm)
+        self.config = config or BackendConfig()
         self.diagnostics = diagnostics or Diagnostics()
         self.window: Window | None = None
         self.timings: dict[str, float] = {}
@@ -98,31 +98,35 @@ class Estimator:
             self._propagation.append_frame(window, self._imu, stamp_ns, still)
             self._add_tracks(window, frame)
         with self._timed("cost"):
+            if not still:
+                window.recall_features()
             constructed = self._construction.construct(window, still)
         with self._timed("gauss_newton"):
-            minimum = self._minimize(constructed)
+            constructed, minimum = self._minimize(window, constructed)
             self.costs = minimum.costs
             self.columns = minimum.posterior.layout.size + window.archive.size
             self._construction.reject_residuals(window, constructed)
             self.innovations = constructed.innovations_under(minimum.posterior)
         with self._timed("marginalization"):
-            policy = self.algorithm.marginalization
-            marginalize_step(window, constructed, minimum, policy)
+            marginalize_step(window, constructed, minimum, self.algorithm)
         self._posterior = minimum.posterior
         state = window.current(minimum.posterior)
         self._propagation.learn(state)
         return state
 
-    def _minimize(self, constructed: ConstructedCost) -> Minimum:
+    def _minimize(
+        self, window: Window, constructed: ConstructedCost
+    ) -> tuple[ConstructedCost, Minimum]:
         """Take the steps; without the features if these leave something undetermined."""
         policy = self.algorithm.gauss_newton
         again = self._calibration.moved_far if self._calibration.keys else None
         try:
-            return minimize(constructed.cost, policy, constructed.linear, again)
+            minimum = minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
             self.diagnostics.warn("features_degenerate", "one frame goes without its features")
-            constructed.drop_features()
-            return minimize(constructed.cost, policy)
+            constructed = constructed.without_features(window)
+            minimum = minimize(constructed.cost, policy)
+        return constructed, minimum
 
     @contextmanager
     def _timed(self, module: str) -> Iterator[None]:
@@ -241,12 +245,3 @@ class Estimator:
         self.diagnostics.warn("feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns")
         cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
         return FeatureFrame(frame.stamp_ns, tuple(cameras))
-
-
-def _with_loss(config: BackendConfig, algorithm: AlgorithmConfig) -> BackendConfig:
-    """The settings with the robust loss of an algorithm, where it has one of its own."""
-    loss = algorithm.cost.robust_loss
-    if loss is None:
-        return config
-    gating = config.gating.model_copy(update={"robust_loss": loss})
-    return config.model_copy(update={"gating": gating})

@@ -15,7 +15,7 @@ from gtsam.symbol_shorthand import L, X
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
@@ -93,7 +93,7 @@ class SmootherEstimator(Estimator):
 
     def _observations(
         self,
-        tracks: TrackWindow,
+        tracks: FeatureTracks,
         ahead: Window,
         predicted: NavState,
         frame: FeatureFrame,
@@ -101,11 +101,11 @@ class SmootherEstimator(Estimator):
     ) -> NewObservations:
         """What the images add; nothing at a standstill, of which they only bring their errors."""
         if still:
-            tracks.retain([])
+            tracks.keep_frames([])
             tracks.add(ahead.frame, frame)  # where a later feature may begin
-            tracks.consume(self._features.active)
+            tracks.remove(Outcome.STANDSTILL, self._features.active)
             return NewObservations()
-        tracks.retain(list(self._frames))
+        tracks.keep_frames(list(self._frames))
         tracks.add(ahead.frame, frame)
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow, is_in
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, Outcome, is_in
 from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
@@ -79,7 +79,7 @@ class SmootherFeatures:
         self.active = np.array(kept, np.int64)
 
     def observe(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, covariance: FloatArray
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, covariance: FloatArray
     ) -> NewObservations:
         """The observations of the graph's newest state.
 
@@ -92,7 +92,7 @@ class SmootherFeatures:
         new = NewObservations()
         seen = np.intersect1d(self.active, tracks.ids_in(frame), True)
         again = tracks.observations(seen, [frame])
-        tracks.consume(self.active)
+        tracks.remove(Outcome.USED, self.active)
         again = again.rows(self._gate(again, estimate, covariance))
         ids = np.unique(again.ids[again.feature])
         self._add(new, again, ids)
@@ -101,7 +101,7 @@ class SmootherFeatures:
         for j, point in zip(entering.ids.tolist(), points, strict=True):
             new.points.insert(L(j), point)
         self._add(new, entering, entering.ids)
-        tracks.consume(entering.ids)
+        tracks.remove(Outcome.USED, entering.ids)
         self.active = np.union1d(self.active, entering.ids)
         return new
 
@@ -133,7 +133,7 @@ class SmootherFeatures:
         return np.asarray(good)
 
     def _entering(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, room: int
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, room: int
     ) -> tuple[Observations, FloatArray]:
         """New variables: the longest tracks that are seen now and determine a point."""
         ids, lengths = tracks.lengths()

@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegrate
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
@@ -63,9 +63,9 @@ class StartWindow:
         """The same frames with some features alone."""
         return StartWindow(self.stamps_ns, [frame.only(ids) for frame in self.frames])
 
-    def tracks(self) -> TrackWindow:
+    def tracks(self) -> FeatureTracks:
         """The observations of all frames, numbered from 0."""
-        window = TrackWindow()
+        window = FeatureTracks()
         for k, frame in enumerate(self.frames):
             window.add(k, frame)
         return window
