@@ -35,8 +35,8 @@ class CostPolicy(Settings):
     factors between them are linearised anew in every step."""
     features: Annotated[str, Choice(FEATURE_POLICIES)] = "once"
     """What becomes of a feature that is not held in the state. once: used when its track ends, or
-    when a pose that saw it leaves, with all its observations, and marginalised at once. state:
-    never used, only features of the state count. every_step: in the cost of every step, linearised anew,
+    when a pose that saw it leaves, with all its observations, and marginalised at once. state: not
+    used, only features of the state count. every_step: in the cost of every step, linearised anew,
     until a pose that saw it leaves; then it becomes part of the prior, and starts anew if it is
     still tracked."""
     keep_lost_features: bool = False

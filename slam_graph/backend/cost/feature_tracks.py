@@ -3,7 +3,7 @@
 """The observations of features that wait to be used, and tables of them for the solver.
 
 `FeatureTracks` owns the life of an observation. It waits from when its frame comes until exactly
-one `Outcome` takes it away; nothing else adds or removes observations. docs/engine.md has the table.
+one `Outcome` takes it away; nothing else adds or removes observations (table in docs/engine.md).
 """
 
 from __future__ import annotations
