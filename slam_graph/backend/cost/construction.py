@@ -24,6 +24,7 @@ from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pose_selection import POSE_CHOICES
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -104,6 +105,7 @@ class CostConstruction:
         self.config = config
         self.diagnostics = diagnostics
         self.rejected = np.zeros(0, np.int64)
+        self.loss = RobustLoss(policy.robust_loss or config.gating.robust_loss)
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -115,7 +117,8 @@ class CostConstruction:
                 takes the place of the last one.
         """
         self.rejected = np.zeros(0, np.int64)
-        cost = Cost(window.state, self.rig, self.config, window.prior, list(window.factors))
+        factors = list(window.factors)
+        cost = Cost(window.state, self.rig, self.config, window.prior, factors, loss=self.loss)
         nothing = np.zeros(0, np.bool_)
         if still:
             past = window.past[:-1]
