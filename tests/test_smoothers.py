@@ -11,8 +11,9 @@ import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
 from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.backend.backend_config import BackendConfig, GatingConfig
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.gtsam_smoothers.smoother_factors import (
     ProjectionFactors,
     joint_prior,
@@ -43,7 +44,7 @@ def test_native_projections_have_the_residuals_of_the_engine(camera: Camera) -> 
         values.insert(X(obs.frames[i]), gtsam.Pose3(gtsam.Rot3(rotation), position))
     for j, point in zip(obs.ids.tolist(), at.points, strict=True):
         values.insert(L(j), point)
-    noise = pixel_noise(2.0, GatingConfig(robust_loss="none"))
+    noise = pixel_noise(2.0, RobustLoss("none"))
     factors = ProjectionFactors(two, noise).of(obs)
     assert len(factors) == len(obs) > 100
     residuals, _ = RigProjection(two).residuals(obs, at)

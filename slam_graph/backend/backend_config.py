@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -63,8 +64,10 @@ class GatingConfig(Settings):
     """Quantile of the χ² distribution beyond which a feature is rejected (Mahalanobis gate)."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
     """Loss that weighs down large reprojection residuals."""
-    robust_width: float = Field(2.45, gt=0)
-    """Width of the robust loss on the length of a whitened residual (2.45: the 95 % circle)."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "robust_width": "is a constant now: WIDTH_2D in slam_graph/backend/cost/robust_loss.py",
+    }
 
 
 class ZeroVelocityConfig(Settings):

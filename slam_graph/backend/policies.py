@@ -15,7 +15,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
 from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
@@ -159,6 +167,28 @@ class SmootherPolicy(Settings):
     """Smallest angle between two rays to such a feature."""
 
 
+OWN_SECTIONS = ("cost", "gauss_newton", "marginalization")
+"""Sections that this package's own engine uses."""
+SMOOTHER_SECTIONS = ("smoother",)
+"""Sections that GTSAM's smoothers use."""
+UNUSED_KEYS = {
+    "isam2": {"max_iterations"},
+    "fixed_lag_isam2": {"max_iterations"},
+    "fixed_lag_batch": {"relinearize_threshold", "relinearize_skip"},
+}
+"""Keys of `smoother` that mean nothing to one of GTSAM's smoothers."""
+
+
+def _sections_of(engine: str) -> tuple[str, ...]:
+    """The sections of an algorithm's table that an engine uses."""
+    return OWN_SECTIONS if engine == "square_root" else SMOOTHER_SECTIONS
+
+
+def _unused_keys(engine: str, section: str) -> set[str]:
+    """Keys of a section that an engine does not use although it uses the section."""
+    return UNUSED_KEYS.get(engine, set()) if section in SMOOTHER_SECTIONS else set()
+
+
 class AlgorithmConfig(Settings):
     """One row of the table."""
 
@@ -180,3 +210,36 @@ class AlgorithmConfig(Settings):
     def relinearizes(self) -> bool:
         """Whether residuals stay in the cost after a step, to be linearised anew in the next."""
         return FEATURE_POLICIES[self.cost.features].relinearized or self.cost.recent_frames > 1
+
+    @field_validator("cost", "gauss_newton", "marginalization", "smoother", mode="before")
+    @classmethod
+    def _used(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse a section, or a key of one, that the engine would ignore."""
+        engine, section = str(info.data.get("engine", "square_root")), str(info.field_name)
+        sections = _sections_of(engine)
+        if section not in sections:
+            others = "square_root" if section in OWN_SECTIONS else "one of GTSAM's smoothers"
+            reason = (
+                f"is not used by engine '{engine}', whose settings are in {', '.join(sections)}; "
+                f"remove it, or set algorithm.engine to {others}"
+            )
+            raise PydanticCustomError("unused", "{reason}", {"reason": reason})
+        given = value.model_fields_set if isinstance(value, Settings) else value
+        unused = sorted(_unused_keys(engine, section).intersection(given or ()))
+        if unused:
+            reason = f"has '{unused[0]}', which engine '{engine}' does not use; remove it"
+            raise PydanticCustomError("unused", "{reason}", {"reason": reason})
+        return value
+
+    @model_serializer(mode="wrap")
+    def _only_what_is_used(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """The table without what the engine does not use, so that it can be read back."""
+        table: dict[str, Any] = handler(self)
+        sections = _sections_of(self.engine)
+        for section in {*OWN_SECTIONS, *SMOOTHER_SECTIONS}.intersection(table):
+            if section not in sections:
+                del table[section]
+            elif isinstance(table[section], dict):
+                unused = _unused_keys(self.engine, section)
+                table[section] = {k: v for k, v in table[section].items() if k not in unused}
+        return table

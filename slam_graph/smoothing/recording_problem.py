@@ -37,6 +37,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
@@ -164,14 +165,10 @@ class RecordingCost:
             variances: (N,) of each, over that of a single observation.
             sigma_px: standard deviation of a single one.
         """
-        robust = {
-            "robust_loss": self._config.robust_loss,
-            "robust_width": self._config.robust_width,
-        }
-        gating = self._backend.gating.model_copy(update=robust)
+        loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
         factors: list[gtsam.NonlinearFactor] = []
         for variance in np.unique(variances).tolist():  # one for each size of a group
-            noise = pixel_noise(sigma_px * math.sqrt(variance), gating)
+            noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
             factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return _graph(factors)
 

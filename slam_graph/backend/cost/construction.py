@@ -32,6 +32,7 @@ from slam_graph.backend.cost.feature_tracks import (
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -151,6 +152,7 @@ class CostConstruction:
         self.rejected = np.zeros(0, np.int64)
         self._features = FEATURE_POLICIES[policy.features]
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
+        self._loss = RobustLoss(config.gating.robust_loss)
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -163,7 +165,7 @@ class CostConstruction:
         """
         self.rejected = np.zeros(0, np.int64)
         state, factors = window.state.copy(), list(window.factors)
-        cost = Cost(state, self.rig, self.config, window.prior, factors)
+        cost = Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
         removals = Removals()
         if still:
             poses = PoseSelection(window.past[:-1], keyframes=frozenset(window.keyframes))

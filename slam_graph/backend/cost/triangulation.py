@@ -58,6 +58,7 @@ def triangulate(
     rotations: FloatArray,
     positions: FloatArray,
     config: TriangulationConfig,
+    min_parallax_rad: float = 0.0,
 ) -> Triangulation:
     """Triangulate every feature of `obs` from known poses.
 
@@ -67,6 +68,7 @@ def triangulate(
         rotations: (F, 3, 3) world_R_body of the frames of `obs`.
         positions: (F, 3) of the body in the world.
         config: thresholds.
+        min_parallax_rad: smallest accepted angle between two rays, where that of `config` is less.
     """
     rays = _rays(obs, rig, rotations, positions)
     points = _nearest_to_rays(obs, rays)
@@ -82,7 +84,7 @@ def triangulate(
         np.all(np.isfinite(points), axis=1)
         & (nearest > config.min_depth_m)
         & (anchor_depth < config.max_depth_m)
-        & (parallax > config.min_parallax_rad)
+        & (parallax > max(config.min_parallax_rad, min_parallax_rad))
     )
     return Triangulation(points, good, np.sqrt(squares / count), depth_error)
 

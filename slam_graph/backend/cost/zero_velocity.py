@@ -44,8 +44,22 @@ class StandstillDetector:
             still.
     """
 
-    def __init__(self, config: ZeroVelocityConfig) -> None:
+    def __init__(
+        self,
+        config: ZeroVelocityConfig,
+        max_disparity_px: float | None = None,
+        enabled: bool | None = None,
+    ) -> None:
+        """Wait for frames.
+
+        Args:
+            config: limits on images and IMU.
+            max_disparity_px: instead of that of `config`.
+            enabled: instead of that of `config`.
+        """
         self.config = config
+        self._max_disparity_px = max_disparity_px or config.max_disparity_px
+        self._enabled = config.enabled if enabled is None else enabled
         self.since_ns: int | None = None
         self.movers = np.zeros(0, np.int64)
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
@@ -63,7 +77,7 @@ class StandstillDetector:
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
         still = (
-            self.config.enabled
+            self._enabled
             and self._recent[0][0] <= start_ns
             and self._images_are_still()
             and self._imu_is_calm(imu, start_ns, stamp_ns)
@@ -96,7 +110,7 @@ class StandstillDetector:
         if len(ids) < MIN_FEATURES:
             return False
         least, median = np.quantile(np.linalg.norm(motion, axis=1), [STILL_SHARE, 0.5])
-        limit_px = self.config.max_disparity_px
+        limit_px = self._max_disparity_px
         return bool(median < limit_px or least < limit_px / OWN_MOTION)
 
     def _note_movers(self) -> None:
@@ -104,7 +118,7 @@ class StandstillDetector:
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
             own = np.linalg.norm(motion, axis=1)
-            limit_px = OWN_MOTION * self.config.max_disparity_px
+            limit_px = OWN_MOTION * self._max_disparity_px
             self.movers = np.union1d(self.movers, ids[own > limit_px])
 
     def _imu_is_calm(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:

@@ -9,8 +9,8 @@ from typing import Any
 import gtsam
 from gtsam.symbol_shorthand import L, X
 
-from slam_graph.backend.backend_config import GatingConfig
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.errors import ConfigError
 from slam_graph.sensors.camera import Camera
@@ -38,14 +38,14 @@ def calibration(camera: Camera) -> tuple[Any, Any]:
     return gtsam.Cal3_S2(*intrinsics), gtsam.GenericProjectionFactorCal3_S2
 
 
-def pixel_noise(sigma_px: float, gating: GatingConfig) -> gtsam.noiseModel.Base:
+def pixel_noise(sigma_px: float, loss: RobustLoss) -> gtsam.noiseModel.Base:
     """Noise of an observation, with the robust loss around it."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_px)
     estimators = gtsam.noiseModel.mEstimator
-    if gating.robust_loss == "huber":
-        return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(gating.robust_width), noise)
-    if gating.robust_loss == "cauchy":
-        return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(gating.robust_width), noise)
+    if loss.name == "huber":
+        return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(loss.width), noise)
+    if loss.name == "cauchy":
+        return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(loss.width), noise)
     return noise
 
 

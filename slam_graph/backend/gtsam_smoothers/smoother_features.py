@@ -20,6 +20,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, Outcome, is_in
 from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
 from slam_graph.backend.policies import SmootherPolicy
@@ -68,10 +69,9 @@ class SmootherFeatures:
         self._config = config
         self._diagnostics = diagnostics
         self._rig = RigProjection(rig)
-        gating = config.gating.model_copy(update={"robust_loss": policy.robust_loss})
-        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, gating))
-        angle = max(policy.min_parallax_rad, config.triangulation.min_parallax_rad)
-        self._triangulation = config.triangulation.model_copy(update={"min_parallax_rad": angle})
+        self._factors = ProjectionFactors(
+            rig, pixel_noise(config.noise.pixel_sigma, RobustLoss(policy.robust_loss))
+        )
 
     def retain(self, estimate: gtsam.Values) -> None:
         """Forget the features that are no variables any more."""
@@ -143,7 +143,9 @@ class SmootherFeatures:
         if len(ids) == 0 or room <= 0:
             return obs.subset(np.zeros(len(ids), np.bool_)), np.zeros((0, 3))
         poses = stacked_poses(estimate, obs.frames)
-        result = triangulate(obs, self._rig, *poses, self._triangulation)
+        result = triangulate(
+            obs, self._rig, *poses, self._config.triangulation, self._policy.min_parallax_rad
+        )
         fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
         good = result.good & fits
         longest = np.argsort(-np.where(good, lengths, 0), kind="stable")[:room]

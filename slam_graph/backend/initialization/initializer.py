@@ -23,6 +23,7 @@ from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
 from slam_graph.backend.cost.imu_factor import ImuBuffer, imu_factor, preintegrate
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.initialization.dynamic_start import (
@@ -123,9 +124,7 @@ class Initializer:
         self._tried_ns = 0
         self._rng = np.random.default_rng(0)
         largest = config.initialization.static_disparity_px
-        self._standstill = StandstillDetector(
-            config.zero_velocity.model_copy(update={"max_disparity_px": largest, "enabled": True})
-        )
+        self._standstill = StandstillDetector(config.zero_velocity, largest, True)
 
     def try_to_start(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """Take the next frame and start if it is possible.
@@ -228,7 +227,8 @@ class Initializer:
         known = self._calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(window.stamps_ns, window.frames, strict=True)):
             self._calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, imu)
-        cost = Cost(state, self._rig, self._config, known, factors)
+        loss = RobustLoss(self._config.gating.robust_loss)
+        cost = Cost(state, self._rig, self._config, known, factors, loss=loss)
         obs = _lasting(window)
         result = self._points(cost, obs)
         self._enter(cost, obs, result, result.good & is_in(obs.ids, guess.static))
