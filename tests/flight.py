@@ -139,6 +139,19 @@ def features(
     """What the cameras see of the points, with noise where `rng` is given."""
     at = np.array([t_s])
     R, p = flight.rotation(at).as_matrix()[0], flight.positions(at)[0]
+    return features_from(R, p, rig, points, round(t_s * NS_PER_S), rng, sigma_px)
+
+
+def features_from(
+    R: FloatArray,
+    p: FloatArray,
+    rig: Rig,
+    points: FloatArray,
+    stamp_ns: int,
+    rng: np.random.Generator | None = None,
+    sigma_px: float = 1.0,
+) -> FeatureFrame:
+    """What the cameras see of the points from a pose of the body, world_R_body and position."""
     in_body = (points - p) @ R
     cameras = []
     for mounted in rig.cameras:
@@ -157,7 +170,7 @@ def features(
         if rng is not None:
             noisy = noisy + rng.normal(0.0, sigma_px, noisy.shape)
         cameras.append(FeatureObservations(ids, noisy, camera.undistort(noisy)))
-    return FeatureFrame(round(t_s * NS_PER_S), tuple(cameras))
+    return FeatureFrame(stamp_ns, tuple(cameras))
 
 
 def packets(

@@ -106,6 +106,9 @@ class Cost:
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
+        if self.tracked is not None:
+            keys += self.rig.keys_of(self.tracked)
+            keys += [L(j) for j in np.unique(self.tracked.ids[self.tracked.feature]).tolist()]
         if self.fresh is not None:
             keys += self.rig.keys_of(self.fresh.obs)
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
