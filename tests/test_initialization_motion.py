@@ -17,6 +17,7 @@ from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.dynamic_start import StartGuess, StartWindow, guess_states
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
 from slam_graph.config import load_config
@@ -28,7 +29,6 @@ from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureOb
 
 PARAMS = preintegration_params(rig().imu, 9.81)
 TIMES = np.linspace(0.0, 1.5, 11)
-SPACING_S = InitializationConfig().frame_spacing_s
 MOTION = BackendConfig(initialization=InitializationConfig(mode="motion"))
 
 
@@ -112,7 +112,7 @@ def window_of(
     """A start window, with the noise of a tracker and an IMU where `rng` is given."""
     mounted, imu = rig(cameras), ImuBuffer()
     stamps, frames = [], []
-    for packet in packets(flight, mounted, points, 1.5, rng, 1.0 / SPACING_S, 0.2):
+    for packet in packets(flight, mounted, points, 1.5, rng, 1.0 / FRAME_SPACING_S, 0.2):
         assert isinstance(packet.frame, FeatureFrame)
         imu.add(packet.imu)
         stamps.append(packet.frame.stamp_ns)

@@ -19,13 +19,23 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import AdaptiveNoiseConfig, NoiseConfig
+from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.imu_factor import preintegration_params
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.rig import ImuNoise
 
-MOST_SURPRISE = 4.0
+PERSISTENCE_TIME_S = 0.5
+"""Time constant of the mean correction, which shows whether corrections keep their direction."""
+SIZE_TIME_S = 2.0
+"""Time constant of the mean squared correction."""
+RESPONSE_TIME_S = 1.0
+"""Time in which the variance grows e-fold if squares are twice what they should be."""
+MAX_FACTOR = 30.0
+"""Largest factor on a density."""
+MAX_SQUARE = 4.0
 """Mean squares above this raise the noise no faster."""
+IMU_GAP_SCALE = 1000.0
+"""Factor on the noise where samples are missing: the IMU then says next to nothing."""
 ROTATION, VELOCITY = slice(0, 3), slice(6, 9)
 """Rows of a state's covariance."""
 
@@ -37,8 +47,7 @@ class DensityScale:
         factor: on the density, at least one.
     """
 
-    def __init__(self, config: AdaptiveNoiseConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._direction = np.zeros(3)
         self._size = 1.0
         self.factor = 1.0
@@ -56,15 +65,14 @@ class DensityScale:
             return
         # by the symmetric root, which keeps the frame, so that steps can be compared
         white = axes @ (axes.T @ correction / np.sqrt(variances))
-        config = self._config
-        memory = np.exp(-dt_s / config.whiteness_s)
+        memory = np.exp(-dt_s / PERSISTENCE_TIME_S)
         self._direction = memory * self._direction + np.sqrt(1.0 - memory**2) * white
-        memory = np.exp(-dt_s / config.size_s)
+        memory = np.exp(-dt_s / SIZE_TIME_S)
         self._size = memory * self._size + (1.0 - memory) * float(white @ white) / 3.0
         persistence = float(self._direction @ self._direction) / 3.0
-        surprise = min(persistence, self._size, MOST_SURPRISE) - 1.0
-        factor = self.factor * np.exp(0.5 * surprise * dt_s / config.response_s)
-        self.factor = float(np.clip(factor, 1.0, config.max_factor))
+        surprise = min(persistence, self._size, MAX_SQUARE) - 1.0
+        factor = self.factor * np.exp(0.5 * surprise * dt_s / RESPONSE_TIME_S)
+        self.factor = float(np.clip(factor, 1.0, MAX_FACTOR))
 
 
 class DynamicsNoise:
@@ -73,8 +81,8 @@ class DynamicsNoise:
     def __init__(self, imu: ImuNoise, config: NoiseConfig) -> None:
         self._imu = imu
         self._config = config
-        self._gyro = DensityScale(config.adaptive)
-        self._accel = DensityScale(config.adaptive)
+        self._gyro = DensityScale()
+        self._accel = DensityScale()
 
     def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
         """Parameters now, all densities multiplied by `scale`."""

@@ -19,7 +19,10 @@ from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 
+STEPS = 5
+"""Damped Gauss-Newton steps that refine the linear solution, at most."""
 REGULARISATION = 1e-9
+"""Added to diagonals, so that features without parallax have a solution; it fails the checks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +75,7 @@ def triangulate(
     """
     rays = _rays(obs, rig, rotations, positions)
     points = _nearest_to_rays(obs, rays)
-    points, depth_error = _refine(obs, rays, points, config.iterations)
+    points, depth_error = _refine(obs, rays, points)
     residuals, depths = rig.residuals(obs, Geometry(rotations, positions, points))
     count = np.maximum(obs.counts, 1)
     squares = np.bincount(obs.feature, np.sum(residuals**2, axis=1), len(obs.ids))
@@ -121,9 +124,7 @@ def _nearest_to_rays(obs: Observations, rays: _Rays) -> FloatArray:
     return home + np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
 
 
-def _refine(
-    obs: Observations, rays: _Rays, points: FloatArray, iterations: int
-) -> tuple[FloatArray, FloatArray]:
+def _refine(obs: Observations, rays: _Rays, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton on the normalised reprojection error in inverse depth of the first camera.
 
     Returns:
@@ -139,7 +140,7 @@ def _refine(
     start[behind, :2] = obs.normalized[rays.anchor][behind]
     x, damping = start, np.full(len(points), 1e-3)
     error, lhs, rhs = _normal_equations(obs, rays, x)
-    for _ in range(iterations):
+    for _ in range(STEPS):
         diagonal = np.einsum("jii->ji", lhs) * damping[:, None] + REGULARISATION
         step = np.linalg.solve(lhs + diagonal[:, :, None] * np.eye(3), rhs[:, :, None])[:, :, 0]
         trial = x + step

@@ -30,6 +30,13 @@ move by so many times less."""
 STILL_SHARE = 1.0 / 3.0
 """So many of the features must stand still, the others may be on something that moves by itself."""
 
+VELOCITY_SIGMA = 0.01
+"""Standard deviation of the velocity at a standstill, m/s."""
+POSITION_SIGMA = 1e-3
+"""Standard deviation of the motion between two frames at a standstill, m."""
+ROTATION_SIGMA = 1e-3
+"""Standard deviation of the rotation between two frames at a standstill, rad."""
+
 MIN_FEATURES = 5
 """Fewer common features than this say nothing about the motion of the image."""
 
@@ -139,14 +146,10 @@ def _common_motion_px(
     return ids, after.pixels[j] - before.pixels[i]
 
 
-def zero_velocity_factors(
-    i: int, j: int, config: ZeroVelocityConfig
-) -> list[gtsam.NonlinearFactor]:
+def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:
     """The pose of frame j equals that of frame i, and its velocity is zero."""
-    between = gtsam.noiseModel.Diagonal.Sigmas(
-        np.repeat([config.rotation_sigma, config.position_sigma], 3)
-    )
-    still = gtsam.noiseModel.Isotropic.Sigma(3, config.velocity_sigma)
+    between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3))
+    still = gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)
     return [
         gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(), between),
         gtsam.PriorFactorVector(V(j), np.zeros(3), still),

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig, PriorConfig
 from slam_graph.backend.cost.cost import Cost, NewFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
@@ -27,6 +27,7 @@ from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.initialization.dynamic_start import (
+    MIN_FEATURES,
     OUTLIER_PX,
     StartGuess,
     StartWindow,
@@ -52,6 +53,23 @@ BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marqu
 FINAL = GaussNewtonPolicy(max_steps=1)
 BEST_KNOWN = 0.1
 """The share of the features that are taken for the best known ones."""
+STATIC_DISPARITY_PX = 1.5
+"""Largest median disparity at a static start: more than later, as running motors shake the
+image."""
+RETRY_S = 0.2
+"""Time between two attempts to start in motion, each of which costs as much as many frames."""
+FRAME_SPACING_S = 0.15
+"""Time between the frames that a start in motion uses."""
+MAX_FEATURES = 150
+"""How many features a start in motion uses at most, those with the longest tracks."""
+MOTION_PRIOR = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
+"""Uncertainty of the guess that a start in motion refines."""
+MAX_NORMALIZED_COST = 3.0
+"""Largest accepted mean squared residual of a start in motion, in σ²."""
+MAX_VELOCITY_SIGMA = 0.1
+"""Largest accepted standard deviation of its velocity, m/s."""
+MAX_SCALE_SIGMA = 0.15
+"""Largest accepted standard deviation of its scale, relative to it."""
 SETTLED = 0.1
 """The last step must not change the cost by more than this share: else it is no minimum."""
 
@@ -123,8 +141,7 @@ class Initializer:
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
         self._rng = np.random.default_rng(0)
-        largest = config.initialization.static_disparity_px
-        self._standstill = StandstillDetector(config.zero_velocity, largest, True)
+        self._standstill = StandstillDetector(config.zero_velocity, STATIC_DISPARITY_PX, True)
 
     def try_to_start(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """Take the next frame and start if it is possible.
@@ -158,17 +175,17 @@ class Initializer:
     def _in_motion(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> Window | str:
         start = self._config.initialization
         length_ns = round(start.motion_window_s * 1e9)
-        if imu.covers(stamp_ns) and len(frame.cameras[0]) >= start.min_features:
+        if imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
             self._stamps_ns.append(stamp_ns)
             self._frames.append(frame)
         while self._stamps_ns and self._stamps_ns[0] < stamp_ns - length_ns - round(1e8):
             del self._stamps_ns[0], self._frames[0]
         if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
             return f"{start.motion_window_s:g} s of frames with IMU samples"
-        if stamp_ns - self._tried_ns < round(start.retry_s * 1e9):
+        if stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
             return self.waiting_for
         self._tried_ns = stamp_ns
-        window = StartWindow.thinned(self._stamps_ns, self._frames, start.frame_spacing_s)
+        window = StartWindow.thinned(self._stamps_ns, self._frames, FRAME_SPACING_S)
         guess = guess_states(window, imu, self._rig, self._params, self._config.noise, self._rng)
         return guess if isinstance(guess, str) else self._refined(window, guess, imu)
 
@@ -221,8 +238,8 @@ class Initializer:
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         for k, samples in enumerate(window.imu_between(imu)):
             factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
-        wide = self._config.initialization.motion_prior
-        first = fix_gauge(replace(start, covariance=prior_covariance(wide)), wide)
+        first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
+        first = fix_gauge(first, MOTION_PRIOR)
         factors += _prior_factors(first)
         known = self._calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(window.stamps_ns, window.frames, strict=True)):
@@ -239,7 +256,7 @@ class Initializer:
     ) -> None:
         """Let the good ones (J,) into the cost; if they are too many, the longest tracks."""
         length = np.where(good, obs.counts, 0)
-        order = np.argsort(-length, kind="stable")[: self._config.initialization.features]
+        order = np.argsort(-length, kind="stable")[:MAX_FEATURES]
         chosen = np.zeros(len(good), np.bool_)
         chosen[order] = good[order]
         nothing = np.zeros(len(good), np.bool_)
@@ -261,7 +278,7 @@ class Initializer:
         good = result.good & fits
         self.unfit = obs.ids[~fits]
         self._enter(cost, obs, result, good)
-        return bool(np.sum(good) >= max(self._config.initialization.min_features, 0.5 * len(good)))
+        return bool(np.sum(good) >= max(MIN_FEATURES, 0.5 * len(good)))
 
     def _keep_features(self, cost: Cost, window: StartWindow) -> IntArray:
         """Make variables of the features that the last frame still sees."""
@@ -282,13 +299,12 @@ class Initializer:
         self, normalized_cost: float, scale_sigma: float, covariance: FloatArray
     ) -> str | None:
         """Why the solution should not be trusted, if so."""
-        start = self._config.initialization
         velocity_sigma = float(np.sqrt(np.max(np.diag(covariance)[6:9])))
-        if normalized_cost > start.max_normalized_cost:
+        if normalized_cost > MAX_NORMALIZED_COST:
             return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
-        if velocity_sigma > start.max_velocity_sigma:
+        if velocity_sigma > MAX_VELOCITY_SIGMA:
             return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
-        if scale_sigma > start.max_scale_sigma:
+        if scale_sigma > MAX_SCALE_SIGMA:
             return f"more motion (scale is known to {scale_sigma:.0%} only)"
         return None
 
