@@ -169,12 +169,12 @@ class InitializationConfig(Settings):
             ("static_disparity_px", "STATIC_DISPARITY_PX", "initializer"),
             ("frame_spacing_s", "FRAME_SPACING_S", "initializer"),
             ("retry_s", "RETRY_S", "initializer"),
-            ("features", "MAX_FEATURES", "initializer"),
+            ("features", "MAX_FEATURES", "dynamic_refinement"),
             ("min_features", "MIN_FEATURES", "dynamic_start"),
-            ("max_normalized_cost", "MAX_NORMALIZED_COST", "initializer"),
-            ("max_velocity_sigma", "MAX_VELOCITY_SIGMA", "initializer"),
-            ("max_scale_sigma", "MAX_SCALE_SIGMA", "initializer"),
-            ("motion_prior", "MOTION_PRIOR", "initializer"),
+            ("max_normalized_cost", "MAX_NORMALIZED_COST", "dynamic_refinement"),
+            ("max_velocity_sigma", "MAX_VELOCITY_SIGMA", "dynamic_refinement"),
+            ("max_scale_sigma", "MAX_SCALE_SIGMA", "dynamic_refinement"),
+            ("motion_prior", "MOTION_PRIOR", "dynamic_refinement"),
         )
     }
 

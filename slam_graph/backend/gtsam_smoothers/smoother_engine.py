@@ -19,7 +19,7 @@ from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
 from slam_graph.backend.gtsam_smoothers.smoother_features import NewObservations, SmootherFeatures
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, NativeSolver
-from slam_graph.backend.initialization.initializer import prior_of
+from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
