@@ -55,13 +55,13 @@ class SquareRootEngine:
         return state
 
     def _minimize(self, constructed: ConstructedCost) -> Minimum:
-        """Take the steps; without the features if these leave something undetermined."""
+        """Take the steps; without features if the system of equations is singular with them."""
         policy, calibration = self._policies.gauss_newton, self._context.calibration
         again = calibration.moved_far if calibration.keys else None
         try:
             return minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
-            warning = "one frame goes without its features"
+            warning = "the features of one frame are not used"
             self._context.diagnostics.warn("features_degenerate", warning)
             constructed.drop_features()
             return minimize(constructed.cost, policy)
