@@ -148,6 +148,14 @@ def test_faults_name_the_override(text: str, message: str) -> None:
         load_config(overrides=[text])
 
 
+@pytest.mark.parametrize("key", ["noise.imu_gap_scale", "initialization.motion_prior"])
+def test_a_setting_that_became_a_constant_says_where_it_is(key: str) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"'backend.{key}' is a constant now: \w+ in slam_graph/"
+    ):
+        load_config(overrides=[f"backend.{key}=1"])
+
+
 def test_a_missing_file_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: cannot read configuration"):
         load_config(tmp_path / "none.yaml")

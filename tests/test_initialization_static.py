@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, PriorConfig
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.initializer import start_from
-from slam_graph.backend.initialization.static_start import (
+from slam_graph.backend.initialization.first_state import (
     fix_gauge,
     level_rotation,
     prior_covariance,
+    start_from,
     state_at_rest,
 )
 from slam_graph.backend.solve.state import imu_state_keys

@@ -20,8 +20,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import (
     pixel_noise,
 )
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS
-from slam_graph.backend.initialization.initializer import prior_of
-from slam_graph.backend.initialization.static_start import prior_covariance
+from slam_graph.backend.initialization.first_state import prior_covariance, prior_of
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import imu_state_keys
 from slam_graph.config import load_config

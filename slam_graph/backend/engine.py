@@ -65,7 +65,7 @@ class SquareRootEngine:
         try:
             return constructed, minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
-            warning = "one frame goes without its features, which go on waiting"
+            warning = "the features of one frame are not used, and go on waiting"
             self._context.diagnostics.warn("features_degenerate", warning)
             constructed = constructed.without_features(window)
             return constructed, minimize(constructed.cost, policy)

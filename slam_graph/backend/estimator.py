@@ -25,7 +25,8 @@ from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
-from slam_graph.backend.initialization.initializer import Initializer, start_from
+from slam_graph.backend.initialization.first_state import start_from
+from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
@@ -81,9 +82,7 @@ class Estimator:
         own = algorithm.engine == "square_root"
         self._engine: Engine = SquareRootEngine(context) if own else SmootherEngine(context)
         self._context = context
-        self._initializer = Initializer(
-            projection, propagation.noise.params(), algorithm, config, calibration
-        )
+        self._initializer = Initializer(context)
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
         self._report = StepReport()
@@ -137,7 +136,7 @@ class Estimator:
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
             still = self._standstill.is_still(imu, stamp_ns, frame)
-            frame = frame.without(self._standstill.movers)
+            frame = frame.without(self._standstill.dynamic)
             if self.window is None:
                 self.window = self._try_to_start(stamp_ns, frame)
             elif stamp_ns > self.window.stamp_ns:
@@ -151,9 +150,9 @@ class Estimator:
     def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible."""
         with self._report.timed("start"):
-            window = self._initializer.try_to_start(self._context.imu, stamp_ns, frame)
+            window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
-            self._standstill.know_movers(self._initializer.unfit)
+            self._standstill.add_dynamic(self._initializer.outliers)
         return window
 
     def _usable(self, frame: FeatureFrame) -> FeatureFrame:

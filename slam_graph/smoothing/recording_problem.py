@@ -34,6 +34,7 @@ from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
@@ -197,14 +198,14 @@ class RecordingCost:
         for k, (i, j) in enumerate(pairwise(self._piece.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
             gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-            scale = noise.imu_scale * (noise.imu_gap_scale if gap else 1.0)
+            scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
             # of noise that is not stationary, variances add up
             gyro, accel = np.sqrt(np.mean(self._piece.noise[i + 1 : j + 1] ** 2, axis=0))
             params = preintegration_params(self._rig.imu, noise.gravity, scale, gyro, accel)
             pim = preintegrate(imu.between(start_ns, end_ns), values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._piece.still[i + 1 : j + 1].all():
-                factors += zero_velocity_factors(k, k + 1, self._backend.zero_velocity)
+                factors += zero_velocity_factors(k, k + 1)
         return factors
 
 

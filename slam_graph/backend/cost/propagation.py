@@ -10,7 +10,11 @@ import gtsam
 from gtsam.symbol_shorthand import B
 
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.adaptive_noise import DynamicsNoise, predicted_covariance
+from slam_graph.backend.cost.adaptive_noise import (
+    IMU_GAP_SCALE,
+    DynamicsNoise,
+    predicted_covariance,
+)
 from slam_graph.backend.cost.imu_factor import (
     ImuBuffer,
     imu_factor,
@@ -62,7 +66,7 @@ class Propagation:
         window.factors.append(factor)
         self._predicted = None if still else self._with_covariance(predicted, factor, window)
         if still:
-            window.factors += zero_velocity_factors(i, j, self.config.zero_velocity)
+            window.factors += zero_velocity_factors(i, j)
 
     def _with_covariance(
         self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window
@@ -89,4 +93,4 @@ class Propagation:
         if gap_s <= self.config.noise.max_imu_gap_s:
             return self.noise.params()
         self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
-        return self.noise.params(self.config.noise.imu_gap_scale)
+        return self.noise.params(IMU_GAP_SCALE)

@@ -18,8 +18,8 @@ from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
 from slam_graph.backend.gtsam_smoothers.smoother_features import NewObservations, SmootherFeatures
-from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, NativeSolver
-from slam_graph.backend.initialization.initializer import prior_of
+from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
+from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
@@ -53,9 +53,9 @@ class SmootherEngine:
         self._features = SmootherFeatures(
             context.rig, self._policy, context.config, context.diagnostics
         )
-        self._solver: NativeSolver | None = None
+        self._solver: SmootherSolver | None = None
         self._estimate = gtsam.Values()
-        self._frames: dict[int, int] = {}  # the states in the lag: index and stamp
+        self._frames: dict[int, int] = {}  # indices and stamps of the states in the lag
         self._origin_ns = 0
 
     def information(self, window: Window) -> SquareRootInformation:
@@ -98,16 +98,16 @@ class SmootherEngine:
         return ahead.current(cost.prior_at_estimate().updated(cost.factor_rows(cost.layout())))
 
     def _pause(self, tracks: FeatureTracks, ahead: Window, frame: FeatureFrame) -> NewObservations:
-        """A standstill: images would add nothing but their errors, so tracks begin anew."""
+        """At a standstill images only add errors: no factors, and tracks begin again."""
         tracks.keep_frames([])
-        tracks.add(ahead.frame, frame)  # where a later feature may begin
+        tracks.add(ahead.frame, frame)
         tracks.remove(Outcome.STANDSTILL, self._features.active)
         return NewObservations()
 
     def _observations(
         self, tracks: FeatureTracks, ahead: Window, predicted: NavState, frame: FeatureFrame
     ) -> NewObservations:
-        """What the images add to the graph."""
+        """What the images add to the graph at the new state."""
         tracks.keep_frames(list(self._frames))
         tracks.add(ahead.frame, frame)
         estimate = gtsam.Values(self._estimate)
@@ -121,9 +121,9 @@ class SmootherEngine:
         return (stamp_ns - self._origin_ns) * 1e-9
 
     def _solve(self, window: Window, ahead: Window, new: NewObservations) -> None:
-        """Update the smoother; if it fails, without this step's features, at last from anew."""
+        """Update the smoother; without new features if that fails, then from the last state."""
         if self._solver is None:
-            self._solver = self._begun(window)
+            self._solver = self._begin(window)
         stamps = dict.fromkeys(imu_state_keys(ahead.frame), self._seconds(ahead.stamp_ns))
         values = _values_of(ahead.state, ahead.frame)
         old_factors, (old_values, old_stamps) = self._solver.factors(), self._solver.everything()
@@ -135,7 +135,7 @@ class SmootherEngine:
             return
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:120]
-            message = f"one frame goes without its features ({reason})"
+            message = f"the features of one frame are not used ({reason})"
             self._context.diagnostics.warn("features_degenerate", message)
         try:
             self._solver = SOLVERS[self._context.algorithm.engine](self._policy)
@@ -147,19 +147,19 @@ class SmootherEngine:
             self._solver.update([*factors, *ahead.factors], old_values, {**old_stamps, **stamps})
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:120]
-            message = f"all but the last state is given up ({reason})"
+            message = f"the graph is restarted from the last state ({reason})"
             self._context.diagnostics.warn("smoother_restarted", message)
-            self._solver = self._begun(window)
+            self._solver = self._begin(window)
             self._solver.update(ahead.factors, values, stamps)
 
-    def _begun(self, window: Window) -> NativeSolver:
-        """A smoother of nothing but the state of a window."""
+    def _begin(self, window: Window) -> SmootherSolver:
+        """A smoother that holds the state of a window only."""
         keys = imu_state_keys(window.frame)
         if not self._frames:
             self._origin_ns = window.stamp_ns
         self._frames = {window.frame: window.stamp_ns}
         prior = joint_prior(window.prior.marginal(keys), window.state.first)
-        solver: NativeSolver = SOLVERS[self._context.algorithm.engine](self._policy)
+        solver = SOLVERS[self._context.algorithm.engine](self._policy)
         values = _values_of(window.state, window.frame)
         solver.update([prior], values, dict.fromkeys(keys, self._seconds(window.stamp_ns)))
         return solver
@@ -189,7 +189,7 @@ class SmootherEngine:
         return state
 
     def _read(self, ahead: Window) -> None:
-        """Read from the smoother what the next steps need, and forget what has left."""
+        """Read the estimates that the next steps need, and forget what was marginalised."""
         assert self._solver is not None
         oldest_ns = ahead.stamp_ns - round(self._policy.lag_s * 1e9)
         self._frames[ahead.frame] = ahead.stamp_ns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Factors of GTSAM alone for observations and for a prior, as its own smoothers need them."""
+"""GTSAM's factors for observations and for a prior, as its smoothers need them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.errors import ConfigError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
+
+__all__ = ["ProjectionFactors", "calibration", "joint_prior", "pixel_noise"]
 
 
 def calibration(camera: Camera) -> tuple[Any, Any]:
@@ -39,7 +41,7 @@ def calibration(camera: Camera) -> tuple[Any, Any]:
 
 
 def pixel_noise(sigma_px: float, loss: RobustLoss) -> gtsam.noiseModel.Base:
-    """Noise of an observation, with the robust loss around it."""
+    """Noise model of an observation under a robust loss."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_px)
     estimators = gtsam.noiseModel.mEstimator
     if loss.name == "huber":
@@ -50,7 +52,7 @@ def pixel_noise(sigma_px: float, loss: RobustLoss) -> gtsam.noiseModel.Base:
 
 
 class ProjectionFactors:
-    """Makes projection factors for the cameras of a rig."""
+    """Makes the projection factors of the cameras of a rig."""
 
     def __init__(self, rig: Rig, noise: gtsam.noiseModel.Base) -> None:
         self._noise = noise
@@ -59,7 +61,7 @@ class ProjectionFactors:
     def of(self, obs: Observations) -> list[gtsam.NonlinearFactor]:
         """One factor between `X(frame)` and `L(feature)` for each observation.
 
-        A point behind the camera gets a constant cost instead of an exception.
+        For a point behind the camera the cost is constant; no exception is raised.
         """
         factors = []
         poses, points = [X(i) for i in obs.frames], [L(j) for j in obs.ids.tolist()]
@@ -78,11 +80,11 @@ class ProjectionFactors:
 
 
 def joint_prior(prior: SquareRootInformation, at: gtsam.Values) -> gtsam.NonlinearFactor:
-    """A Gaussian over pose, velocity and bias of one frame as one factor, with all correlations.
+    """A Gaussian on pose, velocity and bias of one frame as one factor, with all correlations.
 
     Args:
-        prior: ‖R δ - d‖² over exactly these three variables.
-        at: the point from which δ is counted.
+        prior: ‖R δ - d‖² on exactly these three variables.
+        at: the linearisation point, at which δ is zero.
     """
     (x, A_x), (v, A_v), (b, A_b) = (
         (key, prior.R[:, columns]) for key, columns in prior.layout.columns.items()
