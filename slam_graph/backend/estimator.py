@@ -19,8 +19,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
-from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.initialization.initializer import Initializer, start_from
@@ -34,6 +33,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 

@@ -50,8 +50,8 @@ def interpolate(
             positions,
             _slerp(trajectory.quaternions[before], trajectory.quaternions[after], weight),
             blend(trajectory.velocities),
-            blend(trajectory.gyro_biases),
-            blend(trajectory.accel_biases),
+            accel_biases=blend(trajectory.accel_biases),
+            gyro_biases=blend(trajectory.gyro_biases),
         ),
         valid,
     )

@@ -20,8 +20,8 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import AdaptiveNoiseConfig, NoiseConfig
-from slam_graph.backend.cost.imu_factor import preintegration_params
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegration_params
 from slam_graph.sensors.rig import ImuNoise
 
 MOST_SURPRISE = 4.0

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.backend.cost.imu_factor import ImuBuffer
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 OWN_MOTION = 3.0

@@ -29,7 +29,7 @@ from slam_graph.sensors.rig import Rig
 
 GATE_SCALE = 4.0
 """The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
-OUTLIER_PX = 3.0
+OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error do not enter, in units of σ."""
 
 
@@ -144,7 +144,7 @@ class SmootherFeatures:
             return obs.subset(np.zeros(len(ids), np.bool_)), np.zeros((0, 3))
         poses = stacked_poses(estimate, obs.frames)
         result = triangulate(obs, self._rig, *poses, self._triangulation)
-        fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
+        fits = result.reprojection_px < OUTLIER_SIGMAS * self._config.noise.pixel_sigma
         good = result.good & fits
         longest = np.argsort(-np.where(good, lengths, 0), kind="stable")[:room]
         chosen = np.zeros(len(ids), np.bool_)

@@ -16,16 +16,16 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegrate
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.static_start import level_rotation
 from slam_graph.backend.initialization.visual_inertial_alignment import Alignment, Motion, align
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegrate
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
-OUTLIER_PX = 3.0
+OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error leave the window, in units of σ."""
 
 MIN_FEATURES = 10
@@ -109,7 +109,7 @@ def guess_states(
     if len(ids) < MIN_FEATURES:
         return f"more features that last ({len(ids)} so far)"
     obs = tracks.observations(ids)
-    tolerance = OUTLIER_PX * config.pixel_sigma / rig.cameras[0].fx
+    tolerance = OUTLIER_SIGMAS * config.pixel_sigma / rig.cameras[0].fx
 
     def agreed(seen: StartWindow) -> tuple[FloatArray, Motion, BoolArray] | None:
         gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params)
@@ -168,8 +168,8 @@ def _states(
             stamp_ns,
             gtsam.Pose3(gtsam.Rot3.ClosestTo(rotations[k]), positions[k]),
             velocities[k],
-            gyro_bias,
-            np.zeros(3),
+            accel_bias=np.zeros(3),
+            gyro_bias=gyro_bias,
         )
         for k, stamp_ns in enumerate(window.stamps_ns)
     ]

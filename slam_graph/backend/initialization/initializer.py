@@ -21,12 +21,12 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost, NewFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
-from slam_graph.backend.cost.imu_factor import ImuBuffer, imu_factor, preintegrate
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.initialization.dynamic_start import (
-    OUTLIER_PX,
+    OUTLIER_SIGMAS,
     StartGuess,
     StartWindow,
     guess_states,
@@ -44,6 +44,7 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegrate
 from slam_graph.sensors.measurements import FeatureFrame
 
 BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
@@ -257,7 +258,7 @@ class Initializer:
         """
         obs = _lasting(window)
         result = self._points(cost, obs)
-        fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
+        fits = result.reprojection_px < OUTLIER_SIGMAS * self._config.noise.pixel_sigma
         good = result.good & fits
         self.unfit = obs.ids[~fits]
         self._enter(cost, obs, result, good)
