@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from flight import FISHEYE, rig
-from slam_graph.mapping import final_adjustment
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.config import load_config
@@ -33,6 +32,7 @@ from slam_graph.simulation.simulation_config import (
     TrackConfig,
 )
 from slam_graph.simulation.simulator import simulate
+from slam_graph.smoothing import final_adjustment
 from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, pieces
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.recording_problem import nearest_keyframe
