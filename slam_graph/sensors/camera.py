@@ -15,17 +15,13 @@ from typing import Any
 
 import numpy as np
 
-# importing the built-in models registers them
-import slam_graph.sensors.omnidirectional_models
-import slam_graph.sensors.pinhole_models  # noqa: F401
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera_model import (
     CAMERA_MODELS,
     MAX_TANGENT,
     CameraModel,
-    camera_models,
-    find_camera_model,
+    camera_model,
     register_camera_model,
 )
 
@@ -34,8 +30,6 @@ __all__ = [
     "MAX_TANGENT",
     "Camera",
     "CameraModel",
-    "camera_models",
-    "find_camera_model",
     "register_camera_model",
 ]
 
@@ -73,7 +67,7 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        count = len(find_camera_model(self.distortion).coefficient_names)
+        count = len(self.model.coefficient_names)
         if len(self.coefficients) != count:
             raise DataError(
                 f"distortion '{self.distortion}' has {count} coefficients, "
@@ -82,10 +76,10 @@ class Camera:
         if not (self.fx > 0 and self.fy > 0):
             raise DataError(f"focal lengths must be positive, got ({self.fx}, {self.fy})")
 
-    @property
+    @cached_property
     def model(self) -> CameraModel:
         """The camera model."""
-        return CAMERA_MODELS[self.distortion]
+        return camera_model(self.distortion)
 
     @property
     def K(self) -> FloatArray:

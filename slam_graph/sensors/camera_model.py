@@ -13,33 +13,30 @@ no state. To add one, subclass `CameraModel` and register it::
         coefficient_names = ("w",)
         ...
 
-or name the class in the entry-point group ``slam_graph.camera_models`` of a package. It can then
-be used in calibration files, simulated, and calibrated online like those that are built in.
+or give a package an entry point in the group ``slam_graph.camera_models``, with the name of the
+model, that refers to the class. It can then be used in calibration files, simulated, and calibrated
+online like those that are built in.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from functools import cache
-from importlib.metadata import entry_points
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import ConfigError, DataError
+from slam_graph.plugins import Registry
 
 __all__ = [
     "CAMERA_MODELS",
     "MAX_TANGENT",
     "CameraModel",
-    "camera_models",
-    "find_camera_model",
+    "camera_model",
     "register_camera_model",
 ]
-
-PLUGIN_GROUP = "slam_graph.camera_models"
 
 MAX_TANGENT = 6.0
 """Longest normalised point that is used: 80.5° off the axis. What a lens sees beyond has no place
@@ -156,8 +153,17 @@ class CameraModel(ABC):
         return m
 
 
-CAMERA_MODELS: dict[str, CameraModel] = {}
-"""The camera models by name; `camera_models` has those of plugins too."""
+def _is_model(part: object) -> bool:
+    return isinstance(part, type) and issubclass(part, CameraModel)
+
+
+CAMERA_MODELS: Registry[type[CameraModel]] = Registry(
+    "slam_graph.camera_models",
+    "camera model",
+    home="slam_graph.sensors.omnidirectional_models",  # which needs the other built-in models
+    accepts=_is_model,
+)
+"""The camera models by name, those of installed plugins too."""
 
 ModelT = TypeVar("ModelT", bound=type[CameraModel])
 
@@ -168,50 +174,25 @@ def register_camera_model(model: ModelT) -> ModelT:
     Raises:
         ConfigError: if another model has this name.
     """
-    known = CAMERA_MODELS.get(model.name)
-    if known is not None and type(known) is not model:
-        raise ConfigError(
-            f"camera model '{model.name}' is registered already, by {type(known).__module__}"
-        )
-    CAMERA_MODELS[model.name] = model()
-    return model
+    return CAMERA_MODELS.register(model.name)(model)
 
 
-def camera_models() -> tuple[CameraModel, ...]:
-    """All camera models, those of installed plugins too.
-
-    Raises:
-        ConfigError: if a plugin cannot be loaded.
-    """
-    _load_plugins()
-    return tuple(CAMERA_MODELS.values())
-
-
-def find_camera_model(name: str) -> CameraModel:
+def camera_model(name: str) -> CameraModel:
     """The camera model of a name.
 
     Raises:
         DataError: if there is none.
-        ConfigError: if it is not built in, and a plugin cannot be loaded.
+        ConfigError: if it is a plugin's that cannot be loaded, or has another name itself.
     """
     if name not in CAMERA_MODELS:
-        _load_plugins()
-    if name not in CAMERA_MODELS:
-        from slam_graph.settings.tree import closest
-
-        raise DataError(f"unknown distortion model '{name}'; {closest(name, CAMERA_MODELS)}")
-    return CAMERA_MODELS[name]
-
-
-@cache
-def _load_plugins() -> None:
-    for point in entry_points(group=PLUGIN_GROUP):
-        try:
-            register_camera_model(point.load())
-        except Exception as error:
-            raise ConfigError(
-                f"camera model '{point.name}' ({point.value}) cannot be loaded: {error}"
-            ) from error
+        raise DataError(CAMERA_MODELS.unknown(name))
+    model = CAMERA_MODELS[name]
+    if model.name != name:
+        raise ConfigError(
+            f"camera model '{name}': the class {model.__name__} has the name '{model.name}'; "
+            "its entry point must have the same"
+        )
+    return model()
 
 
 def _solve_2x2(A: FloatArray, b: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ import gtsam
 
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-from slam_graph.sensors.camera import Camera, CameraModel, camera_models
+from slam_graph.sensors.camera import CAMERA_MODELS, Camera, CameraModel
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 __all__ = [
@@ -60,7 +60,7 @@ def _read_model(entry: YamlValue) -> tuple[CameraModel, bool]:
     A model with leading coefficients, such as Kalibr's omni, goes with the distortion `none` too.
     """
     camera = entry.require("camera_model", "model")
-    known = camera_models()
+    known = [part() for _, part in CAMERA_MODELS.working()]
     models = [model for model in known if model.kalibr_camera == camera.text()]
     if not models:
         cameras = ", ".join(dict.fromkeys(model.kalibr_camera for model in known))
@@ -71,6 +71,8 @@ def _read_model(entry: YamlValue) -> tuple[CameraModel, bool]:
             return model, True
     if distortion.text() == "none" and models[0].leading:
         return models[0], False
+    if distortion.text() in CAMERA_MODELS:
+        CAMERA_MODELS[distortion.text()]  # raises the error of a plugin that does not work
     names = [name for model in known for name in _distortion_names(model)]
     if distortion.text() not in names:
         raise DataError(

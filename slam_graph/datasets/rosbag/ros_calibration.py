@@ -14,7 +14,7 @@ from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
 from slam_graph.datasets.rosbag.topics import Topics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera, camera_models
+from slam_graph.sensors.camera import CAMERA_MODELS, Camera
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 STATIC_TOPIC = "/tf_static"
@@ -68,7 +68,7 @@ def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
     fx, fy, cx, cy = (P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]).tolist()
     if rectified or not np.any(D):
         return Camera(fx, fy, cx, cy, "none", (), *size)
-    models = {name: model for model in camera_models() for name in model.ros_names}
+    models = {name: model for _, model in CAMERA_MODELS.working() for name in model.ros_names}
     model = models.get(info.distortion_model)
     count = 0 if model is None else len(model.coefficient_names)
     if model is None or np.any(D[count:]):
