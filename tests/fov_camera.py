@@ -5,7 +5,8 @@
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.sensors.camera import Camera, CameraModel, register_camera_model
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CameraModel, register_camera_model
 
 
 @register_camera_model

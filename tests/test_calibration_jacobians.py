@@ -31,7 +31,8 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 from slam_graph.config import load_config
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.camera import CAMERA_MODELS, Camera
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS
 from slam_graph.sensors.measurements import FeatureFrame
 
 PLAIN = replace(RADTAN, distortion="none", coefficients=())

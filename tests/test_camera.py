@@ -15,12 +15,8 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.image_frontend import ImageFrontend
-from slam_graph.sensors.camera import (
-    CAMERA_MODELS,
-    MAX_TANGENT,
-    Camera,
-    register_camera_model,
-)
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS, MAX_TANGENT, register_camera_model
 from slam_graph.sensors.measurements import CameraFrame
 from slam_graph.sensors.rig import Rig, RigCamera
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 
-__all__ = ["NavState", "StateHistory", "Trajectory", "seconds_text", "tum_lines"]
+__all__ = ["NavState", "StateHistory", "Trajectory", "tum_lines"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras, IMU and rig: models, calibration files, and the measurements that sensors make.
 
-- `camera`: `Camera`, and `CAMERA_MODELS` with the models by name; `camera_model` says what a model
-  is and how to add one.
+- `camera`: `Camera`.
+- `camera_model`: `CameraModel`, `CAMERA_MODELS` with the models by name, and how to add one.
 - `rig`: `Rig`, `RigCamera`, `ImuNoise`.
 - `measurements`: `ImuData`, `CameraFrame`, `FeatureObservations`, `FeatureFrame`, `Packet`.
 - `imu_buffer`: `ImuBuffer`, and the integration of the IMU.

@@ -30,13 +30,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.plugins import Registry
 
-__all__ = [
-    "CAMERA_MODELS",
-    "MAX_TANGENT",
-    "CameraModel",
-    "camera_model",
-    "register_camera_model",
-]
+__all__ = ["CAMERA_MODELS", "CameraModel", "register_camera_model"]
 
 MAX_TANGENT = 6.0
 """Longest normalised point that is used: 80.5° off the axis. What a lens sees beyond has no place

@@ -12,11 +12,11 @@ import gtsam
 
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-from slam_graph.sensors.camera import CAMERA_MODELS, Camera, CameraModel
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 __all__ = [
-    "CameraEntry",
     "camera_entry",
     "has_rolling_shutter",
     "read_body_T_sensor",

@@ -28,7 +28,6 @@ from slam_graph.backend.solve.square_root import Layout
 from slam_graph.geometry.trajectory import NavState
 
 __all__ = [
-    "DIMS",
     "POINT_DIM",
     "POSE_DIM",
     "FrameMotion",

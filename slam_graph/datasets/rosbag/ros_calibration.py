@@ -14,7 +14,8 @@ from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
 from slam_graph.datasets.rosbag.topics import Topics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import CAMERA_MODELS, Camera
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 STATIC_TOPIC = "/tf_static"
