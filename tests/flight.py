@@ -110,9 +110,9 @@ class Flight:
             round(t_s * NS_PER_S),
             gtsam.Pose3(gtsam.Rot3(self.rotation(at).as_matrix()[0]), self.positions(at)[0]),
             self.velocities(at)[0],
-            self.gyro_bias,
-            self.accel_bias,
-            None if sigmas is None else np.diag(np.repeat(sigmas, 3) ** 2),
+            accel_bias=self.accel_bias,
+            gyro_bias=self.gyro_bias,
+            covariance=None if sigmas is None else np.diag(np.repeat(sigmas, 3) ** 2),
         )
 
 

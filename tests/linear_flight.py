@@ -12,14 +12,9 @@ from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, GatingConfig, InitializationConfig
-from slam_graph.backend.cost.imu_factor import (
-    ImuBuffer,
-    imu_factor,
-    predict,
-    preintegrate,
-    preintegration_params,
-)
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate, preintegration_params
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 
@@ -65,9 +60,9 @@ def given_start() -> NavState:
         true.stamp_ns,
         true.world_T_body.retract(error[:6]),
         true.velocity + error[6:9],
-        true.gyro_bias + error[12:],
-        true.accel_bias + error[9:12],
-        true.covariance,
+        accel_bias=true.accel_bias + error[9:12],
+        gyro_bias=true.gyro_bias + error[12:],
+        covariance=true.covariance,
     )
 
 

@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegration_params
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess, guess_states
@@ -25,6 +24,7 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
 PARAMS = preintegration_params(rig().imu, 9.81)

@@ -19,7 +19,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine import SquareRootEngine

@@ -36,7 +36,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
@@ -44,6 +44,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactor
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.keyframe_states import fill_in
 from slam_graph.smoothing.recording_keyframes import (
@@ -454,8 +455,8 @@ class BundleAdjustment:
                     stamp_ns,
                     self._values.atPose3(X(k)),
                     np.asarray(self._values.atVector(V(k))),
-                    np.asarray(bias.gyroscope()),
-                    np.asarray(bias.accelerometer()),
+                    accel_bias=np.asarray(bias.accelerometer()),
+                    gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
         params = preintegration_params(self._rig.imu, self._backend.noise.gravity)

@@ -30,7 +30,7 @@ from slam_graph.sensors.rig import Rig
 __all__ = ["NewObservations", "SmootherFeatures"]
 
 GATE_SCALE = 4.0
-"""The gate is this much wider, as it is computed without the covariance of the features."""
+"""The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error do not enter, in units of σ."""
 
