@@ -53,8 +53,8 @@ FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics], Frontend]]
 PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
 """The detector that a descriptor was published with; for BRIEF, which has none, FAST."""
 
-RANSAC_PX = {"klt": 1.0, "matching": 1.5}
-"""Default of `ransac_px`: matched keypoints are located anew in each image, less exactly."""
+TRACKED_RANSAC_PX, MATCHED_RANSAC_PX = 1.0, 1.5
+"""Defaults of `ransac_px`: matched keypoints are located anew in each image, less exactly."""
 
 _MATCHING = "is a constant now, in slam_graph/frontend/matching.py"
 _TRACKING = "is a constant now, in slam_graph/frontend/lucas_kanade.py"
@@ -172,4 +172,4 @@ class FrontendConfig(Settings):
         """Largest epipolar distance of an inlier between two frames, for the method chosen."""
         if self.ransac_px is not None:
             return self.ransac_px
-        return RANSAC_PX["klt" if self.method == "klt" else "matching"]
+        return MATCHED_RANSAC_PX if self.method in DESCRIPTORS else TRACKED_RANSAC_PX

@@ -13,7 +13,7 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.association import Associator
 from slam_graph.frontend.camera_tracker import CameraTracker
 from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
-from slam_graph.frontend.frontend_config import FRONTENDS, FrontendConfig
+from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
@@ -38,8 +38,8 @@ CLAHE_CLIP_LIMIT, CLAHE_TILES = 3.0, (8, 8)
 class ImageFrontend:
     """Tracks features of the first camera and finds them in the cameras that see the same.
 
-    A camera that sees little of what an earlier one sees has features of its own. The method is
-    `klt` or the name of a descriptor.
+    A camera that sees little of what an earlier one sees has features of its own. They are matched
+    if `method` names a descriptor, and tracked otherwise.
 
     Args:
         rig: calibrated cameras.
@@ -208,10 +208,10 @@ class ImageFrontend:
 def _associator(
     camera: Camera, extractor: FeatureExtractor, config: FrontendConfig, mask: Image | None
 ) -> Associator:
-    """Lucas-Kanade, or matching of the descriptor that the method names."""
-    if config.method == "klt":
-        return CornerTracking(extractor, config)
-    return DescriptorMatching(camera, extractor, config, mask)
+    """Matching of the descriptor that the method names, or Lucas-Kanade."""
+    if config.method in DESCRIPTORS:
+        return DescriptorMatching(camera, extractor, config, mask)
+    return CornerTracking(extractor, config)
 
 
 def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
