@@ -156,7 +156,7 @@ def test_wrong_calibration_and_units_are_found(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace(",9.8", ",0.98"))  # g instead of m/s²
     texts = found(tmp_path)
     assert any("principal point" in text for text in texts["error"])
-    assert any("at rest instead of" in text for text in texts["error"])
+    assert any("at rest, expected" in text for text in texts["error"])
     assert any("the calibration says 100.0 Hz" in text for text in texts["warning"])
 
 

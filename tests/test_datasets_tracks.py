@@ -12,7 +12,8 @@ from recordings import edit_line, edit_text, write_euroc, write_lines, write_ope
 
 from slam_graph.datasets.formats.eqvio import EqvioTracks, wheel_tracks
 from slam_graph.datasets.formats.openvins_sim import OpenvinsSimulation
-from slam_graph.datasets.formats.track_recording import TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
+from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState

@@ -149,7 +149,7 @@ def _watch(
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
     """What is done with every frame: drawn, and recorded if asked for."""
-    from slam_graph.datasets.formats.track_recording import TrackRecorder
+    from slam_graph.datasets.formats.track_recorder import TrackRecorder
     from slam_graph.sensors.measurements import CameraFrame
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
 

@@ -99,7 +99,7 @@ def _read_poses(path: Path) -> FloatArray:
     """Poses (N, 3, 4) of a file with twelve numbers a row.
 
     Raises:
-        DataError: naming file and line of a row that cannot be read.
+        DataError: if a row cannot be read; names file and line.
     """
     blocks = [
         parse(rows, [("pose", "f8", (12,))], "12 numbers of a 3x4 pose", None, None)["pose"]

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.formats import track_format as layout
-from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.datasets.sequence import (
     Extent,
     FrameStream,
@@ -33,7 +32,7 @@ from slam_graph.sensors.calibration_yaml import read_yaml
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
-__all__ = ["TrackRecorder", "TrackRecordingSequence", "is_recording"]
+__all__ = ["TrackRecordingSequence", "is_recording"]
 
 SAMPLES_PER_BLOCK = 4096
 """IMU samples that are read at a time."""

@@ -1,17 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""TUM RGB-D: colour images of a Kinect with motion capture; neither a gyroscope nor an IMU.
+"""TUM RGB-D: colour images of a Kinect with motion capture, without an IMU.
 
 Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. ``rgb.txt`` lists
 time [s] and file of the images, ``groundtruth.txt`` the poses of the colour camera's optical frame.
-The images are undistorted with the published calibration as they are read.
 ``depth.txt`` and the depth images are not read, nor is ``accelerometer.txt``, which is of no use
 without a gyroscope.
 
-Images brought into the frame of a pinhole without distortion, where no camera model fits them.
-
-KITTI's unsynchronised images and those of TUM RGB-D are calibrated with five coefficients of
-Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows.
+The images are undistorted with the published calibration as they are read, because it has five
+coefficients of Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows. `rectifier`
+does the same for KITTI's unsynchronised images.
 """
 
 from __future__ import annotations
@@ -39,6 +37,8 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.rig import Rig, RigCamera
 
+__all__ = ["TumRgbdSequence", "is_tum_rgbd", "rectifier"]
+
 Size = tuple[int, int]
 
 
@@ -50,9 +50,9 @@ def rectifier(
     size: Size,
     rectified_size: Size,
 ) -> Callable[[Image], Image]:
-    """What turns images of a distorted camera into rectified ones.
+    """A function that turns images of a distorted camera into rectified ones.
 
-    Images of another size than `size` are handed back as they are, to be found by their size.
+    Images of another size than `size` are returned as they are, to be refused for their size.
 
     Args:
         K: (3, 3) of the camera as it is.
