@@ -87,8 +87,8 @@ class FrontendConfig(Settings):
 
     method: Annotated[str, Choice(FRONTENDS, DESCRIPTORS)] = "klt"
     """How features are found again in the next image. `klt` tracks corners by Lucas-Kanade: the
-    most accurate and the fastest here. A descriptor (`sift`, `surf`, `orb`, `brisk`, `brief`)
-    matches keypoints, which bridges larger motions and short occlusions with shorter tracks."""
+    longest tracks, in the least time. A descriptor (`sift`, `surf`, `orb`, `brisk`, `brief`)
+    matches keypoints, and finds features again that were hidden for a few frames."""
 
     detector: Annotated[str, Choice(DETECTORS, others=("auto",))] = "auto"
     """What finds features. `auto` is Shi-Tomasi for `klt`, and for a descriptor the detector that
@@ -96,7 +96,7 @@ class FrontendConfig(Settings):
 
     max_features: PositiveCount = 200
     """Number of features aimed at in the first camera; the other cameras look for these same ones.
-    More give a little more accuracy, and cost time in front end and back end alike."""
+    More make the estimate less dependent on single ones, and cost time in front and back end."""
 
     grid: tuple[PositiveCount, PositiveCount] = (8, 6)
     """Columns and rows of the grid over which features are spread evenly. Fit it to the shape of
