@@ -13,7 +13,13 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import ImuData
@@ -67,7 +73,7 @@ class SimulatedSequence(RecordedSequence):
         flight: Flight,
         diagnostics: Diagnostics | None = None,
     ) -> None:
-        super().__init__(name, flight.rig, None, diagnostics)
+        super().__init__(name, flight.rig, ReaderOptions(diagnostics=diagnostics or Diagnostics()))
         self.config = config
         self.flight = flight
         self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)
