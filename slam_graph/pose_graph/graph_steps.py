@@ -126,7 +126,7 @@ def _optimized(
     policy: PoseGraphStepsPolicy,
     max_steps: int,
 ) -> Minimum:
-    """The minimum that an optimizer of GTSAM finds; `kind` is its class and that of its settings."""
+    """The minimum that an optimizer of GTSAM finds; `kind`: its class and that of its settings."""
     optimizer_of, parameters_of = kind
     parameters = _parameters(parameters_of(), policy.tolerance, max_steps)
     optimizer = optimizer_of(cost.factors(), values_of(start), parameters)
