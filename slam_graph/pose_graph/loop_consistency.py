@@ -14,12 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 __all__ = ["confirmed_loops"]
@@ -41,7 +40,7 @@ class _Pairs:
     """
 
     members: IntArray
-    consistent: NDArray[np.bool_]
+    consistent: BoolArray
 
 
 def confirmed_loops(graph: PoseGraph, along_odometry: Poses, bound: float) -> IntArray:
