@@ -86,8 +86,8 @@ class MergedMaps:
 def merge_maps(
     first: SlamMap,
     second: SlamMap,
-    loops: LoopClosureConfig,
-    localization: LocalizationConfig,
+    loops: LoopClosureConfig | None = None,
+    localization: LocalizationConfig | None = None,
     seed: int = 0,
 ) -> MergedMaps:
     """Merge two maps.
@@ -95,14 +95,15 @@ def merge_maps(
     Args:
         first: its first keyframe keeps its pose.
         second: of the same place; its world may be any other.
-        loops: settings of verification, and the drift of odometry.
-        localization: settings of matching.
+        loops: settings of verification, and the drift of odometry; defaults if not given.
+        localization: settings of matching; defaults if not given.
         seed: of the training of the new vocabulary.
 
     Raises:
         DataError: if the maps have different kinds of descriptors.
         EstimationError: if they share no place.
     """
+    loops, localization = loops or LoopClosureConfig(), localization or LocalizationConfig()
     level = first.gravity_aligned and second.gravity_aligned
     found = list(_matched(first, second, loops, localization, level))
     consistent, first_T_second = _aligned(first, second, found, localization, level)

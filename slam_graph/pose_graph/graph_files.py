@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,9 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, parse
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
+from slam_graph.settings.tree import closest
 
 __all__ = ["g2o_lines", "read_pose_graph"]
 
@@ -108,6 +109,12 @@ def read_pose_graph(
 ) -> PoseGraph:
     """Read a pose graph.
 
+    Args:
+        path: of a g2o or TORO file.
+        diagnostics: counts repairs.
+        rotation_information: whether the information of 3D rotations belongs to the angle (GTSAM)
+            or to the vector part of the quaternion (g2o).
+
     Faults that do not change the problem are repaired and counted in `diagnostics`, and so are
     lines of unknown kinds, which are skipped.
 
@@ -115,7 +122,11 @@ def read_pose_graph(
         DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
             has an edge to a missing vertex, numbers that are not finite, or an information matrix
             that is not positive definite.
+        ConfigError: if `rotation_information` is unknown.
     """
+    if rotation_information not in get_args(RotationInformation):
+        hint = closest(str(rotation_information), get_args(RotationInformation))
+        raise ConfigError(f"unknown rotation_information '{rotation_information}'; {hint}")
     path, diagnostics = Path(path), diagnostics or Diagnostics()
     blocks = [_parse(rows, tag) for tag, rows in _by_kind(path, diagnostics).items()]
     vertices = [block for block in blocks if block.ids.shape[1] == 1]
