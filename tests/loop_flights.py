@@ -50,7 +50,9 @@ def tour(
         rate_hz=4.0,
         flight=FlightConfig(hover_s=0.0),
         landmarks=LandmarkConfig(density=4.0),
-        tracks=TrackConfig(features=80, outliers=0.01, descriptors=True, descriptor_looks=looks),
+        tracks=TrackConfig(
+            features=80, outliers=0.01, descriptors=True, distinct_descriptors=looks
+        ),
     )
     sequence = cast(SimulatedTracks, simulate(config))
     truth = sequence.groundtruth()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A comparison: record every source under every seed, run every algorithm on that, report."""
+"""The tasks of a comparison: record every source with every seed, run every algorithm on that."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from slam_graph.config import RunConfig
 from slam_graph.errors import ConfigError
@@ -16,51 +17,67 @@ from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import RecordTask, RunTask, Task
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
-WITHOUT_FEJ = "_no_fej"
-"""What the name of an algorithm without first-estimates Jacobians ends in."""
+__all__ = [
+    "WITHOUT_FEJ",
+    "Comparison",
+    "Progress",
+    "load_configs",
+    "plan",
+    "run_tasks",
+    "with_variants",
+]
 
-Told = Callable[[Task, str | None, int, int], None]
-"""Is told of each task that has ended, why it failed if it did, and how many of how many have."""
+WITHOUT_FEJ = "_no_fej"
+"""Suffix of the name of an algorithm without first-estimates Jacobians."""
+
+Progress = Callable[[Task, str | None, int, int], None]
+"""Called after each task: the task, why it failed or None, tasks done, tasks to do."""
 
 
 @dataclass
 class Comparison:
-    """All tasks of a comparison, and what became of them.
+    """The tasks of a comparison and their outcome.
 
     Attributes:
         folder: of all files.
-        runs: of all algorithms, on all data, for all seeds, in the order of the tables.
-        failures: why a task could not be done, by its name; a run that diverged is not one.
-        skipped: how many tasks had been done before.
+        runs: of all algorithms, on all data, for all seeds, in the order of the table.
+        failures: why a task could not be done, by its name; a run that diverged is not a failure.
+        skipped: number of tasks that had been done before.
+        rows: of the table, one for each algorithm and data set; empty before the report is written.
+        files: of the report.
     """
 
     folder: Path
     runs: list[RunTask]
     failures: dict[str, str] = field(default_factory=dict)
     skipped: int = 0
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
 
 
 def load_configs(
     algorithms: Sequence[str], load: Callable[[str], RunConfig]
 ) -> dict[str, RunConfig]:
-    """The settings under each algorithm, by the name that the algorithm gives itself.
+    """The settings of a run with each algorithm, by the `name` in the algorithm's file.
 
     Args:
         algorithms: names, or paths of YAML files.
         load: gives the settings for one of these.
 
     Raises:
-        ConfigError: if two have the same name, or there are none.
+        ConfigError: if two have the same name, or there is none.
     """
     configs: dict[str, RunConfig] = {}
     for algorithm in algorithms:
         config = load(algorithm)
         name = config.algorithm.name
         if name in configs:
-            raise ConfigError(f"--algorithms: '{name}' is there twice; give one another name")
+            raise ConfigError(
+                f"algorithms: '{name}' is given twice; change the name in one of the files"
+            )
         configs[name] = config
     if not configs:
-        raise ConfigError("--algorithms: none is named")
+        raise ConfigError("algorithms: none is given")
     return configs
 
 
@@ -81,43 +98,48 @@ def with_variants(configs: Mapping[str, RunConfig]) -> dict[str, RunConfig]:
     return both
 
 
-def compare(
+def run_tasks(
     sources: Sequence[Source],
     configs: Mapping[str, RunConfig],
-    seeds: int,
-    folder: Path,
+    seeds: int | Sequence[int],
+    folder: str | Path,
     executor: Executor,
-    told: Told,
+    progress: Progress,
 ) -> Comparison:
-    """Do what has not been done yet. An interruption loses only the tasks that are under way.
+    """Do the tasks that have not been done yet. An interruption loses only those in progress.
 
     Args:
-        sources: what to run on.
-        configs: settings under each algorithm, which differ in nothing else.
-        seeds: how many; 0, 1, … are taken. Where a seed changes nothing there is only one.
+        sources: recordings and simulations.
+        configs: settings by algorithm, which differ in the algorithm only.
+        seeds: their number, for 0, 1, …, or the seeds themselves. Where a seed changes nothing only
+            the first is used.
         folder: of tracks and results.
         executor: does the tasks.
-        told: is told of the progress.
+        progress: called after each task.
     """
-    folder = folder.resolve()
+    folder = Path(folder).resolve()
     recordings, runs = plan(sources, configs, seeds, folder)
     comparison = Comparison(folder, runs)
-    _do(comparison, recordings, executor, told)
-    _do(comparison, [task for task in runs if task.tracks.is_dir()], executor, told)
+    _do(comparison, recordings, executor, progress)
+    _do(comparison, [task for task in runs if task.tracks.is_dir()], executor, progress)
     return comparison
 
 
 def plan(
-    sources: Sequence[Source], configs: Mapping[str, RunConfig], seeds: int, folder: Path
+    sources: Sequence[Source],
+    configs: Mapping[str, RunConfig],
+    seeds: int | Sequence[int],
+    folder: Path,
 ) -> tuple[list[RecordTask], list[RunTask]]:
     """All tasks: one recording for each source and seed, and on it a run of every algorithm."""
     recordings: list[RecordTask] = []
     runs: list[RunTask] = []
     common = next(iter(configs.values()))
-    replay = {"start_s": 0.0, "duration_s": None, "cameras": None}  # the recording is cut already
-    alike = FinalBaConfig(enabled=False)  # it would end all of them in much the same
+    numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
+    replay = {"start_s": 0.0, "duration_s": None, "cameras": None}  # the tracks are cut already
+    causal = FinalBaConfig(enabled=False)  # it would make the results of all algorithms alike
     for source in sources:
-        for seed in range(seeds if source.random else 1):
+        for seed in numbers if source.random else numbers[:1]:
             record = RecordTask(source=source, seed=seed, config=common, root=folder / "tracks")
             recordings.append(record)
             runs += [
@@ -126,7 +148,7 @@ def plan(
                     algorithm=name,
                     seed=seed,
                     config=_adapted(config, source).model_copy(
-                        update={**replay, "seed": seed, "final_ba": alike}
+                        update={**replay, "seed": seed, "final_ba": causal}
                     ),
                     tracks=record.folder,
                     result=folder / "runs" / f"{source.name}_seed{seed}" / f"{name}.json",
@@ -137,10 +159,10 @@ def plan(
 
 
 def _adapted(config: RunConfig, source: Source) -> RunConfig:
-    """The settings for a source: a start with an error of its covariance keeps that covariance.
+    """The settings for a source; a start state with a drawn error keeps its covariance.
 
-    To take its position and yaw as the definition of the world would call the part of its error in
-    these zero, and every NEES would be too large by it.
+    With `fix_gauge` position and yaw of the start would be taken as exact, and every NEES would be
+    too large by their error.
     """
     if source.simulation is None or not source.simulation.known_start.error:
         return config
@@ -149,8 +171,10 @@ def _adapted(config: RunConfig, source: Source) -> RunConfig:
     return config.model_copy(update={"backend": backend})
 
 
-def _do(comparison: Comparison, tasks: Sequence[Task], executor: Executor, told: Told) -> None:
-    """Do those tasks that are not done."""
+def _do(
+    comparison: Comparison, tasks: Sequence[Task], executor: Executor, progress: Progress
+) -> None:
+    """Do the tasks that are not done yet."""
     missing = [task for task in tasks if not task.is_done()]
     comparison.skipped += len(tasks) - len(missing)
     if not missing:
@@ -159,4 +183,4 @@ def _do(comparison: Comparison, tasks: Sequence[Task], executor: Executor, told:
         for count, (task, failure) in enumerate(outcomes, start=1):
             if failure is not None:
                 comparison.failures[task.name] = failure
-            told(task, failure, count, len(missing))
+            progress(task, failure, count, len(missing))

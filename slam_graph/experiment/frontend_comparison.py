@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Front ends on one recording: what their tracks are like, and what an algorithm makes of them."""
+"""Front ends compared on one recording: track quality, and accuracy of an algorithm on them."""
 
 from __future__ import annotations
 
@@ -21,21 +21,24 @@ from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
 from slam_graph.pipeline.run import run
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking
 from slam_graph.results.run_logs import TimingLog
+from slam_graph.settings.tree import closest
+
+__all__ = ["FrontendReport", "parse_frontends", "track", "track_and_estimate"]
 
 
 @dataclass(frozen=True)
 class FrontendReport:
-    """What a front end made of a recording.
+    """Results of a front end on a recording.
 
     Attributes:
         name: of the front end.
         tracks: the quality of its tracks.
         inliers: share of the associated features that pass outlier rejection.
-        counts: mean counts a frame.
-        ms: mean milliseconds a frame of each stage; `total` is all of the front end.
-        ate_m: position error of an algorithm on these tracks after alignment; None without one, or
-            without ground truth.
-        status: how the run of the algorithm ended; empty without one.
+        counts: mean counts per frame.
+        ms: mean milliseconds per frame of each stage; `total` is the whole front end.
+        ate_m: ATE of an algorithm on these tracks after SE(3) alignment; None without an algorithm
+            or ground truth.
+        status: status of the run of the algorithm; empty without one.
     """
 
     name: str
@@ -63,7 +66,7 @@ def track(
         sequence: of images.
         config: `frontend`, `seed`, `start_s` and `duration_s` matter.
         name: for the report.
-        watch: is shown every packet.
+        watch: called with every tracked packet.
 
     Raises:
         DataError: if the recording holds no images.
@@ -88,7 +91,7 @@ def track(
 
 
 def track_and_estimate(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
-    """Run the whole pipeline, whose back end tells the front end what it knows.
+    """Run the whole pipeline, with feedback of the back end to the front end.
 
     Args:
         sequence: of images.
@@ -130,10 +133,10 @@ def _report(
 
 
 def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
-    """The settings of front ends that are given as METHOD or METHOD/DETECTOR.
+    """The settings of front ends given as METHOD or METHOD/DETECTOR.
 
     Returns:
-        by name, overrides for `load_config`.
+        Overrides for `load_config`, by name.
 
     Raises:
         ConfigError: if there is no such method.
@@ -142,7 +145,7 @@ def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
     for name in names:
         method, _, detector = name.partition("/")
         if method not in FRONTENDS:
-            raise ConfigError(f"unknown front end '{method}'; known: {', '.join(FRONTENDS)}")
+            raise ConfigError(f"unknown front end '{method}'; {closest(method, FRONTENDS)}")
         settings[name] = [f"frontend.method={method}"]
         settings[name] += [f"frontend.detector={detector}"] if detector else []
     return settings
