@@ -15,13 +15,12 @@ import numpy as np
 
 from slam_graph.config import RunConfig
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
 from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
 from slam_graph.pipeline.run import run
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking
 from slam_graph.results.run_logs import TimingLog
-from slam_graph.settings.tree import closest
 
 __all__ = ["FrontendReport", "parse_frontends", "track", "track_and_estimate"]
 

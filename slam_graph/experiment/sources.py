@@ -10,9 +10,9 @@ from pathlib import Path
 
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.settings.base import Settings
-from slam_graph.settings.tree import ConfigTree, closest, override, validate
+from slam_graph.settings.tree import ConfigTree, override, validate
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig, StartConfig
 from slam_graph.simulation.simulator import simulate
 

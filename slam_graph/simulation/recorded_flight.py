@@ -13,11 +13,10 @@ import numpy as np
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import DataError, closest
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig
-from slam_graph.settings.tree import closest
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
 
