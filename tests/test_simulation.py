@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of simulated motions, IMU streams and feature tracks."""
 
+import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from flight import FISHEYE, FORWARD
 from numpy.typing import NDArray
+from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from slam_graph.errors import ConfigError, DataError
@@ -408,3 +411,18 @@ def test_settings_come_from_a_file_keywords_and_overrides_in_this_order(tmp_path
 def test_unknown_and_moved_settings_are_explained(override: str, message: str) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         simulate(overrides=[override])
+
+
+def test_the_plain_settings_are_those_in_the_documents() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "simulation.md").read_text(encoding="utf-8")
+    table = page[page.index("| setting |") : page.index("All others")]
+    assert re.findall(r"^\| `([a-z_.]+)` \|", table, re.MULTILINE) == list(plain(SimulationConfig))
+
+
+def plain(settings: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Names of the settings that are not for experts."""
+    for name, info in settings.model_fields.items():
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
+            yield from plain(info.annotation, f"{prefix}{name}.")
+        elif not (isinstance(info.json_schema_extra, dict) and info.json_schema_extra["expert"]):
+            yield prefix + name
