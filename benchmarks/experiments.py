@@ -16,7 +16,7 @@ from pathlib import Path
 import slam_graph
 from benchmarks.suite import Outcome
 from slam_graph.config import RunConfig, load_config
-from slam_graph.experiment.comparison import Comparison, load_configs, run_tasks
+from slam_graph.experiment.comparison_plan import Comparison, load_configs, run_tasks
 from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
 from slam_graph.experiment.sources import Source

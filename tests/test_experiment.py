@@ -21,9 +21,9 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.experiment.compare import compare as compare_algorithms
-from slam_graph.experiment.comparison import load_configs, plan, with_variants
+from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
+from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
 from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources

@@ -14,7 +14,7 @@ from slam_graph.cli.data import Json
 from slam_graph.cli.output import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.experiment.comparison import Comparison
+    from slam_graph.experiment.comparison_plan import Comparison
     from slam_graph.experiment.tasks import Task
 
 INTERRUPTED = 130
@@ -82,7 +82,7 @@ def compare(
 
     Given the same OUTPUT again, only what has not been done yet is done.
     """
-    from slam_graph.experiment.compare import compare as run_comparison
+    from slam_graph.experiment.comparison import compare as run_comparison
 
     try:
         comparison = run_comparison(

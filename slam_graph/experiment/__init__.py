@@ -2,6 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Experiments: algorithms compared on the same feature tracks, and front ends on the same images.
 
-`compare` (in `experiment/compare.py`) records the tracks of every recording and seed once, runs
+`compare` (in `experiment/comparison.py`) records the tracks of every recording and seed once, runs
 every algorithm on them in separate processes, and writes a report.
 """

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.consistency import mean_bounds
-from slam_graph.experiment.comparison import Comparison
+from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
     ALIGNMENTS,
     STAGE,

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.experiment.comparison import Comparison
 from slam_graph.experiment.comparison_figures import Figure, draw
+from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
     ALIGNMENTS,
     STAGE,
