@@ -413,6 +413,11 @@ def test_unknown_and_moved_settings_are_explained(override: str, message: str) -
         simulate(overrides=[override])
 
 
+def test_a_trajectory_in_place_of_a_file_is_explained() -> None:
+    with pytest.raises(ConfigError, match="write trajectory='rooms'"):
+        simulate("rooms")
+
+
 def test_the_plain_settings_are_those_in_the_documents() -> None:
     page = (Path(__file__).parent.parent / "docs" / "simulation.md").read_text(encoding="utf-8")
     table = page[page.index("| setting |") : page.index("All others")]

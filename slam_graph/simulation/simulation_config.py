@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from slam_graph.errors import ConfigError
 from slam_graph.settings.base import Settings, expert
 from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
 
@@ -242,6 +243,8 @@ def load_simulation_config(
     tree = ConfigTree()
     if isinstance(config, SimulationConfig):
         tree.merge(ConfigTree(config.model_dump()))
+    elif config in TRAJECTORIES:
+        raise ConfigError(f"'{config}' is no file of settings; write trajectory='{config}'")
     elif config is not None:
         tree.merge(read_tree(Path(config)))
     given = {
