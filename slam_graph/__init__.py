@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
-    from slam_graph.backend.build_estimator import build_estimator
     from slam_graph.backend.estimator import Estimator
     from slam_graph.bundle_adjustment.bal_file import read_bal
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
@@ -52,7 +51,6 @@ __all__ = [
     "adjust_bundle",
     "adjust_map",
     "ape",
-    "build_estimator",
     "certify",
     "load_config",
     "load_map",
@@ -81,7 +79,6 @@ _HOME = {
     "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
     "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
-    "build_estimator": "slam_graph.backend.build_estimator",
     "certify": "slam_graph.pose_graph.certificate",
     "load_config": "slam_graph.config",
     "load_map": "slam_graph.results.map_output",

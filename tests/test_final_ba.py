@@ -103,8 +103,8 @@ def disturbed(truth: Trajectory, seed: int = 0) -> Trajectory:
         truth.positions + drift,
         truth.quaternions,
         truth.velocities + rng.normal(0.0, 0.05, (len(truth), 3)),
-        truth.gyro_biases,
-        truth.accel_biases,
+        accel_biases=truth.accel_biases,
+        gyro_biases=truth.gyro_biases,
     )
 
 

@@ -14,9 +14,10 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Frontend
 from slam_graph.frontend.image_frontend import ImageFrontend
 from slam_graph.frontend.replay import ReplayFrontend
+from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
 from slam_graph.sensors.rig import Rig
 
-FRONTENDS: dict[str, Callable[[Rig, FrontendConfig, int, Diagnostics], Frontend]] = {
+FRONTENDS: dict[str, Callable[[Rig, FrontendConfig, int, Diagnostics, float], Frontend]] = {
     "klt": ImageFrontend,
     **dict.fromkeys(DESCRIPTORS, ImageFrontend),
 }
@@ -29,6 +30,7 @@ def build_frontend(
     seed: int = 0,
     diagnostics: Diagnostics | None = None,
     content: Literal["images", "tracks"] = "images",
+    gravity: float = STANDARD_GRAVITY,
 ) -> Frontend:
     """The front end for a recording.
 
@@ -39,6 +41,7 @@ def build_frontend(
         diagnostics: where faults are counted.
         content: what the frames of the recording hold (`SequenceInfo.content`); tracks are handed
             on as they are.
+        gravity: magnitude in m/s² (`backend.noise.gravity` of the settings).
 
     Raises:
         ConfigError: if no front end has the name that `config.method` gives, or an option of it
@@ -52,4 +55,4 @@ def build_frontend(
         raise ConfigError(
             f"unknown front end '{config.method}' (frontend.method); known: {', '.join(FRONTENDS)}"
         )
-    return FRONTENDS[config.method](rig, config, seed, diagnostics)
+    return FRONTENDS[config.method](rig, config, seed, diagnostics, gravity)

@@ -16,7 +16,7 @@ from slam_graph.frontend.detectors import DETECTORS, refine
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points, spread
 from slam_graph.frontend.tracked_features import Image
-from slam_graph.sensors.camera import WIDE, Camera
+from slam_graph.sensors.camera import Camera
 
 REST_FRAMES = 3
 """A cell that could not be filled is left alone for so many frames: it would hardly be now."""
@@ -257,7 +257,7 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
         ConfigError: if the image is not there, or does not fit the camera.
     """
     mask = None if path is None else read_mask(path, camera.width, camera.height)
-    if camera.distortion not in WIDE:
+    if not camera.model.sees_sideways:
         return mask
     visible = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
     inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)

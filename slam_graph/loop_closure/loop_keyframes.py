@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.frontend.descriptors import Orb
@@ -193,7 +193,7 @@ class KeyframeLog:
 
     def _points(self, ids: IntArray) -> FloatArray:
         """Where features (N,) are in the world, (N, 3); NaN where that is not known."""
-        window = TrackWindow()
+        window = FeatureTracks()
         for index, view in enumerate(self._recent):
             window.add(index, view.frame)
         obs = window.observations(np.unique(ids))

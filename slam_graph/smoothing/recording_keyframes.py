@@ -11,15 +11,15 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.smoothing.frame_log import FrameLog
 
-MAX_START_ERROR_PX = 30.0
+MAX_START_ERROR_SIGMAS = 30.0
 """Features with a larger root mean square reprojection error do not begin, in units of σ."""
 RECENT_NS = 10_000_000_000
 """How much of the IMU is looked through for standing still."""
@@ -123,7 +123,7 @@ def with_native_cameras(rig: Rig) -> Rig:
 
 def _native(mounted: RigCamera) -> RigCamera:
     camera = mounted.camera
-    if camera.distortion != "double_sphere":
+    if camera.gtsam_calibration() is not None:
         return mounted
     middle, slope = (values[0] for values in camera.distort(np.zeros((1, 2))))
     fx, fy, cx, cy = slope[0, 0], slope[1, 1], middle[0], middle[1]
@@ -208,5 +208,5 @@ def triangulated(
         backend: noise and thresholds.
     """
     found = triangulate(obs, projection, *poses, backend.triangulation)
-    limit_px = MAX_START_ERROR_PX * backend.noise.pixel_sigma
+    limit_px = MAX_START_ERROR_SIGMAS * backend.noise.pixel_sigma
     return found.points, found.good & (found.reprojection_px < limit_px)

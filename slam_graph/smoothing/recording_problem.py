@@ -34,14 +34,17 @@ from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.keyframe_states import fill_in
 from slam_graph.smoothing.recording_keyframes import (
@@ -164,14 +167,10 @@ class RecordingCost:
             variances: (N,) of each, over that of a single observation.
             sigma_px: standard deviation of a single one.
         """
-        robust = {
-            "robust_loss": self._config.robust_loss,
-            "robust_width": self._config.robust_width,
-        }
-        gating = self._backend.gating.model_copy(update=robust)
+        loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
         factors: list[gtsam.NonlinearFactor] = []
         for variance in np.unique(variances).tolist():  # one for each size of a group
-            noise = pixel_noise(sigma_px * math.sqrt(variance), gating)
+            noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
             factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return _graph(factors)
 
@@ -200,14 +199,14 @@ class RecordingCost:
         for k, (i, j) in enumerate(pairwise(self._piece.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
             gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-            scale = noise.imu_scale * (noise.imu_gap_scale if gap else 1.0)
+            scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
             # of noise that is not stationary, variances add up
             gyro, accel = np.sqrt(np.mean(self._piece.noise[i + 1 : j + 1] ** 2, axis=0))
             params = preintegration_params(self._rig.imu, noise.gravity, scale, gyro, accel)
             pim = preintegrate(imu.between(start_ns, end_ns), values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._piece.still[i + 1 : j + 1].all():
-                factors += zero_velocity_factors(k, k + 1, self._backend.zero_velocity)
+                factors += zero_velocity_factors(k, k + 1)
         return factors
 
 
@@ -456,8 +455,8 @@ class BundleAdjustment:
                     stamp_ns,
                     self._values.atPose3(X(k)),
                     np.asarray(self._values.atVector(V(k))),
-                    np.asarray(bias.gyroscope()),
-                    np.asarray(bias.accelerometer()),
+                    accel_bias=np.asarray(bias.accelerometer()),
+                    gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
         params = preintegration_params(self._rig.imu, self._backend.noise.gravity)
