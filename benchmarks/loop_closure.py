@@ -50,7 +50,7 @@ def rooms(seed: int, duration_s: float, cameras: int, looks: int) -> RunResult:
         cameras=cameras,
         landmarks=LandmarkConfig(density=4.0),
         tracks=TrackConfig(
-            features=80, loss=0.02, outliers=0.01, descriptors=True, descriptor_looks=looks
+            features=80, loss=0.02, outliers=0.01, descriptors=True, distinct_descriptors=looks
         ),
     )
     settings = load_config(None, ["loop_closure.enabled=true"])

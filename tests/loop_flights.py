@@ -51,7 +51,7 @@ def tour(
         flight=FlightConfig(hover_s=0.0),
         landmarks=LandmarkConfig(density=4.0),
         tracks=TrackConfig(
-            features=80, outliers=0.01, descriptors=True, descriptor_looks=descriptors
+            features=80, outliers=0.01, descriptors=True, distinct_descriptors=descriptors
         ),
     )
     sequence = cast(SimulatedTracks, simulate(config))

@@ -11,10 +11,9 @@ from slam_graph.maps.map_building import build_map
 from slam_graph.maps.map_model import MapRecording, SlamMap
 from slam_graph.pose_graph.graph import Poses
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
-from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.simulator import euroc_rig, simulate
 
 PLACES = PlaceConfig(words=50)
 SPACING_M = 0.5

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from flight import rig
 from fov_camera import FOV
+from slam_graph.simulation.writers import write
 
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -17,7 +18,6 @@ from slam_graph.pipeline.run import run
 from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 HERE = Path(__file__).parent
 

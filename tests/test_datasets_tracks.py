@@ -23,7 +23,6 @@ from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, I
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 
 def features(sequence: OpenvinsSimulation | EqvioTracks) -> list[FeatureFrame]:
@@ -300,7 +299,7 @@ def test_another_calibration_moves_the_normalised_points(simulated: Path, tmp_pa
 def test_descriptors_are_replayed_bit_by_bit(tmp_path: Path) -> None:
     tracks = TrackConfig(features=20, descriptors=True)
     source = simulate(SimulationConfig(duration_s=1.0, rate_hz=10.0, tracks=tracks))
-    write(source, tmp_path / "recorded")
+    source.save(tmp_path / "recorded")
     replay = TrackRecordingSequence(tmp_path / "recorded")
     frames = [f for f in source.frames() if isinstance(f, FeatureFrame)]
     for first in (0, 4):

@@ -15,7 +15,6 @@ from slam_graph.config import load_config
 from slam_graph.pipeline.run import run
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 SETTINGS = ("--set", "loop_closure.places.words=300")
 
@@ -33,7 +32,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tracks=TrackConfig(features=70, descriptors=True),
     )
     folder = tmp_path_factory.mktemp("loops") / "tour"
-    write(simulate(config), folder)
+    simulate(config).save(folder)
     return folder
 
 

@@ -17,7 +17,6 @@ from slam_graph.pipeline.run import run
 from slam_graph.results.map_output import load_map, save_map
 from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 HALF_S = 48.0
 WITHIN_M, WITHIN_DEG = 0.05, 2.0
@@ -27,7 +26,7 @@ WITHIN_M, WITHIN_DEG = 0.05, 2.0
 def tour(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of two laps in `tour`, and a run with a map of the first one in `a`."""
     folder = tmp_path_factory.mktemp("maps")
-    write(rooms(seed=1, duration_s=2 * HALF_S), folder / "tour")
+    rooms(seed=1, duration_s=2 * HALF_S).save(folder / "tour")
     done = call(
         "run", folder / "tour", "--duration", HALF_S, "--save-map", "--output", folder / "a"
     )
@@ -125,7 +124,7 @@ def test_maps_are_not_optimised(tour: Path, known: Path) -> None:
 
 
 def test_strangers_are_refused(tour: Path, known: Path) -> None:
-    write(rooms(seed=2, duration_s=6.0), tour / "elsewhere")
+    rooms(seed=2, duration_s=6.0).save(tour / "elsewhere")
     result = run(rooms(seed=2, duration_s=20.0), load_config(None, ["map.enabled=true"]))
     assert result.slam_map is not None
     save_map(result.slam_map, tour / "elsewhere.slam")
