@@ -61,18 +61,18 @@ def test_overrides_have_the_types_of_yaml() -> None:
             "backend.noise.pixel_sigma=1.5e-1",
             "backend.zero_velocity.enabled=false",
             "frontend.grid=[4, 3]",
-            "algorithm.cost.max_past_poses=9",
+            "algorithm.cost.max_past_poses=7",
         ]
     )
     assert config.backend.noise.pixel_sigma == 0.15
     assert config.backend.zero_velocity.enabled is False
     assert config.frontend.grid == (4, 3)
-    assert config.algorithm.cost.max_past_poses == 9
+    assert config.algorithm.cost.max_past_poses == 7
 
 
 def test_an_override_of_the_algorithm_comes_before_those_that_reach_into_it() -> None:
     other = next(name for name in algorithm_names() if name != "msckf")
-    config = load_config(overrides=["algorithm.cost.max_past_poses=9", f"algorithm={other}"])
+    config = load_config(overrides=["algorithm.cost.max_past_poses=7", f"algorithm={other}"])
     assert (config.algorithm.name, config.algorithm.cost.max_past_poses) == (other, 7)
 
 
