@@ -21,12 +21,11 @@ if TYPE_CHECKING:
     from slam_graph.config import RunConfig, load_config
     from slam_graph.datasets.dataset_registry import open_dataset
     from slam_graph.datasets.groundtruth import read_groundtruth
+    from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
-    from slam_graph.maps.map_adjustment import adjust_map
-    from slam_graph.maps.map_config import MapBalPolicy
     from slam_graph.maps.map_merge import merge_maps
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.pipeline.run import RunResult, run
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 __all__ = [
     "BalPolicy",
     "Estimator",
-    "MapBalPolicy",
     "NavState",
     "PoseGraphPolicy",
     "RunConfig",
@@ -49,9 +47,9 @@ __all__ = [
     "Trajectory",
     "__version__",
     "adjust_bundle",
-    "adjust_map",
     "ape",
     "certify",
+    "dataset_from_arrays",
     "load_config",
     "load_map",
     "merge_maps",
@@ -68,7 +66,6 @@ __all__ = [
 _HOME = {
     "BalPolicy": "slam_graph.bundle_adjustment.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
-    "MapBalPolicy": "slam_graph.maps.map_config",
     "NavState": "slam_graph.geometry.trajectory",
     "PoseGraphPolicy": "slam_graph.pose_graph.pose_graph_policy",
     "RunConfig": "slam_graph.config",
@@ -77,9 +74,9 @@ _HOME = {
     "SlamMap": "slam_graph.maps.map_model",
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
-    "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "certify": "slam_graph.pose_graph.certificate",
+    "dataset_from_arrays": "slam_graph.datasets.memory_sequence",
     "load_config": "slam_graph.config",
     "load_map": "slam_graph.results.map_output",
     "merge_maps": "slam_graph.maps.map_merge",

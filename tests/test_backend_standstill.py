@@ -13,7 +13,6 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
-from slam_graph.backend.cost.imu_factor import ImuBuffer
 from slam_graph.backend.cost.zero_velocity import (
     POSITION_SIGMA,
     VELOCITY_SIGMA,
@@ -25,6 +24,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.pipeline.run import run
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
 Motion = Callable[[float], FloatArray]

@@ -11,8 +11,7 @@ from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegration_params
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess, guess_states
@@ -25,6 +24,7 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
 PARAMS = preintegration_params(rig().imu, 9.81)
@@ -81,7 +81,7 @@ def test_alignment_bears_pixel_noise(cameras: int) -> None:
 @pytest.mark.parametrize("dynamic", [60, 130])
 def test_the_imu_tells_the_static_world_from_an_object(cameras: int, dynamic: int) -> None:
     """Even where most features are on the object, which moves as the room of another flight."""
-    rng, mounted, window = np.random.default_rng(5), rig(cameras), TrackWindow()
+    rng, mounted, window = np.random.default_rng(5), rig(cameras), FeatureTracks()
     flight, other = Flight(), Flight(position_rate=np.array([2.5, -1.2, 1.6]))
     still, moving = room(400, rng), room(dynamic * 4, rng)
     for number, t_s in enumerate(TIMES.tolist()):

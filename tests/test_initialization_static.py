@@ -83,9 +83,9 @@ def random_state(seed: int) -> NavState:
         0,
         gtsam.Pose3(gtsam.Rot3(R), rng.normal(size=3)),
         rng.normal(size=3),
-        np.zeros(3),
-        np.zeros(3),
-        0.1 * root @ root.T,
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=0.1 * root @ root.T,
     )
 
 

@@ -15,7 +15,6 @@ from slam_graph.config import load_config
 from slam_graph.pipeline.run import run
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 SETTINGS = ("--set", "loop_closure.places.words=300")
 
@@ -33,7 +32,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tracks=TrackConfig(features=70, descriptors=True),
     )
     folder = tmp_path_factory.mktemp("loops") / "tour"
-    write(simulate(config), folder)
+    simulate(config).save(folder)
     return folder
 
 
@@ -67,7 +66,7 @@ def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
     assert (without / "trajectory.tum").read_text() == (folder / "trajectory.tum").read_text()
 
 
-def test_tracks_without_looks_are_said_to_have_no_loops() -> None:
+def test_tracks_without_descriptors_are_said_to_have_no_loops() -> None:
     tracks = TrackConfig(features=30)
     sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
     result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))

@@ -62,7 +62,8 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
     mixed = np.eye(15) + 0.2 * rng.normal(size=(15, 15))
     covariance = mixed @ prior_covariance(BackendConfig().initialization.prior) @ mixed.T
     turned = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
-    given = NavState(0, turned, np.ones(3), np.full(3, 0.01), np.full(3, 0.1), covariance)
+    biases = {"accel_bias": np.full(3, 0.1), "gyro_bias": np.full(3, 0.01)}
+    given = NavState(0, turned, np.ones(3), **biases, covariance=covariance)
     values = gtsam.Values()
     values.insert(X(0), turned)
     values.insert(V(0), given.velocity)

@@ -42,29 +42,33 @@ class SquareRootEngine:
             context.propagation.append_frame(window, context.imu, stamp_ns, still)
             context.add_observations(window, frame)
         with report.timed("cost"):
+            if not still:
+                window.recall_features()
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):
-            minimum = self._minimize(constructed)
+            constructed, minimum = self._minimize(window, constructed)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
         with report.timed("marginalization"):
-            marginalize_step(window, constructed, minimum, self._policies.marginalization)
+            marginalize_step(window, constructed, minimum, self._policies)
         self._posterior = minimum.posterior
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
         return state
 
-    def _minimize(self, constructed: ConstructedCost) -> Minimum:
-        """Take the steps; without features if the system of equations is singular with them."""
+    def _minimize(
+        self, window: Window, constructed: ConstructedCost
+    ) -> tuple[ConstructedCost, Minimum]:
+        """Take the steps; without the features if these leave something undetermined."""
         policy, calibration = self._policies.gauss_newton, self._context.calibration
         again = calibration.moved_far if calibration.keys else None
         try:
-            return minimize(constructed.cost, policy, constructed.linear, again)
+            return constructed, minimize(constructed.cost, policy, constructed.linear, again)
         except np.linalg.LinAlgError:
-            warning = "the features of one frame are not used"
+            warning = "the features of one frame are not used, and go on waiting"
             self._context.diagnostics.warn("features_degenerate", warning)
-            constructed.drop_features()
-            return minimize(constructed.cost, policy)
+            constructed = constructed.without_features(window)
+            return constructed, minimize(constructed.cost, policy)
 
     def _describe(
         self, window: Window, constructed: ConstructedCost, minimum: Minimum, report: StepReport

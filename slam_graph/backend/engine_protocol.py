@@ -20,8 +20,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
-from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
@@ -29,6 +28,7 @@ from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig
 

@@ -9,6 +9,9 @@ step of its engine: this package's own loop (`engine.py`) or one of GTSAM's smoo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import gtsam
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
@@ -16,7 +19,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine import SquareRootEngine
@@ -218,6 +221,24 @@ class Estimator:
             return None
         information = self._engine.information(self.window)
         return variables.estimate(self.window.stamp_ns, self.window.state, information)
+
+    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """The joint covariance (n, n) of variables after the last step.
+
+        Args:
+            keys: of past poses X(i), of the current state X(i), V(i), B(i), of features L(j) of the
+                state, or of the calibration; tangents are GTSAM's.
+
+        Raises:
+            EstimationError: if there is no state yet, or a key is not of a variable now.
+        """
+        if self.window is None:
+            raise EstimationError("there is no state yet")
+        information = self._engine.information(self.window)
+        missing = [gtsam.DefaultKeyFormatter(k) for k in keys if k not in information.layout]
+        if missing:
+            raise EstimationError(f"not variables of the last step: {', '.join(missing)}")
+        return information.covariance_of(keys)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

@@ -107,7 +107,12 @@ def run(
 
     result = _open(sequence, config)
     frontend = build_frontend(
-        result.rig, config.frontend, config.seed, sequence.diagnostics, result.info.content
+        result.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        result.info.content,
+        config.backend.noise.gravity,
     )
     estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)

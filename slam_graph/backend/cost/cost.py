@@ -18,7 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     ReducedFeatures,
@@ -106,6 +106,9 @@ class Cost:
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
+        if self.tracked is not None:
+            keys += self.rig.keys_of(self.tracked)
+            keys += [L(j) for j in np.unique(self.tracked.ids[self.tracked.feature]).tolist()]
         if self.fresh is not None:
             keys += self.rig.keys_of(self.fresh.obs)
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
@@ -120,12 +123,20 @@ class Cost:
         return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
-        """The prior with only some of the factors and of the new features (J,)."""
+        """The prior and the features of the state, with some of the factors and new features (J,).
+
+        Observations of features of the state are never linearised again, so no part is without
+        them. New features that fewer than two observations are left of are left out.
+        """
         features = None
         if self.fresh is not None:
             features = self.fresh.subset(fresh & (self.fresh.obs.counts > 1))
             features = replace(features, obs=features.obs.without_idle_frames())
-        return replace(self, factors=factors, tracked=None, fresh=features)
+        return replace(self, factors=factors, fresh=features)
+
+    def ids_of(self, fresh: BoolArray) -> IntArray:
+        """Ids, ascending, of some of the new features (J,)."""
+        return self.fresh.obs.ids[fresh] if self.fresh is not None else np.zeros(0, np.int64)
 
     def value(self) -> float:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""

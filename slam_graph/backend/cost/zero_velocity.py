@@ -19,7 +19,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.backend.cost.imu_factor import ImuBuffer
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 __all__ = ["POSITION_SIGMA", "VELOCITY_SIGMA", "StandstillDetector", "zero_velocity_factors"]

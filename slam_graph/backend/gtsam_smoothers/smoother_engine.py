@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.cost import Cost
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
 from slam_graph.backend.gtsam_smoothers.smoother_features import NewObservations, SmootherFeatures
@@ -97,18 +97,18 @@ class SmootherEngine:
         cost = Cost(ahead.state, context.projection, context.config, ahead.prior, ahead.factors)
         return ahead.current(cost.prior_at_estimate().updated(cost.factor_rows(cost.layout())))
 
-    def _pause(self, tracks: TrackWindow, ahead: Window, frame: FeatureFrame) -> NewObservations:
+    def _pause(self, tracks: FeatureTracks, ahead: Window, frame: FeatureFrame) -> NewObservations:
         """At a standstill images only add errors: no factors, and tracks begin again."""
-        tracks.retain([])
+        tracks.keep_frames([])
         tracks.add(ahead.frame, frame)
-        tracks.consume(self._features.active)
+        tracks.remove(Outcome.STANDSTILL, self._features.active)
         return NewObservations()
 
     def _observations(
-        self, tracks: TrackWindow, ahead: Window, predicted: NavState, frame: FeatureFrame
+        self, tracks: FeatureTracks, ahead: Window, predicted: NavState, frame: FeatureFrame
     ) -> NewObservations:
         """What the images add to the graph at the new state."""
-        tracks.retain(list(self._frames))
+        tracks.keep_frames(list(self._frames))
         tracks.add(ahead.frame, frame)
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)

@@ -20,24 +20,18 @@ __all__ = ["ProjectionFactors", "calibration", "joint_prior", "pixel_noise"]
 
 
 def calibration(camera: Camera) -> tuple[Any, Any]:
-    """GTSAM's calibration of a camera, and the type of its projection factor."""
-    intrinsics = (camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    if camera.distortion == "equidistant":
-        fisheye = gtsam.Cal3Fisheye(*intrinsics, *camera.coefficients)
-        return fisheye, gtsam.GenericProjectionFactorCal3Fisheye
-    if camera.distortion == "radtan":
-        radtan = gtsam.Cal3DS2(*intrinsics, *camera.coefficients)
-        return radtan, gtsam.GenericProjectionFactorCal3DS2
-    if camera.distortion == "mei":
-        xi, k1, k2, p1, p2 = camera.coefficients
-        unified = gtsam.Cal3Unified(*intrinsics, k1, k2, p1, p2, xi)
-        return unified, gtsam.GenericProjectionFactorCal3Unified
-    if camera.distortion != "none":
+    """GTSAM's calibration of a camera, and the type of its projection factor.
+
+    Raises:
+        ConfigError: if GTSAM has no such camera model.
+    """
+    model = camera.gtsam_calibration()
+    if model is None:
         raise ConfigError(
             f"GTSAM's smoothers have no camera with distortion '{camera.distortion}'; "
             "choose another algorithm"
         )
-    return gtsam.Cal3_S2(*intrinsics), gtsam.GenericProjectionFactorCal3_S2
+    return model, getattr(gtsam, f"GenericProjectionFactor{type(model).__name__}")
 
 
 def pixel_noise(sigma_px: float, loss: RobustLoss) -> gtsam.noiseModel.Base:

@@ -16,7 +16,7 @@ from gtsam.symbol_shorthand import L
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow, is_in
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, Outcome, is_in
 from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
@@ -30,7 +30,7 @@ from slam_graph.sensors.rig import Rig
 __all__ = ["NewObservations", "SmootherFeatures"]
 
 GATE_SCALE = 4.0
-"""The gate is this much wider, as it is computed without the covariance of the features."""
+"""The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error do not enter, in units of σ."""
 
@@ -80,7 +80,7 @@ class SmootherFeatures:
         self.active = np.array(kept, np.int64)
 
     def observe(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, covariance: FloatArray
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, covariance: FloatArray
     ) -> NewObservations:
         """The observations of the graph's newest state.
 
@@ -93,7 +93,7 @@ class SmootherFeatures:
         new = NewObservations()
         seen = np.intersect1d(self.active, tracks.ids_in(frame), True)
         again = tracks.observations(seen, [frame])
-        tracks.consume(self.active)
+        tracks.remove(Outcome.USED, self.active)
         again = again.rows(self._gate(again, estimate, covariance))
         ids = np.unique(again.ids[again.feature])
         self._add(new, again, ids)
@@ -102,7 +102,7 @@ class SmootherFeatures:
         for j, point in zip(entering.ids.tolist(), points, strict=True):
             new.points.insert(L(j), point)
         self._add(new, entering, entering.ids)
-        tracks.consume(entering.ids)
+        tracks.remove(Outcome.USED, entering.ids)
         self.active = np.union1d(self.active, entering.ids)
         return new
 
@@ -132,7 +132,7 @@ class SmootherFeatures:
         return np.asarray(good)
 
     def _entering(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, room: int
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, room: int
     ) -> tuple[Observations, FloatArray]:
         """New variables: the longest current tracks that determine a point."""
         ids, lengths = tracks.lengths()

@@ -20,7 +20,7 @@ from slam_graph.backend.backend_config import PriorConfig
 from slam_graph.backend.cost.cost import Cost, NewFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
-from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.engine_protocol import EngineContext
@@ -38,6 +38,7 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegrate
 
 __all__ = ["DynamicRefinement"]
 
@@ -139,7 +140,7 @@ class DynamicRefinement:
         known = context.calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
             context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
-        loss = RobustLoss(context.algorithm.cost.robust_loss or context.config.gating.robust_loss)
+        loss = RobustLoss(context.config.gating.robust_loss)
         cost = Cost(state, context.projection, context.config, known, factors, loss=loss)
         obs = _lasting(frames)
         result = self._triangulated(cost, obs)

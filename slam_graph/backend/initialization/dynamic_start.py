@@ -15,14 +15,14 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegrate
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.first_state import level_rotation
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import Alignment, Motion, align
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegrate
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
 __all__ = ["MIN_FEATURES", "OUTLIER_SIGMAS", "StartFrames", "StartGuess", "guess_states"]
@@ -65,9 +65,9 @@ class StartFrames:
         """The same frames with only some features (N,)."""
         return StartFrames(self.stamps_ns, [frame.only(ids) for frame in self.frames])
 
-    def tracks(self) -> TrackWindow:
+    def tracks(self) -> FeatureTracks:
         """The observations of all frames, numbered from 0."""
-        window = TrackWindow()
+        window = FeatureTracks()
         for k, frame in enumerate(self.frames):
             window.add(k, frame)
         return window
@@ -171,8 +171,8 @@ def _states(
             stamp_ns,
             gtsam.Pose3(gtsam.Rot3.ClosestTo(rotations[k]), positions[k]),
             velocities[k],
-            gyro_bias,
-            np.zeros(3),
+            accel_bias=np.zeros(3),
+            gyro_bias=gyro_bias,
         )
         for k, stamp_ns in enumerate(frames.stamps_ns)
     ]

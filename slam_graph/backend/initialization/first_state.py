@@ -7,6 +7,8 @@ At standstill gravity gives roll and pitch, and the gyroscope measures its own b
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
@@ -44,9 +46,9 @@ def state_at_rest(samples: ImuData, stamp_ns: int, prior: PriorConfig) -> NavSta
         stamp_ns,
         gtsam.Pose3(level_rotation(samples.accel.mean(axis=0)), np.zeros(3)),
         np.zeros(3),
-        samples.gyro.mean(axis=0),
-        np.zeros(3),
-        prior_covariance(prior),
+        accel_bias=np.zeros(3),
+        gyro_bias=samples.gyro.mean(axis=0),
+        covariance=prior_covariance(prior),
     )
 
 
@@ -85,14 +87,7 @@ def fix_gauge(state: NavState, prior: PriorConfig) -> NavState:
     covariance = level @ covariance @ level.T
     covariance[:3, :3] += np.outer(up, up) * prior.yaw_rad**2
     covariance[3:6, 3:6] += np.eye(3) * prior.position_m**2
-    return NavState(
-        state.stamp_ns,
-        state.world_T_body,
-        state.velocity,
-        state.gyro_bias,
-        state.accel_bias,
-        covariance,
-    )
+    return replace(state, covariance=covariance)
 
 
 def start_from(

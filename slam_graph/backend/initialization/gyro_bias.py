@@ -23,8 +23,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.imu_factor import preintegrate
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.sensors.imu_buffer import preintegrate
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
 __all__ = ["estimate_gyro_bias"]
