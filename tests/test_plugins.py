@@ -21,6 +21,7 @@ from slam_graph.settings.tree import ConfigTree, validate
 
 Shape = Callable[[float], float]
 GROUP = "slam_graph.test_shapes"
+TIMEOUT_S = 600
 
 
 def shapes() -> Registry[Shape]:
@@ -119,11 +120,26 @@ def test_a_setting_names_a_part(site: Path) -> None:
         validate(Drawing, tree)
 
 
+def test_the_names_that_are_known_without_an_import_are_those_registered() -> None:
+    code = (
+        "import sys\n"
+        "from slam_graph.frontend.frontend_config import DESCRIPTORS, DETECTORS, FRONTENDS\n"
+        "for registry in (DETECTORS, DESCRIPTORS, FRONTENDS):\n"
+        "    before = list(registry)\n"
+        "    assert 'cv2' not in sys.modules or registry is not DETECTORS\n"
+        "    assert [registry[name] for name in before]\n"
+        "    assert list(registry) == before, registry.kind\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert done.returncode == 0, done.stderr
+
+
 # --- a package that is installed ------------------------------------------------------------------
 
 EXAMPLE = Path(__file__).parent / "plugin_example"
 ROOT = Path(__file__).parent.parent
-TIMEOUT_S = 600
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,8 @@ from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera, Distortion
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
+__all__ = ["read_bag_rig"]
+
 MODELS: dict[str, Distortion] = {
     "plumb_bob": "radtan",
     "rational_polynomial": "radtan",
