@@ -33,8 +33,14 @@ from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
 from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
+from slam_graph.sensors.imu_buffer import (
+    ImuBuffer,
+    predict,
+    preintegrate,
+    preintegration_params,
+)
 from slam_graph.sensors.measurements import CameraFrame, ImuData
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 S = 1_000_000_000
 
@@ -145,7 +151,7 @@ def test_suppression_keeps_the_first_and_its_distance() -> None:
 
 def test_imu_motion_follows_a_flight() -> None:
     flight = Flight(gyro_bias=np.array([0.01, -0.02, 0.03]), accel_bias=np.array([0.1, 0, -0.1]))
-    motion = ImuMotion()
+    motion = ImuMotion(ImuNoise(), 9.81)
     motion.add(flight.imu(0.0, 2.0))
     assert motion.pose(S) is None
     motion.state = flight.nav_state(1.0)
@@ -157,6 +163,29 @@ def test_imu_motion_follows_a_flight() -> None:
     assert pose is not None
     assert np.linalg.norm(pose.logmap(truth)) < 1e-3
     assert motion.rotation(S, 3 * S) is None
+
+
+@pytest.mark.parametrize("gravity", [9.81, 1.62])
+def test_imu_motion_is_the_prediction_of_the_back_end(gravity: float) -> None:
+    """Both integrate alike, under the gravity of the settings."""
+    flight = Flight(gyro_bias=np.array([0.01, -0.02, 0.03]), accel_bias=np.array([0.1, 0, -0.1]))
+    motion, buffer, state = ImuMotion(ImuNoise(), gravity), ImuBuffer(), flight.nav_state(1.0)
+    for start_s in (0.0, 0.5, 1.0):
+        for taker in (motion, buffer):
+            taker.add(flight.imu(start_s, start_s + 0.5))
+    motion.state = state
+    end_ns = round(1.3 * S)
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    params = preintegration_params(ImuNoise(), gravity)
+    pim = preintegrate(buffer.between(S, end_ns), bias, params)
+    pose, rotation = motion.pose(end_ns), motion.rotation(S, end_ns)
+    assert pose is not None
+    assert rotation is not None
+    predicted = predict(state, pim, end_ns).world_T_body
+    np.testing.assert_array_equal(pose.matrix(), predicted.matrix())
+    np.testing.assert_allclose(rotation.matrix(), pim.deltaRij().matrix(), atol=1e-6)
+    fallen = flight.nav_state(1.3).world_T_body.translation() - pose.translation()
+    np.testing.assert_allclose(fallen, [0, 0, 0.5 * (gravity - 9.81) * 0.3**2], atol=2e-3)
 
 
 def gyro(rate: list[float], end_s: float) -> ImuData:

@@ -162,8 +162,8 @@ def _trajectory(stamps: IntArray, values: FloatArray) -> Trajectory:
         values[:, :3].copy(),
         quaternions,
         values[:, 7:10].copy() if values.shape[1] >= 10 else None,
-        values[:, 10:13].copy() if full else None,
-        values[:, 13:16].copy() if full else None,
+        accel_biases=values[:, 13:16].copy() if full else None,
+        gyro_biases=values[:, 10:13].copy() if full else None,
     )
 
 

@@ -72,7 +72,13 @@ def track(
     if info.content != "images" or info.frames == 0:
         raise DataError(f"{info.name}: holds no images; there is nothing to track")
     quality = TrackQuality(sequence.rig, sequence.groundtruth())
-    frontend = build_frontend(sequence.rig, config.frontend, config.seed, sequence.diagnostics)
+    frontend = build_frontend(
+        sequence.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        gravity=config.backend.noise.gravity,
+    )
     start_ns = info.start_ns + round(config.start_s * 1e9)
     end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
     packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)

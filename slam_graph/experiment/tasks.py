@@ -69,7 +69,12 @@ class RecordTask(Settings):
         length_s = config.duration_s
         end_ns = None if length_s is None else start_ns + round(length_s * 1e9)
         frontend = build_frontend(
-            sequence.rig, config.frontend, self.seed, sequence.diagnostics, info.content
+            sequence.rig,
+            config.frontend,
+            self.seed,
+            sequence.diagnostics,
+            info.content,
+            config.backend.noise.gravity,
         )
         truth, start = sequence.groundtruth(), sequence.initial_state()
         with TrackRecorder(self.folder, sequence.rig, self.source.name, truth, start) as recorder:

@@ -13,6 +13,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, Frontend
+from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -25,6 +26,7 @@ def build_frontend(
     seed: int = 0,
     diagnostics: Diagnostics | None = None,
     content: Literal["images", "tracks"] = "images",
+    gravity: float = STANDARD_GRAVITY,
 ) -> Frontend:
     """The front end for a recording.
 
@@ -35,6 +37,7 @@ def build_frontend(
         diagnostics: where faults are counted.
         content: what the frames of the recording hold (`SequenceInfo.content`); tracks are passed
             on as they are.
+        gravity: magnitude in m/s² (`backend.noise.gravity` of the settings).
 
     Raises:
         ConfigError: if a setting does not fit the rig, or the front end needs a library that is
@@ -46,7 +49,7 @@ def build_frontend(
         return _ReplayFrontend(rig, config)
     # a descriptor is matched by the same front end that tracks corners
     name = "klt" if config.method in DESCRIPTORS else config.method
-    return FRONTENDS[name](rig, config, seed, diagnostics)
+    return FRONTENDS[name](rig, config, seed, diagnostics, gravity)
 
 
 class _ReplayFrontend:

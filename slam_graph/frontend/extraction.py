@@ -15,7 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
-from slam_graph.sensors.camera import WIDE, Camera
+from slam_graph.sensors.camera import Camera
 
 __all__ = ["BORDER_PX", "FeatureExtractor", "camera_mask"]
 
@@ -272,7 +272,7 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
         ConfigError: if the image is not there, or does not fit the camera.
     """
     mask = None if path is None else _read_mask(path, camera.width, camera.height)
-    if camera.distortion not in WIDE:
+    if not camera.model.sees_sideways:
         return mask
     visible = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
     inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)

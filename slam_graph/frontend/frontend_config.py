@@ -42,13 +42,14 @@ DESCRIPTORS: Registry[Callable[[], Descriptor]] = Registry(
 )
 """Descriptors by name: callables without arguments that make one."""
 
-FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics], Frontend]] = Registry(
+FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics, float], Frontend]] = Registry(
     "slam_graph.frontends",
     "front end",
     home="slam_graph.frontend.image_frontend",
     names=("klt",),
 )
-"""Front ends by name: callables that make one from rig, settings, seed and diagnostics."""
+"""Front ends by name: callables that make one from rig, settings, seed, diagnostics and gravity in
+m/s²."""
 
 PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
 """The detector that a descriptor was published with; for BRIEF, which has none, FAST."""

@@ -22,6 +22,7 @@ from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -60,13 +61,31 @@ class ImageFrontend:
     """
 
     def __init__(
-        self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
+        self,
+        rig: Rig,
+        config: FrontendConfig,
+        seed: int,
+        diagnostics: Diagnostics,
+        gravity: float = STANDARD_GRAVITY,
     ) -> None:
+        """Prepare for the first frame.
+
+        Args:
+            rig: calibrated cameras.
+            config: options.
+            seed: decides the random samples of RANSAC.
+            diagnostics: where faults are counted.
+            gravity: magnitude in m/s², for predictions from the back end's state.
+
+        Raises:
+            ConfigError: if a mask cannot be read or does not fit its camera, or a method needs a
+                library that is not installed.
+        """
         self._rig = rig
         self._config = config
         self._diagnostics = diagnostics
         self._stats = FrameStats()
-        self._motion = ImuMotion()
+        self._motion = ImuMotion(rig.imu, gravity)
         self._feedback = Feedback()
         self._gated = 0
         self._references = reference_cameras(rig)

@@ -101,8 +101,8 @@ class SimulatedSequence(RecordedSequence):
             motion.positions(stamps),
             motion.rotations(stamps).as_quat(),
             motion.velocities(stamps),
-            gyro_biases,
-            accel_biases,
+            accel_biases=accel_biases,
+            gyro_biases=gyro_biases,
         )
 
     def initial_state(self) -> NavState:
@@ -126,9 +126,9 @@ class SimulatedSequence(RecordedSequence):
             int(first[0]),
             gtsam.Pose3(R, motion.positions(first)[0]).retract(error[:6]),
             motion.velocities(first)[0] + error[6:9],
-            gyro_biases[0] + error[12:],
-            accel_biases[0] + error[9:12],
-            np.diag(spread**2),
+            accel_bias=accel_biases[0] + error[9:12],
+            gyro_bias=gyro_biases[0] + error[12:],
+            covariance=np.diag(spread**2),
         )
 
 

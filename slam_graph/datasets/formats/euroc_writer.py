@@ -236,16 +236,15 @@ def _truth_rows(truth: Trajectory) -> FloatArray:
 
 def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
     """What EuRoC's ``sensor.yaml`` holds, and Kalibr's key for the time offset, if there is one."""
-    camera = mounted.camera
-    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    camera, entry = mounted.camera, camera_entry(mounted.camera)
     values: dict[str, object] = {
         "T_BS": _matrix(mounted.body_T_camera),
         "rate_hz": float(rate_hz),
         "resolution": [camera.width, camera.height],
-        "camera_model": model,
-        "intrinsics": intrinsics,
-        "distortion_model": "radial-tangential" if distortion == "radtan" else distortion,
-        "distortion_coefficients": coefficients,
+        "camera_model": entry.camera_model,
+        "intrinsics": entry.intrinsics,
+        "distortion_model": entry.euroc_distortion,
+        "distortion_coefficients": entry.coefficients,
     }
     if mounted.time_offset_s:
         values["timeshift_cam_imu"] = float(mounted.time_offset_s)

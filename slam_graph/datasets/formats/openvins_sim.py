@@ -104,8 +104,8 @@ def _read_states(path: Path) -> Trajectory:
         values[:, :3].copy(),
         values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True),
         values[:, 7:10].copy(),
-        values[:, 10:13].copy(),
-        values[:, 13:].copy(),
+        accel_biases=values[:, 13:].copy(),
+        gyro_biases=values[:, 10:13].copy(),
     )
 
 
