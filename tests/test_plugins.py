@@ -209,6 +209,14 @@ def test_a_plugin_brings_a_format_and_a_front_end(
     assert np.all(rows["id"] % 2 == 0)
 
 
+def test_a_plugin_brings_a_pose_selection(environment: dict[str, str], tmp_path: Path) -> None:
+    options = ("--duration", "12", "--set", "algorithm.cost.past_poses=second_newest_leaves")
+    done = slam_graph(environment, tmp_path, "run", "demo", "--output", "out", *options)
+    assert done.returncode == 0, done.stderr
+    (used,) = tmp_path.glob("out/*/latest/config.yaml")
+    assert "past_poses: second_newest_leaves" in used.read_text()
+
+
 def test_a_plugin_that_cannot_be_loaded_is_named_where_it_is_used(
     environment: dict[str, str], flight: Path, tmp_path: Path
 ) -> None:
