@@ -13,4 +13,6 @@ def second_newest_leaves(window: Window, policy: CostPolicy, rig: RigProjection)
     frames = window.past
     if len(frames) <= policy.max_past_poses:
         return PoseSelection(list(frames))
-    return PoseSelection([frame for frame in frames if frame != frames[-2]], frozenset({frames[-2]}))
+    return PoseSelection(
+        [frame for frame in frames if frame != frames[-2]], frozenset({frames[-2]})
+    )
