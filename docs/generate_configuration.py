@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig, load_config
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
@@ -75,6 +76,7 @@ def page() -> str:
     """The whole page, Markdown."""
     schema = RunConfig.model_json_schema()
     run_defaults = load_config().model_dump(mode="json")
+    run_defaults["algorithm"]["smoother"] = SmootherPolicy().model_dump(mode="json")
     sections = [INTRODUCTION, *_sections(schema, schema["$defs"], run_defaults, "")]
     expert = list(_sections(schema, schema["$defs"], run_defaults, "", expert=True))
     for heading, policy in (

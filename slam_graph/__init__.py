@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
-    from slam_graph.backend.build_estimator import build_estimator
     from slam_graph.backend.estimator import Estimator
     from slam_graph.bundle_adjustment.bal_file import read_bal
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from slam_graph.config import RunConfig, load_config
     from slam_graph.datasets.dataset_registry import open_dataset
     from slam_graph.datasets.groundtruth import read_groundtruth
+    from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
@@ -48,8 +48,8 @@ __all__ = [
     "__version__",
     "adjust_bundle",
     "ape",
-    "build_estimator",
     "certify",
+    "dataset_from_arrays",
     "load_config",
     "load_map",
     "merge_maps",
@@ -75,8 +75,8 @@ _HOME = {
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
     "ape": "slam_graph.evaluation.ape",
-    "build_estimator": "slam_graph.backend.build_estimator",
     "certify": "slam_graph.pose_graph.certificate",
+    "dataset_from_arrays": "slam_graph.datasets.memory_sequence",
     "load_config": "slam_graph.config",
     "load_map": "slam_graph.results.map_output",
     "merge_maps": "slam_graph.maps.map_merge",

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from slam_graph.evaluation.consistency import average_nees, mean_bounds, nees
-from slam_graph.evaluation.report import consistency_report, innovation_report
+from slam_graph.evaluation.evaluation_report import consistency_report, innovation_report
 from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
 from slam_graph.geometry.trajectory_alignment import Similarity
 
@@ -48,9 +48,9 @@ def noisy_history(
                 # the truth is at `error` from the estimate: truth = estimate ⊕ error
                 pose.compose(gtsam.Pose3.Expmap(error).inverse()),
                 np.zeros(3),
-                np.zeros(3),
-                np.zeros(3),
-                covariance,
+                accel_bias=np.zeros(3),
+                gyro_bias=np.zeros(3),
+                covariance=covariance,
             )
         )
     return history
@@ -112,7 +112,9 @@ def test_history_gives_back_what_it_was_given() -> None:
     state = NavState(
         START_NS,
         gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)),
-        *rng.normal(size=(3, 3)),
+        rng.normal(size=3),
+        accel_bias=rng.normal(size=3),
+        gyro_bias=rng.normal(size=3),
     )
     history = StateHistory()
     history.append(state)

@@ -17,7 +17,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import select
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run import run
 from slam_graph.results.run_result import RunResult
@@ -105,8 +105,8 @@ def disturbed(truth: Trajectory, seed: int = 0) -> Trajectory:
         truth.positions + drift,
         truth.quaternions,
         truth.velocities + rng.normal(0.0, 0.05, (len(truth), 3)),
-        truth.gyro_biases,
-        truth.accel_biases,
+        accel_biases=truth.accel_biases,
+        gyro_biases=truth.gyro_biases,
     )
 
 

@@ -14,7 +14,6 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.feature_factors import robust_loss, robust_weights
 from slam_graph.bundle_adjustment.bal_policy import BalCostPolicy, Intrinsics
 from slam_graph.bundle_adjustment.bal_problem import (
     CAMERA_DIM,
@@ -49,7 +48,7 @@ class BalCost:
         """The cost; infinite if a point has zero depth."""
         errors = reprojection_errors(self.part.problem, estimates)
         with np.errstate(all="ignore"):
-            cost = float(np.sum(robust_loss(errors, self.policy.loss)))
+            cost = float(np.sum(self.policy.loss.value(errors)))
         return cost if np.isfinite(cost) else np.inf
 
     def linearized(self, estimates: BalEstimates) -> BalLinearization:
@@ -58,7 +57,7 @@ class BalCost:
         linear = linearize(estimates, problem.camera, problem.point, problem.pixels)
         if self.policy.robust == "none":
             return linear
-        weights = robust_weights(np.linalg.norm(linear.r, axis=1), self.policy.loss)
+        weights = self.policy.loss.weights(np.linalg.norm(linear.r, axis=1))
         root = np.sqrt(weights)[:, None]
         return BalLinearization(
             linear.by_camera * root[:, :, None], linear.by_point * root[:, :, None], linear.r * root

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from slam_graph.backend.backend_config import GatingConfig
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
 from slam_graph.settings.base import Settings, expert
 
@@ -43,9 +43,9 @@ class BalCostPolicy(Settings):
     95 % circle of a noise of 1 px)."""
 
     @property
-    def loss(self) -> GatingConfig:
+    def loss(self) -> RobustLoss:
         """The loss as the back end has it, for errors in pixels."""
-        return GatingConfig(robust_loss=self.robust, robust_width=self.robust_width_px)
+        return RobustLoss(self.robust, self.robust_width_px)
 
 
 class BalStepsPolicy(Settings):

@@ -15,9 +15,9 @@ import numpy as np
 
 from slam_graph.config import RunConfig
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import DataError
 from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
-from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.pipeline.run import run
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking
 from slam_graph.results.run_logs import TimingLog
@@ -72,7 +72,13 @@ def track(
     if info.content != "images" or info.frames == 0:
         raise DataError(f"{info.name}: holds no images; there is nothing to track")
     quality = TrackQuality(sequence.rig, sequence.groundtruth())
-    frontend = build_frontend(sequence.rig, config.frontend, config.seed, sequence.diagnostics)
+    frontend = build_frontend(
+        sequence.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        gravity=config.backend.noise.gravity,
+    )
     start_ns = info.start_ns + round(config.start_s * 1e9)
     end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
     packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
@@ -133,16 +139,11 @@ def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
     """The settings of front ends that are given as METHOD or METHOD/DETECTOR.
 
     Returns:
-        by name, overrides for `load_config`.
-
-    Raises:
-        ConfigError: if there is no such method.
+        by name, overrides for `load_config`, which refuses unknown ones.
     """
     settings = {}
     for name in names:
         method, _, detector = name.partition("/")
-        if method not in FRONTENDS:
-            raise ConfigError(f"unknown front end '{method}'; known: {', '.join(FRONTENDS)}")
         settings[name] = [f"frontend.method={method}"]
         settings[name] += [f"frontend.detector={detector}"] if detector else []
     return settings

@@ -18,7 +18,8 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets.formats.track_recording import TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
+from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.sources import Source
 from slam_graph.frontend.build_frontend import build_frontend
@@ -68,7 +69,12 @@ class RecordTask(Settings):
         length_s = config.duration_s
         end_ns = None if length_s is None else start_ns + round(length_s * 1e9)
         frontend = build_frontend(
-            sequence.rig, config.frontend, self.seed, sequence.diagnostics, info.content
+            sequence.rig,
+            config.frontend,
+            self.seed,
+            sequence.diagnostics,
+            info.content,
+            config.backend.noise.gravity,
         )
         truth, start = sequence.groundtruth(), sequence.initial_state()
         with TrackRecorder(self.folder, sequence.rig, self.source.name, truth, start) as recorder:

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.frontend.descriptors import Orb
-from slam_graph.frontend.keypoints import Keypoints
-from slam_graph.frontend.tracked_features import Image
+from slam_graph.frontend.keypoints import Image, Keypoints
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.loop_closure.loop_config import KeyframeConfig
@@ -208,7 +207,7 @@ class KeyframeLog:
 
     def _points(self, ids: IntArray) -> FloatArray:
         """(N, 3) world points of features (N,); NaN where not triangulated."""
-        window = TrackWindow()
+        window = FeatureTracks()
         for index, view in enumerate(self._recent):
             window.add(index, view.frame)
         obs = window.observations(np.unique(ids))

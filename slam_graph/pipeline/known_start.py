@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.backend.build_estimator import EstimatorLike
+from slam_graph.backend.estimator import Estimator
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry.interpolation import interpolate
@@ -65,7 +65,7 @@ class KnownStart:
             )
         return KnownStart(state=state)
 
-    def apply(self, estimator: EstimatorLike, frame_ns: int, result: RunResult) -> None:
+    def apply(self, estimator: Estimator, frame_ns: int, result: RunResult) -> None:
         """Start the estimator if the state is known by the time of a frame."""
         if estimator.initialized:
             return
@@ -101,7 +101,7 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
         stamp_ns,
         near.pose(middle),
         velocity,
-        np.zeros(3) if near.gyro_biases is None else near.gyro_biases[middle],
-        np.zeros(3) if near.accel_biases is None else near.accel_biases[middle],
-        np.diag(np.repeat(np.square(sigmas), 3)),
+        accel_bias=np.zeros(3) if near.accel_biases is None else near.accel_biases[middle],
+        gyro_bias=np.zeros(3) if near.gyro_biases is None else near.gyro_biases[middle],
+        covariance=np.diag(np.repeat(np.square(sigmas), 3)),
     )

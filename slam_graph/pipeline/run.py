@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import Protocol
 
-from slam_graph.backend.build_estimator import build_estimator
+from slam_graph.backend.estimator import Estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import DataError
@@ -107,9 +107,14 @@ def run(
 
     result = _open(sequence, config)
     frontend = build_frontend(
-        result.rig, config.frontend, config.seed, sequence.diagnostics, result.info.content
+        result.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        result.info.content,
+        config.backend.noise.gravity,
     )
-    estimator = build_estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
+    estimator = Estimator(result.rig, config.algorithm, config.backend, sequence.diagnostics)
     start = KnownStart.of(sequence, result, config.backend.initialization.mode)
     loops = LoopStage(
         result.rig, config.loop_closure, config.seed, sequence.diagnostics, config.map.enabled

@@ -15,8 +15,8 @@ from types import FrameType
 
 import numpy as np
 
-from slam_graph.backend.build_estimator import EstimatorLike
 from slam_graph.backend.cost.gating import Innovations
+from slam_graph.backend.estimator import Estimator
 from slam_graph.config import LimitsConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
@@ -34,7 +34,7 @@ class DivergenceError(EstimationError):
     """The estimate left all that is possible."""
 
 
-def estimate(estimator: EstimatorLike, features: FeatureFrame) -> NavState | None:
+def estimate(estimator: Estimator, features: FeatureFrame) -> NavState | None:
     """The state at a frame.
 
     Raises:
@@ -129,9 +129,7 @@ class Agreement:
 
 
 @contextmanager
-def outcome(
-    result: RunResult, estimator: EstimatorLike, diagnostics: Diagnostics
-) -> Iterator[None]:
+def outcome(result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> Iterator[None]:
     """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
     began = time.perf_counter()
     try:
@@ -154,7 +152,7 @@ def outcome(
     logger.log(level, "%s", result.message or f"{result.frames} frames in {result.wall_s:.1f} s")
 
 
-def _judge(result: RunResult, estimator: EstimatorLike) -> None:
+def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked = result.config.min_coverage
     if not estimator.initialized:

@@ -13,7 +13,11 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.report import accuracy_report, consistency_report, innovation_report
+from slam_graph.evaluation.evaluation_report import (
+    accuracy_report,
+    consistency_report,
+    innovation_report,
+)
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:

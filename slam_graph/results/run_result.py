@@ -16,7 +16,7 @@ import numpy as np
 from slam_graph.config import RunConfig
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import EstimationError
-from slam_graph.evaluation.association import select
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.loop_closure.close_loops import LoopClosures
 from slam_graph.maps.map_model import SlamMap

@@ -15,7 +15,7 @@ import numpy as np
 from slam_graph.config import dump_yaml
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.geometry.trajectory import StateHistory, Trajectory, tum_lines
+from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory, tum_lines
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.results.map_output import MAP_NAME, save_map
 from slam_graph.results.point_map import write_ply
@@ -25,13 +25,10 @@ from slam_graph.sensors.kalibr_calibration import write_kalibr
 if TYPE_CHECKING:
     from slam_graph.results.run_result import RunResult
 
-STATE_COLUMNS = ("velocity_{}_m_s", "gyro_bias_{}_rad_s", "accel_bias_{}_m_s2")
-SIGMA_COLUMNS = (
-    "sigma_rotation_body_{}_rad",
-    "sigma_position_body_{}_m",
-    "sigma_velocity_{}_m_s",
-    "sigma_accel_bias_{}_m_s2",
-    "sigma_gyro_bias_{}_rad_s",
+STATE_COLUMNS = (
+    "stamp_ns",
+    *NavState.COMPONENTS[6:],
+    *(f"sigma_{component}" for component in NavState.COMPONENTS),
 )
 
 
@@ -105,10 +102,9 @@ def write_picture(result: RunResult, truth: Trajectory, path: Path) -> bool:
 
 def state_lines(history: StateHistory) -> Iterator[str]:
     """Velocities, biases and standard deviations as CSV; sigmas are empty where unknown."""
-    names = [column.format(axis) for column in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz"]
-    yield ",".join(["stamp_ns", *names]) + "\n"
+    yield ",".join(STATE_COLUMNS) + "\n"
     trajectory = history.trajectory()
-    parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
+    parts = (trajectory.velocities, trajectory.accel_biases, trajectory.gyro_biases)
     rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
     # row by row: lists of all of them would take several times the memory of the arrays
     for stamp_ns, row in zip(trajectory.stamps_ns, rows, strict=True):

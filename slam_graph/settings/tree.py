@@ -7,8 +7,7 @@ A fault found later, when the tree is checked against the schema, can then name 
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from slam_graph.errors import ConfigError
+from slam_graph.errors import closest as closest
 from slam_graph.settings.base import Settings
 
 KeyPath = tuple[str | int, ...]
@@ -108,13 +108,6 @@ def validate(model: type[ModelT], tree: ConfigTree) -> ModelT:
         raise ConfigError(f"{_describe(model, tree, dict(faults[0]))}{more}") from error
 
 
-def closest(name: str, known: Iterable[str]) -> str:
-    """A hint at the known name most like `name`, or the list of all if none is."""
-    known = list(known)
-    similar = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean '{similar[0]}'?" if similar else f"known: {', '.join(known)}"
-
-
 def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]) -> str:
     """One line about one fault that the schema found."""
     path: KeyPath = fault["loc"]
@@ -127,8 +120,12 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
         return f"{where}: unknown key '{dotted}'; {closest(key, known)}"
     if fault["type"] == "missing":
         return f"{where}: key '{dotted}' is missing"
+    if fault["type"] == "unused":
+        return f"{where}: '{dotted}' {fault['msg']}"
     message = str(fault["msg"]).removeprefix("Value error, ")
-    return f"{where}: {dotted}: {message[:1].lower()}{message[1:]}, got {fault['input']!r}"
+    got = repr(fault["input"])
+    message = f"{where}: {dotted}: {message[:1].lower()}{message[1:]}"
+    return message if got in message else f"{message}, got {got}"
 
 
 def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:

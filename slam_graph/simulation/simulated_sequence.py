@@ -13,7 +13,13 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import ImuData
@@ -67,7 +73,7 @@ class SimulatedSequence(RecordedSequence):
         flight: Flight,
         diagnostics: Diagnostics | None = None,
     ) -> None:
-        super().__init__(name, flight.rig, None, diagnostics)
+        super().__init__(name, flight.rig, ReaderOptions(diagnostics=diagnostics or Diagnostics()))
         self.config = config
         self.flight = flight
         self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)
@@ -95,8 +101,8 @@ class SimulatedSequence(RecordedSequence):
             motion.positions(stamps),
             motion.rotations(stamps).as_quat(),
             motion.velocities(stamps),
-            gyro_biases,
-            accel_biases,
+            accel_biases=accel_biases,
+            gyro_biases=gyro_biases,
         )
 
     def initial_state(self) -> NavState:
@@ -120,9 +126,9 @@ class SimulatedSequence(RecordedSequence):
             int(first[0]),
             gtsam.Pose3(R, motion.positions(first)[0]).retract(error[:6]),
             motion.velocities(first)[0] + error[6:9],
-            gyro_biases[0] + error[12:],
-            accel_biases[0] + error[9:12],
-            np.diag(spread**2),
+            accel_bias=accel_biases[0] + error[9:12],
+            gyro_bias=gyro_biases[0] + error[12:],
+            covariance=np.diag(spread**2),
         )
 
 

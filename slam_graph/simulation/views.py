@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import WIDEST, Camera
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.simulation_config import TrackConfig
 from slam_graph.simulation.world import World
@@ -43,7 +43,7 @@ class View:
         camera, pose = mounted.camera, mounted.body_T_camera
         plane, valid = camera.visible(_border(camera))
         reach = float(np.max(np.linalg.norm(plane[valid], axis=1), initial=0.0))
-        reach = reach if valid.all() else WIDEST
+        reach = reach if valid.all() else camera.max_tangent
         R, p = pose.rotation().matrix(), np.asarray(pose.translation())
         return View(camera, R, p, 1.001 * reach, config)
 

@@ -20,9 +20,9 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.imu_factor import preintegration_params
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
+from slam_graph.sensors.imu_buffer import preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.keyframe_states import states_at
@@ -294,8 +294,10 @@ def _trajectory(states: list[NavState]) -> Trajectory:
 
 def _concatenated(parts: list[Trajectory]) -> Trajectory:
     """Trajectories with velocities and biases, concatenated in time."""
-    names = ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases", "accel_biases")
-    return Trajectory(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
+    return Trajectory(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
 
 
 def _summary(

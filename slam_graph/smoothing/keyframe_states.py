@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.cost.imu_factor import ImuBuffer, predict, preintegrate
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate
 
 __all__ = ["fill_in", "states_at"]
 
@@ -30,8 +30,8 @@ def _state_at(trajectory: Trajectory, row: int) -> NavState:
         int(trajectory.stamps_ns[row]),
         trajectory.pose(row),
         trajectory.velocities[row],
-        trajectory.gyro_biases[row],
-        trajectory.accel_biases[row],
+        accel_bias=trajectory.accel_biases[row],
+        gyro_bias=trajectory.gyro_biases[row],
     )
 
 
@@ -92,7 +92,9 @@ def _predict_backward(
         - rotation.rotate(pim.deltaPij())
     )
     pose = gtsam.Pose3(rotation, position)
-    return NavState(stamp_ns, pose, velocity, state.gyro_bias, state.accel_bias)
+    return NavState(
+        stamp_ns, pose, velocity, accel_bias=state.accel_bias, gyro_bias=state.gyro_bias
+    )
 
 
 def fill_in(

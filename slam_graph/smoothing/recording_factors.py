@@ -15,11 +15,14 @@ import numpy as np
 from gtsam.symbol_shorthand import B, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import BackendConfig, GatingConfig
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.cost.imu_factor import imu_factor
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
+from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.recording_segment import RecordingSegment
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
@@ -72,9 +75,7 @@ class RecordingFactors:
             variances: (N,) relative to that of a single observation.
             sigma_px: standard deviation of a single observation.
         """
-        loss = GatingConfig(
-            robust_loss=self._config.robust_loss, robust_width=self._config.robust_width
-        )
+        loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
         factors: list[gtsam.NonlinearFactor] = []
         for variance in np.unique(variances).tolist():  # one noise model for each group size
             noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
@@ -104,14 +105,14 @@ class RecordingFactors:
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
             gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-            scale = noise.imu_scale * (noise.imu_gap_scale if gap else 1.0)
+            scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
             # variances of non-stationary noise add up
             gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
             params = preintegration_params(self._rig.imu, noise.gravity, scale, gyro, accel)
             pim = preintegrate(imu.between(start_ns, end_ns), values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():
-                factors += zero_velocity_factors(k, k + 1, self._backend.zero_velocity)
+                factors += zero_velocity_factors(k, k + 1)
         return factors
 
 

@@ -20,11 +20,11 @@ from gtsam.symbol_shorthand import B, L, V, X
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import preintegration_params
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.frame_averaging import averaged, nearest_keyframe
 from slam_graph.smoothing.keyframe_states import fill_in
@@ -280,8 +280,8 @@ class BundleAdjustment:
                     stamp_ns,
                     self._values.atPose3(X(k)),
                     np.asarray(self._values.atVector(V(k))),
-                    np.asarray(bias.gyroscope()),
-                    np.asarray(bias.accelerometer()),
+                    accel_bias=np.asarray(bias.accelerometer()),
+                    gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
         params = preintegration_params(self._rig.imu, self._backend.noise.gravity)

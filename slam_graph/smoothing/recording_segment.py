@@ -11,10 +11,10 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.smoothing.frame_log import FrameLog
@@ -132,7 +132,7 @@ def with_gtsam_cameras(rig: Rig) -> Rig:
 
 def _gtsam_camera(mounted: RigCamera) -> RigCamera:
     camera = mounted.camera
-    if camera.distortion != "double_sphere":
+    if camera.gtsam_calibration() is not None:
         return mounted
     middle, slope = (values[0] for values in camera.distort(np.zeros((1, 2))))
     fx, fy, cx, cy = slope[0, 0], slope[1, 1], middle[0], middle[1]
