@@ -39,5 +39,5 @@ def test_old_keys_name_what_replaces_them(table: type[Settings]) -> None:
         found = re.fullmatch(r"is a constant now: (\w+) in (\S+\.py)", text)
         if found:
             name, path = found.groups()
-            source = (PACKAGE / path).read_text(encoding="utf-8")
+            source = (PACKAGE / path.removeprefix("slam_graph/")).read_text(encoding="utf-8")
             assert re.search(rf"^{name}\b.*=", source, re.MULTILINE), f"{key}: {text}"

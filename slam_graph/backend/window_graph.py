@@ -132,7 +132,7 @@ def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
     for factor in cost.factors:
         graph.push_back(factor)
         losses.append(None)
-    loss = cost._robust
+    loss = cost.robust
     projections = _Projections(cost.rig, cost.state, sigma_px, loss)
     if cost.tracked is not None:
         projections.add(graph, cost.tracked)
