@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from slam_graph.config import RunConfig, load_config
     from slam_graph.datasets.dataset_registry import open_dataset
     from slam_graph.datasets.groundtruth import read_groundtruth
+    from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
@@ -52,6 +53,7 @@ __all__ = [
     "adjust_map",
     "ape",
     "certify",
+    "dataset_from_arrays",
     "load_config",
     "load_map",
     "merge_maps",
@@ -80,6 +82,7 @@ _HOME = {
     "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "certify": "slam_graph.pose_graph.certificate",
+    "dataset_from_arrays": "slam_graph.datasets.memory_sequence",
     "load_config": "slam_graph.config",
     "load_map": "slam_graph.results.map_output",
     "merge_maps": "slam_graph.maps.map_merge",

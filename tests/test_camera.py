@@ -224,7 +224,7 @@ def test_a_front_end_leaves_out_what_a_fisheye_sees_sideways() -> None:
     rng = np.random.default_rng(3)
     image = cv2.resize(rng.integers(0, 255, (128, 128), dtype=np.uint8), (512, 512))
     rig = Rig((RigCamera(WIDE, gtsam.Pose3()),))
-    tracker = ImageFrontend(rig, FrontendConfig(features=400), 0, Diagnostics())
+    tracker = ImageFrontend(rig, FrontendConfig(max_features=400), 0, Diagnostics())
     features = tracker.track(CameraFrame(0, (np.asarray(image, np.uint8),))).cameras[0]
     length = np.linalg.norm(features.normalized, axis=1)
     assert len(features) > 100

@@ -15,9 +15,9 @@ import numpy as np
 
 from slam_graph.config import RunConfig
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError, closest
+from slam_graph.errors import DataError
 from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
-from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.pipeline.run import run
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking
 from slam_graph.results.run_logs import TimingLog
@@ -141,16 +141,11 @@ def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
     """The settings of front ends given as METHOD or METHOD/DETECTOR.
 
     Returns:
-        Overrides for `load_config`, by name.
-
-    Raises:
-        ConfigError: if there is no such method.
+        Overrides for `load_config`, which refuses unknown ones, by name.
     """
     settings = {}
     for name in names:
         method, _, detector = name.partition("/")
-        if method not in FRONTENDS:
-            raise ConfigError(f"unknown front end '{method}'; {closest(method, FRONTENDS)}")
         settings[name] = [f"frontend.method={method}"]
         settings[name] += [f"frontend.detector={detector}"] if detector else []
     return settings

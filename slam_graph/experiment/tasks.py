@@ -18,7 +18,8 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets.formats.track_recording import TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
+from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.sources import Source
 from slam_graph.frontend.build_frontend import build_frontend

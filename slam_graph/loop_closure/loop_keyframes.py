@@ -20,8 +20,7 @@ from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.frontend.descriptors import Orb
-from slam_graph.frontend.keypoints import Keypoints
-from slam_graph.frontend.tracked_features import Image
+from slam_graph.frontend.keypoints import Image, Keypoints
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.loop_closure.loop_config import KeyframeConfig

@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry.trajectory import Trajectory
@@ -59,7 +60,7 @@ class RecordedFlight:
         folder = path / "mav0" if (path / "mav0").is_dir() else path
         sequence = None
         if (folder / "imu0" / "data.csv").is_file() and any(folder.glob("cam[0-9]*")):
-            sequence = EurocSequence(path, diagnostics=diagnostics)
+            sequence = EurocSequence(path, ReaderOptions(diagnostics=diagnostics))
         elif config.real_imu:
             raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
         rig = None if sequence is None else sequence.rig

@@ -18,7 +18,13 @@ import yaml
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.formats.euroc_writer import EurocWriter
 from slam_graph.datasets.formats.track_recorder import TrackRecorder
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
@@ -79,7 +85,7 @@ class SimulatedSequence(RecordedSequence):
         flight: Flight,
         diagnostics: Diagnostics | None = None,
     ) -> None:
-        super().__init__(name, flight.rig, None, diagnostics)
+        super().__init__(name, flight.rig, ReaderOptions(diagnostics=diagnostics or Diagnostics()))
         self.config = config
         self.flight = flight
         self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)

@@ -19,6 +19,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
@@ -116,7 +117,7 @@ class FrameLog:
 
     def packets(self, first: int, stop: int) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = TrackRecordingSequence(self._path, diagnostics=_Silent())
+        sequence = TrackRecordingSequence(self._path, ReaderOptions(diagnostics=_Silent()))
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:

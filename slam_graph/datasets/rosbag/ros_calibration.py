@@ -55,7 +55,10 @@ def _info(bag: Bag, topic: str) -> Any:
     base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
     beside = f"{base.rpartition('/')[0]}/camera_info"
     if bag.topics.get(beside) != CAMERA_INFO:
-        raise DataError(f"{bag.path}: no calibration, '{beside}' is missing; give --calibration")
+        raise DataError(
+            f"{bag.path}: no calibration: no topic '{beside}'; give --calibration; "
+            f"the bag has {bag.listed()}"
+        )
     return _first(bag, beside)
 
 
