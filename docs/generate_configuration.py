@@ -12,7 +12,6 @@ from typing import Any
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig, load_config
-from slam_graph.maps.map_config import MapBalPolicy
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
@@ -63,16 +62,6 @@ slam-graph optimize problem.txt --set cost.robust_width_px=1.5 --set gauss_newto
 ```
 """
 
-MAPS = """\
-## Bundle adjustment of maps
-
-The settings of `slam-graph optimize` for a map:
-
-```sh
-slam-graph optimize results/MONDAY/latest --set prior.position_sigma=0.02
-```
-"""
-
 EXPERT = """\
 # Expert settings
 
@@ -93,7 +82,6 @@ def page() -> str:
     for heading, policy in (
         (POSE_GRAPHS, PoseGraphPolicy()),
         (BUNDLES, BalPolicy()),
-        (MAPS, MapBalPolicy()),
     ):
         schema = policy.model_json_schema()
         defaults = policy.model_dump(mode="json")

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
     from slam_graph.geometry.trajectory import NavState, Trajectory
-    from slam_graph.maps.map_adjustment import adjust_map
-    from slam_graph.maps.map_config import MapBalPolicy
     from slam_graph.maps.map_merge import merge_maps
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.pipeline.run import RunResult, run
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
 __all__ = [
     "BalPolicy",
     "Estimator",
-    "MapBalPolicy",
     "NavState",
     "PoseGraphPolicy",
     "RunConfig",
@@ -50,7 +47,6 @@ __all__ = [
     "Trajectory",
     "__version__",
     "adjust_bundle",
-    "adjust_map",
     "ape",
     "certify",
     "dataset_from_arrays",
@@ -70,7 +66,6 @@ __all__ = [
 _HOME = {
     "BalPolicy": "slam_graph.bundle_adjustment.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
-    "MapBalPolicy": "slam_graph.maps.map_config",
     "NavState": "slam_graph.geometry.trajectory",
     "PoseGraphPolicy": "slam_graph.pose_graph.pose_graph_policy",
     "RunConfig": "slam_graph.config",
@@ -79,7 +74,6 @@ _HOME = {
     "SlamMap": "slam_graph.maps.map_model",
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
-    "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
     "certify": "slam_graph.pose_graph.certificate",
     "dataset_from_arrays": "slam_graph.datasets.memory_sequence",

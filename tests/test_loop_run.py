@@ -66,7 +66,7 @@ def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
     assert (without / "trajectory.tum").read_text() == (folder / "trajectory.tum").read_text()
 
 
-def test_tracks_without_looks_are_said_to_have_no_loops() -> None:
+def test_tracks_without_descriptors_are_said_to_have_no_loops() -> None:
     tracks = TrackConfig(features=30)
     sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
     result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))

@@ -48,7 +48,8 @@ FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics, float], Fro
     home="slam_graph.frontend.image_frontend",
     names=("klt",),
 )
-"""Front ends by name: callables that make one from rig, settings, seed and diagnostics."""
+"""Front ends by name: callables that make one from rig, settings, seed, diagnostics and gravity in
+m/s²."""
 
 PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
 """The detector that a descriptor was published with; for BRIEF, which has none, FAST."""

@@ -67,7 +67,7 @@ class LocalizationStage:
         self, known: SlamMap, rig: Rig, config: RunConfig, name: str, diagnostics: Diagnostics
     ) -> None:
         loops, settings = config.loop_closure, config.localization
-        self._places = MapPlaces(known, rig, loops.places, loops.verification, settings.neighbours)
+        self._places = MapPlaces(known, rig, loops.verification, settings.neighbours)
         self._localizer = MapLocalizer(self._places, settings)
         self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
         self._name, self._diagnostics = name, diagnostics
@@ -89,7 +89,7 @@ class LocalizationStage:
             if view is not None:
                 self._places.check(view.descriptors, self._name)
                 try:
-                    localizer.see(view)
+                    localizer.match(view)
                 except (cv2.error, np.linalg.LinAlgError) as error:
                     reason = " ".join(str(error).split())[:200]
                     self._diagnostics.warn("localization_query_failed", reason)
@@ -121,9 +121,9 @@ class LocalizationStage:
         localizer, log = self._localizer, self._log
         log.count(
             queries=localizer.queries,
-            sightings=localizer.sightings,
-            believed=localizer.believed,
-            starts=localizer.restarts,
+            matches=localizer.matches,
+            accepted=localizer.accepted,
+            starts=localizer.starts,
         )
         if len(log.located) and localizer.queries == 0:
             self._diagnostics.warn(

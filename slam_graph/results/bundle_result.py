@@ -110,8 +110,8 @@ class BalResult:
         Returns:
             The files.
         """
-        files = self.save_estimates(folder)
-        texts = {
+        texts: dict[str, Iterable[str]] = {
+            "optimized.txt": self.lines(),
             "config.yaml": [dump_yaml(self.policy)],
             "metrics.json": [json.dumps(self.metrics, indent=2, allow_nan=False), "\n"],
         }
@@ -120,13 +120,7 @@ class BalResult:
         write_ply(folder / "scene.ply", self.after.points, self.after.centres())
         self._draw(folder / "bundle_adjustment.png")
         more = (*texts, "scene.ply", "bundle_adjustment.png")
-        return [*files, *(folder / name for name in more)]
-
-    def save_estimates(self, folder: Path) -> list[Path]:
-        """Write the estimates into a folder."""
-        file = folder / "optimized.txt"
-        write_text(file, self.lines())
-        return [file]
+        return [folder / name for name in more]
 
     def lines(self) -> Iterable[str]:
         """The whole problem with its estimates, in BAL's format."""

@@ -14,7 +14,12 @@ class EveryOtherFeature:
     """The features of `klt` that have even ids."""
 
     def __init__(
-        self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
+        self,
+        rig: Rig,
+        config: FrontendConfig,
+        seed: int,
+        diagnostics: Diagnostics,
+        gravity: float,
     ) -> None:
         self._all = FRONTENDS["klt"](rig, config, seed, diagnostics, gravity)
         self.frame_stats: dict[str, float] = {}
