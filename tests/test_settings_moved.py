@@ -14,6 +14,7 @@ from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 from slam_graph.settings.base import Settings
+from slam_graph.simulation.simulation_config import SimulationConfig
 
 PACKAGE = Path(slam_graph.__file__).parent
 
@@ -28,7 +29,9 @@ def tables(model: type[BaseModel]) -> Iterator[type[Settings]]:
 
 
 TABLES = dict.fromkeys(
-    table for policy in (RunConfig, PoseGraphPolicy, BalPolicy) for table in tables(policy)
+    table
+    for policy in (RunConfig, PoseGraphPolicy, BalPolicy, SimulationConfig)
+    for table in tables(policy)
 )
 
 
@@ -39,5 +42,5 @@ def test_old_keys_name_what_replaces_them(table: type[Settings]) -> None:
         found = re.fullmatch(r"is a constant now: (\w+) in (\S+\.py)", text)
         if found:
             name, path = found.groups()
-            source = (PACKAGE / path).read_text(encoding="utf-8")
+            source = (PACKAGE / path.removeprefix("slam_graph/")).read_text(encoding="utf-8")
             assert re.search(rf"^{name}\b.*=", source, re.MULTILINE), f"{key}: {text}"
