@@ -4,10 +4,13 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
+from limits import HANG_S
 from pydantic import BaseModel
 
 from slam_graph.config import RunConfig
@@ -70,6 +73,24 @@ def test_settings_exist() -> None:
     settings = set(SETTING.findall(TEXT))
     assert {"backend.noise.gravity", "backend.gating.confidence"} <= settings
     assert not sorted(setting for setting in settings if not exists(setting))
+
+
+def test_the_pose_selection_of_the_page_runs() -> None:
+    """In a process of its own, as a name that is registered stays."""
+    (block,) = re.findall(r"^```python\n(.+?)^```", TEXT, re.MULTILINE | re.DOTALL)
+    (override,) = re.findall(r'overrides=\["(algorithm\.cost\.past_poses=\w+)"\]', TEXT)
+    use = f"""
+import slam_graph as sg
+config = sg.load_config(overrides=["{override}", "duration_s=8"])
+result = sg.run(sg.open_dataset("demo"), config)
+result.check()
+print(len(result.history))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", block + use], capture_output=True, text=True, timeout=HANG_S
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[-1]) > 100
 
 
 def test_a_name_that_does_not_exist_is_noticed() -> None:

@@ -14,6 +14,7 @@ from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 from slam_graph.settings.base import Settings
+from slam_graph.simulation.simulation_config import SimulationConfig
 
 PACKAGE = Path(slam_graph.__file__).parent
 
@@ -28,7 +29,9 @@ def tables(model: type[BaseModel]) -> Iterator[type[Settings]]:
 
 
 TABLES = dict.fromkeys(
-    table for policy in (RunConfig, PoseGraphPolicy, BalPolicy) for table in tables(policy)
+    table
+    for policy in (RunConfig, PoseGraphPolicy, BalPolicy, SimulationConfig)
+    for table in tables(policy)
 )
 
 

@@ -141,7 +141,7 @@ def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
     """The settings of front ends given as METHOD or METHOD/DETECTOR.
 
     Returns:
-        by name, overrides for `load_config`, which refuses unknown ones.
+        Overrides for `load_config`, which refuses unknown ones, by name.
     """
     settings = {}
     for name in names:

@@ -18,7 +18,8 @@ __all__ = ["View", "camera_groups"]
 OVERLAP_DEPTH_M = 4.0
 """Depth at which the overlap of two cameras is determined."""
 
-MIN_DEPTH_M, MAX_DEPTH_M = 0.3, 40.0
+MIN_DEPTH_M = 0.3
+MAX_DEPTH_M = 40.0
 """Depths between which a point is visible: the range of an indoor front end."""
 
 BORDER_PX = 8.0
