@@ -67,7 +67,7 @@ def figures_of(
         Metric("ate", errors.position_m, "m", "lower", ate_bar_m),
         Metric("gain", causal.position_m / errors.position_m, "×", "higher", gain_bar),
         Metric("orientation", errors.orientation_deg, "deg", "lower"),
-        Metric("frames_without", run.result.frames - summary.frames, "frames", "lower", 0.0),
+        Metric("frames_without", run.result.logs.frames - summary.frames, "frames", "lower", 0.0),
         Metric("cpu", summary.cpu_seconds, "s", "lower", seconds_bar),
         info("causal_ate", causal.position_m, "m"),
         info("keyframes", summary.keyframes, ""),

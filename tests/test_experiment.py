@@ -83,7 +83,7 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
     # the error of the start is drawn from its covariance, which is not to be reduced
     config = load_config(None, ["backend.initialization.fix_gauge=false"], algorithm="swf")
     result = pipeline.run(open_dataset(tracks), config)
-    truth = result.truth_of_run()
+    truth = result.groundtruth
     assert truth is not None
     file = folder / "runs" / "sim_figure8_seed0" / "swf.npz"
     with np.load(file, allow_pickle=False) as series:
@@ -92,11 +92,11 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
             np.testing.assert_allclose(series[f"translation_m_{mode}"], expected.values, atol=1e-12)
         assert np.all(np.diff(series["distance_m"]) >= 0.0)
         assert len(series["nees_position"]) == len(series["nees_time_s"]) > 0
-        assert len(series["steps"]) == len(result.steps) > 0
+        assert len(series["steps"]) == len(result.logs.steps) > 0
         assert np.all(series["columns"] >= 15)
         assert 0.5 < np.median(series["nis_ratio"]) < 1.5
         assert np.all(series["cost_before"] >= 0.0)
-        assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.frames
+        assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.logs.frames
     table = json.loads(file.with_suffix(".json").read_text())
     ours = table["metrics"]["accuracy"]["none"]["ate"]
     assert ours == result.metrics["accuracy"]["none"]["ate"]

@@ -20,7 +20,7 @@ from slam_graph.results.metrics import finite
 from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
 from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
-from slam_graph.results.run_result import RunResult
+from slam_graph.results.run_result import RunInput, RunResult
 from slam_graph.sensors.rig import Rig
 
 NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
@@ -136,13 +136,13 @@ def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
     """A result whose states are a trajectory that another system estimated."""
     start, end = int(estimate.stamps_ns[0]), int(estimate.stamps_ns[-1])
     info = SequenceInfo("clip", "euroc", "images", 2, len(estimate), start, end, 0, True)
-    result = RunResult(info, load_config(), Rig(()), start, end, truth=truth)
+    result = RunResult(RunInput(info, load_config(), Rig(()), start, end, truth))
     for index in range(len(estimate)):
         stamp, zero = int(estimate.stamps_ns[index]), np.zeros(3)
         covariance = np.eye(15) * 1e-4
         result.history.append(NavState(stamp, estimate.pose(index), zero, zero, zero, covariance))
-        result.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
-    result.wall_s = 2.0
+        result.logs.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
+    result.ending.wall_s = 2.0
     return result
 
 
@@ -174,7 +174,7 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     assert metrics["accuracy"]["none"]["rpe"]["translation_m"]["rmse"] < 0.02
     assert metrics["nees"]["alignment"] == "yaw"
     assert metrics["features_per_frame"] == {"tracked": 10.0}
-    assert metrics["timing"]["real_time_factor"] == pytest.approx(result.recorded_s / 2.0)
+    assert metrics["timing"]["real_time_factor"] == pytest.approx(result.input.recorded_s / 2.0)
     assert (tmp_path / "out" / "trajectory.png").read_bytes()[:4] == b"\x89PNG"
     assert load_config(tmp_path / "out" / "config.yaml") == result.config
 
@@ -184,7 +184,7 @@ def test_a_result_without_states_is_written_too(
 ) -> None:
     caplog.set_level(logging.INFO)
     info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
-    result = RunResult(info, load_config(), Rig(()), 0, 10**9)
+    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
     result.save(tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["accuracy"] is None

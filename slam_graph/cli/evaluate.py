@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, PoseRelation
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ STATISTICS = ("max", "mean", "median", "min", "rmse", "sse", "std")
 Reference = Annotated[
     Path, typer.Argument(help="True trajectory: TUM file, EuRoC CSV or EuRoC folder.")
 ]
-Estimate = Annotated[Path, typer.Argument(help="Trajectory to judge: TUM file or EuRoC CSV.")]
+Estimate = Annotated[Path, typer.Argument(help="Trajectory to evaluate: TUM file or EuRoC CSV.")]
 Relation = Annotated[
     PoseRelation,
     typer.Option("-r", "--pose_relation", help="Part of the difference of two poses that counts."),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph frontend`: the front end alone, its tracks drawn and judged; and several compared."""
+"""`slam-graph frontend`: run the front end alone and draw its tracks; compare several."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import (
+from slam_graph.cli.options import (
     Calibration,
     Cameras,
+    ConfigFile,
     Data,
     Duration,
     Format,
     Groundtruth,
     Json,
+    Overrides,
     Sources,
     Start,
     open_recording,
 )
-from slam_graph.cli.output import echo_json, echo_table, number
+from slam_graph.cli.printing import echo_json, echo_table, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +39,7 @@ EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,su
 
 
 class RunByDefault(TyperGroup):
-    """A group whose first command is meant where none is named: `frontend DATA`."""
+    """A group whose first command is the default: `frontend DATA`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the name of the first command before arguments that do not begin with one."""
@@ -64,7 +65,7 @@ def run(
     start: Start = None,
     duration: Duration = None,
     picture: Annotated[
-        Path, typer.Option("--picture", help="PNG of the frame in the middle with its tracks.")
+        Path, typer.Option("--picture", help="PNG of the middle frame with its tracks.")
     ] = Path("tracks.png"),
     video: Annotated[
         Path | None, typer.Option("--video", help="MP4 of all frames with their tracks.")
@@ -104,7 +105,7 @@ def compare(
     ] = EVERYTHING,
     algorithm: Annotated[
         str | None,
-        typer.Option("--algorithm", help="Also estimate the trajectory from each one's tracks."),
+        typer.Option("--algorithm", help="Also estimate the trajectory from the tracks of each."),
     ] = None,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -121,10 +122,10 @@ def compare(
     from slam_graph.config import load_config
     from slam_graph.experiment.frontend_comparison import parse_frontends, track, track_and_estimate
 
-    said = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
+    options = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
     for name, changes in parse_frontends(n for n in frontends.split(",") if n).items():
-        settings = load_config(config, [*(set_ or ()), *changes], **said)
+        settings = load_config(config, [*(set_ or ()), *changes], **options)
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
@@ -145,7 +146,7 @@ def _watch(
     record: Path | None,
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
-    """What is done with every frame: drawn, and recorded if asked for."""
+    """A function that draws each frame, and records it if asked for."""
     from slam_graph.datasets.formats.track_recording import TrackRecorder
     from slam_graph.sensors.measurements import CameraFrame
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
@@ -233,7 +234,7 @@ def _lines(report: FrontendReport) -> list[tuple[str, str]]:
 
 
 def _plain(report: FrontendReport) -> dict[str, Any]:
-    """A report for JSON, which knows no NaN."""
+    """A report for JSON, which has no NaN."""
     table = report.table()
     if table["inliers"] != table["inliers"]:
         table["inliers"] = None

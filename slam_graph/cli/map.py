@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph map`: what a map holds, its export, and two maps made one."""
+"""`slam-graph map`: show, export and merge maps."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import (
+    ConfigFile,
+    Json,
+    Overrides,
+)
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.maps.map_model import MapRecording, SlamMap
 
-app = typer.Typer(
-    help="Look at maps, export and merge them.", no_args_is_help=True, rich_markup_mode=None
-)
+app = typer.Typer(help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode=None)
 
 MapPath = Annotated[
     Path, typer.Argument(metavar="MAP", help="Map file, or the folder of a run with one.")
@@ -67,7 +68,7 @@ def export(
     from slam_graph.results.result_files import refuse_to_replace
 
     if ply is None and tum is None:
-        raise ConfigError("nothing to write: say --ply FILE, --tum FILE, or both")
+        raise ConfigError("nothing to write: give --ply FILE, --tum FILE, or both")
     content = load_map(path)
     if ply is not None and tum is not None:
         refuse_to_replace(tum, force)
@@ -81,7 +82,7 @@ def export(
 
 @app.command()
 def merge(
-    first: Annotated[Path, typer.Argument(metavar="MAP", help="Its world is that of the result.")],
+    first: Annotated[Path, typer.Argument(metavar="MAP", help="The result keeps its world.")],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="Map of the same place.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
     config: ConfigFile = None,
@@ -89,7 +90,7 @@ def merge(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make one map of two of the same place; nothing is written if they share none."""
+    """Merge two maps of the same place; nothing is written if they do not overlap."""
     from dataclasses import asdict
 
     from slam_graph.config import load_config

@@ -11,11 +11,14 @@ from zipfile import is_zipfile
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.optimization import read_policy
 from slam_graph.cli.optimize_bal import optimize_bal, optimize_map
+from slam_graph.cli.optimize_common import read_policy
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
+from slam_graph.cli.options import (
+    ConfigFile,
+    Json,
+    Overrides,
+)
 from slam_graph.errors import ConfigError, DataError
 
 Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
@@ -35,15 +38,15 @@ def optimize(
         ),
     ],
     kind: Annotated[
-        Format, typer.Option("--format", help="What FILE is; auto: as its content says.")
+        Format, typer.Option("--format", help="Kind of FILE; auto detects it from the content.")
     ] = "auto",
-    method: Annotated[Method | None, typer.Option("--method", help="How steps are taken.")] = None,
+    method: Annotated[Method | None, typer.Option("--method", help="Optimisation method.")] = None,
     initialization: Annotated[
-        Initial | None, typer.Option("--init", help="Where the first estimates come from.")
+        Initial | None, typer.Option("--init", help="Source of the initial estimates.")
     ] = None,
     robust: Annotated[
         Robust | None,
-        typer.Option("--robust", help="How false loop closures or outliers are held back."),
+        typer.Option("--robust", help="Robust loss against false loop closures or outliers."),
     ] = None,
     intrinsics: Annotated[
         Intrinsics | None,
@@ -53,22 +56,22 @@ def optimize(
         Literal["angle", "quaternion"] | None,
         typer.Option(
             "--information",
-            help="What the information of 3D rotations is for: GTSAM's (angle, the default) or "
-            "g2o's.",
+            help="Which rotation error the information of 3D edges is for: GTSAM's (angle, the "
+            "default) or g2o's (quaternion).",
         ),
     ] = None,
     certify: Annotated[
-        bool, typer.Option("--certify", help="Say whether the result is the global optimum.")
+        bool, typer.Option("--certify", help="Certify whether the result is the global optimum.")
     ] = False,
     covariances: Annotated[
         bool, typer.Option("--covariances", help="Write the covariance of every pose.")
     ] = False,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="PATH", help="Write the optimised problem here too."),
+        typer.Option("--save", metavar="PATH", help="Also write the optimised problem here."),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Let --save replace a file that is there.")
+        bool, typer.Option("--force", help="Let --save replace an existing file.")
     ] = False,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -86,9 +89,9 @@ def optimize(
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
-        raise DataError(f"{save}: is there already; say --force to replace it")
+        raise DataError(f"{save}: exists already; use --force to replace it")
     if save is not None and (save.is_dir() or not save.parent.is_dir()):
-        raise DataError(f"{save}: cannot be written; name a file in a folder that is there")
+        raise DataError(f"{save}: cannot be written; name a file in an existing folder")
     loss = {("cost", "robust"): robust}
     of_graphs = {("gauss_newton", "method"): method, ("cost", "initialization"): initialization}
     of_bundles = {("cost", "intrinsics"): intrinsics}
@@ -114,7 +117,7 @@ def optimize(
 
 
 def _seen_format(file: Path) -> Format:
-    """What a file is, as its content says; a folder is one of a run with a map."""
+    """The kind of a file, from its content; a folder is that of a run with a map."""
     from slam_graph.bundle_adjustment.bal_file import is_bal
 
     if file.is_dir() or is_zipfile(file):
@@ -123,10 +126,10 @@ def _seen_format(file: Path) -> Format:
 
 
 def _refuse(options: Mapping[str, Any], what: str, file: Path) -> None:
-    """Make sure that options for another kind of problem are not given.
+    """Refuse options for another kind of problem.
 
     Raises:
-        ConfigError: if one is.
+        ConfigError: if one is given.
     """
     for option, value in options.items():
         if value is not None:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from slam_graph.cli.logs import collected_log
-from slam_graph.cli.optimization import timed, write_result
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.optimize_common import timed, write_result
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from slam_graph.results.bundle_result import BalResult
 
 MOST_LETTERS = 100
-"""Of the name of a recording in that of a folder."""
+"""The name of a recording is cut to this length in the name of a folder."""
 
 
 def optimize_bal(

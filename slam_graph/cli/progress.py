@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a run is, on stderr: a bar in a terminal, now and then a line in a log."""
+"""Progress of a run on stderr: a bar in a terminal, a line every few seconds in a log."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ProgressBar:
             sys.stderr.flush()
 
     def advance(self, stamp_ns: int, initialized: bool) -> None:
-        """Count a frame, and show it if it is time to."""
+        """Count a frame, and refresh the line if it is due."""
         self._frames += 1
         now = time.monotonic()
         self._line = self._text(stamp_ns - self._start_ns, now - self._began, initialized)
@@ -56,7 +56,7 @@ class ProgressBar:
         sys.stderr.flush()
 
     def adjusting(self, done: int, keyframes: int, steps: int) -> None:
-        """Show how far the bundle adjustment over the whole recording is."""
+        """Show the progress of the final bundle adjustment."""
         now = time.monotonic()
         if now - self._shown < self._period_s:
             return

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from slam_graph.cli.output import echo_table, number
+from slam_graph.cli.printing import echo_table, number
 
 if TYPE_CHECKING:
     from slam_graph.results.run_result import RunResult
@@ -19,7 +19,7 @@ Table = dict[str, Any]
 
 
 def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
-    """Print what a run reached, and where its files are."""
+    """Print the results of a run, and where its files are."""
     metrics = result.metrics
     echo_table(_overview(metrics))
     if metrics["accuracy"]:
@@ -49,7 +49,7 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
 
 
 def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
-    """What was run, how much of it, and how fast."""
+    """Dataset, algorithm, extent, speed and sizes."""
     dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
     cameras = f"{metrics['cameras']} camera{'s' if metrics['cameras'] > 1 else ''}"
     yield "dataset", f"{dataset['name']} ({dataset['format']}, {dataset['content']}, {cameras})"
@@ -86,7 +86,7 @@ def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
 
 
 def _final_ba(table: Table) -> str:
-    """How large the problem of the whole recording was, and what became of its cost."""
+    """Size of the final bundle adjustment, and its cost before and after."""
     return (
         f"{table['frames']} frames, {table['keyframes']} keyframes, {table['features']} features, "
         f"{table['iterations']} steps in {table['seconds']:.1f} s, "
@@ -100,7 +100,7 @@ def _located(table: Table) -> str:
         return f"never, in {table['queries']} comparisons with the map"
     return (
         f"{table['located']} frames, {table['located_share']:.1%} of all, from "
-        f"{table['first_s']:.2f} s on; {table['believed']} sightings believed of "
+        f"{table['first_s']:.2f} s on; {table['believed']} sightings accepted of "
         f"{table['sightings']} in {table['queries']} comparisons, "
         f"{table['ms_per_frame']:.1f} ms a frame"
     )
@@ -133,14 +133,14 @@ def _consistency(nees: Table) -> Iterator[tuple[str, ...]]:
 
 
 def _innovations(nis: Table) -> Iterator[tuple[str, ...]]:
-    """NIS over its degrees of freedom, beside what a right covariance leaves behind the gate."""
+    """NIS over its degrees of freedom, beside the mean expected after the gate."""
     yield "NIS / dof", "mean", "expected", "inside 95% bounds", "rejected"
     shares = (f"{nis['inside_bounds']:.0%}", f"{nis['rejected']:.1%}")
     yield "images", number(nis["mean"], 2), number(nis["expected_mean"], 2), *shares
 
 
 def _calibration(parameters: Table) -> Iterator[tuple[str, ...]]:
-    """Estimated parameters of the rig beside what they were at first."""
+    """Estimated parameters of the rig beside their initial values."""
     yield "calibration", "start", "estimate", "1 sigma"
     for name, row in parameters.items():
         values = (f"{row[column]:.6g}" for column in ("start", "value"))

@@ -12,12 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.maps.map_adjustment import MapAdjustment
-from slam_graph.results.bundle_result import BalResult, Table
+from slam_graph.results.bundle_result import BalResult
 from slam_graph.results.map_output import MAP_NAME, export_tum, save_map
-from slam_graph.results.metrics import finite
+from slam_graph.results.metrics import Table, finite
+from slam_graph.results.result_files import ResultFolder
+
+__all__ = ["MapBalResult"]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class MapBalResult(BalResult):
     """What the bundle adjustment of a map found out.
 
@@ -56,15 +59,13 @@ class MapBalResult(BalResult):
             )
         ]
 
-    def save_estimates(self, folder: Path) -> list[Path]:
+    def save_estimates(self, files: ResultFolder) -> None:
         """Write the map, and the poses of its keyframes, one file for each recording."""
-        self.save_problem(folder / MAP_NAME)
-        return [
-            folder / MAP_NAME,
-            *export_tum(self.adjustment.after, folder / "trajectory.tum"),
-        ]
+        path = files.path(MAP_NAME)
+        self.save_problem(path)
+        files.files += export_tum(self.adjustment.after, path.with_name("trajectory.tum"))
 
-    def save_problem(self, path: Path) -> None:
+    def save_problem(self, path: Path | str) -> None:
         """Write the map, over what is there."""
         save_map(self.adjustment.after, path, force=True)
 
