@@ -9,6 +9,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
+# A file of tests stays on one core: what its tests share is then made once.
+PARALLEL ?= -n logical --dist loadfile
+
 # Matrices here are a few hundred wide: threads of BLAS cost more than they bring.
 export OPENBLAS_NUM_THREADS ?= 1
 
@@ -25,7 +28,7 @@ demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path fo
 		--algorithms ekf,iekf,msckf,swf,okvis --output results/comparison --no-progress
 
 test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## Check style and formatting
 	@$(BIN)/ruff check .

@@ -16,9 +16,8 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import select
 from slam_graph.evaluation.choices import PoseRelation
-from slam_graph.geometry.interpolation import interpolate
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.pipeline.run import run
@@ -42,16 +41,10 @@ class Errors:
 
     @staticmethod
     def of(truth: Trajectory, estimate: Trajectory, alignment: AlignmentMode) -> Errors:
-        """The errors of an estimate.
-
-        The truth is interpolated at the times of the estimate: where the stamps of the two differ
-        by a few milliseconds, taking the nearest pose would add the motion in between.
-        """
-        true, valid = interpolate(truth, estimate.stamps_ns)
-        own = select(estimate, np.flatnonzero(valid))
+        """The errors of an estimate."""
 
         def rmse(relation: PoseRelation) -> float:
-            return ape(true, own, relation, alignment).statistics.rmse
+            return ape(truth, estimate, relation, alignment).statistics.rmse
 
         stamps = estimate.stamps_ns
         return Errors(rmse("trans_part"), rmse("angle_deg"), float(stamps[-1] - stamps[0]) * 1e-9)

@@ -8,9 +8,11 @@ what to do about it.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from typing import ClassVar
 
-__all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError"]
+__all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError", "closest"]
 
 
 class SlamGraphError(Exception):
@@ -35,3 +37,10 @@ class EstimationError(SlamGraphError):
     """The run started but never initialised, diverged, or covered less than was asked."""
 
     exit_code: ClassVar[int] = 3
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """A hint at the known name most like `name`, or the list of all if none is."""
+    known = list(known)
+    similar = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f"did you mean '{similar[0]}'?" if similar else f"known: {', '.join(known)}"

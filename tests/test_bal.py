@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from slam_graph.mapping import bal_schur
 
 from benchmarks.bal import SMALL, by_gtsam
 from benchmarks.bal_problems import ring
+from slam_graph.bundle_adjustment import bal_schur
 from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, moved, reprojection_errors
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.bundle_adjustment.bal_policy import (

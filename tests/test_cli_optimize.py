@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from limits import HANG_S
 from pose_graphs import laps
 from typer.testing import CliRunner
 
@@ -31,7 +32,11 @@ FILES = {
 
 def run(tmp_path: Path, *arguments: str | Path) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, cwd=tmp_path, timeout=120
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=HANG_S,
     )
 
 

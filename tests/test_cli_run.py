@@ -10,10 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
+from limits import HANG_S
 
-from slam_graph import pipeline
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.pipeline.run import run as run_pipeline
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 
@@ -28,7 +29,6 @@ FILES = {
     "run.log",
 }
 
-TIMEOUT_S = 600
 STATIC = ("--set", "backend.initialization.mode=static", "--no-progress")
 SHORT = ("--duration", "3", "--set", "min_coverage=0.1", *STATIC)
 """The demo stands still when it begins: looking for a motion there would only take time."""
@@ -40,7 +40,7 @@ def run(tmp_path: Path, *arguments: str | Path) -> subprocess.CompletedProcess:
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        timeout=TIMEOUT_S,
+        timeout=HANG_S,
     )
 
 
@@ -72,7 +72,7 @@ def test_json_is_all_of_stdout_and_the_settings_run_again(tmp_path: Path) -> Non
     first = json.loads(run(tmp_path, "demo", *SHORT, "--seed", "3", "--json").stdout)
     assert first["seed"] == 3
     folder = tmp_path / first["folder"]
-    again = pipeline.run(open_dataset("demo"), load_config(folder / "config.yaml"))
+    again = run_pipeline(open_dataset("demo"), load_config(folder / "config.yaml"))
     again.save(tmp_path / "again")
     rows = [(path / "trajectory.tum").read_text() for path in (folder, tmp_path / "again")]
     assert rows[0] == rows[1]
@@ -125,12 +125,12 @@ def test_an_interrupted_run_keeps_what_was_done(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        deadline = time.monotonic() + TIMEOUT_S
+        deadline = time.monotonic() + HANG_S
         while not list(tmp_path.glob("results/*/*")) and time.monotonic() < deadline:
             time.sleep(0.02)
         time.sleep(0.4)
         process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=TIMEOUT_S)
+        _, stderr = process.communicate(timeout=HANG_S)
     assert process.returncode == 130, stderr
     assert stderr == "interrupted before the end; what was done so far is written\n"
     metrics = metrics_of(tmp_path)

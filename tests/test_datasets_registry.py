@@ -34,11 +34,10 @@ def test_formats_are_guessed(tmp_path: Path) -> None:
     assert open_dataset("demo").info().format == "eqvio"
 
 
-@pytest.mark.parametrize("name", list(DATASETS))
-def test_unknown_path_names_all_formats(tmp_path: Path, name: str) -> None:
+def test_unknown_path_names_all_formats(tmp_path: Path) -> None:
     with pytest.raises(DataError) as error:
         open_dataset(tmp_path)
-    assert f"{name}: " in str(error.value)
+    assert not [name for name in DATASETS if f"{name}: " not in str(error.value)]
     assert "\n" not in str(error.value)
 
 

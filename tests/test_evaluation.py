@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import associate, nearest
 from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory, seconds_text, tum_lines
 from slam_graph.geometry.trajectory_alignment import Similarity, align, align_first_pose, umeyama
@@ -124,6 +124,60 @@ def test_trajectories_of_different_times_are_refused() -> None:
         ape(truth, late)
 
 
+def steady_motion(stamps_ns: np.ndarray) -> Trajectory:
+    """Constant speed and constant rate of turn, which interpolation follows exactly."""
+    seconds = stamps_ns * 1e-9
+    turn = Rotation.from_euler("x", 0.3) * Rotation.from_rotvec(np.outer(seconds, (0, 0.5, 1.0)))
+    return Trajectory(stamps_ns, np.outer(seconds, (1.0, 2.0, 3.0)), turn.as_quat())
+
+
+@pytest.mark.parametrize("offset_ms", [0.0, 1.0, 2.5])
+def test_an_exact_estimate_has_no_error_wherever_the_stamps_of_the_truth_are(
+    offset_ms: float,
+) -> None:
+    truth = steady_motion(np.arange(0, 10**9, 5_000_000, dtype=np.int64))
+    stamps = np.arange(50_000_000, 9 * 10**8, 50_000_000, dtype=np.int64)
+    exact = steady_motion(stamps + round(offset_ms * 1e6))
+    for error in (ape(truth, exact, "full"), rpe(truth, exact, "full", delta=3)):
+        assert error.poses == len(exact)
+        assert error.statistics.max < 1e-12
+    speed_m_s = float(np.linalg.norm((1.0, 2.0, 3.0)))
+    floor_m = ape(truth, exact, pairing="nearest").statistics.mean
+    assert floor_m == pytest.approx(speed_m_s * offset_ms * 1e-3, abs=1e-9)
+
+
+def test_the_truth_is_not_made_up_in_a_gap_or_beyond_its_ends() -> None:
+    stamps = np.arange(0, 10**9, 10**7, dtype=np.int64)
+    outside_gap = (stamps < 3 * 10**8) | (stamps > 6 * 10**8)
+    truth = steady_motion(stamps[outside_gap])
+    estimate = steady_motion(np.arange(-(10**8), 12 * 10**8, 4 * 10**7 + 1, dtype=np.int64))
+    own = synchronize(truth, estimate)[1].stamps_ns
+    ends = truth.stamps_ns[[0, -1]]
+    assert own.min() >= ends[0]
+    assert own.max() <= ends[1]
+    assert not np.any((own > 3 * 10**8) & (own < 6 * 10**8))
+    bridged = synchronize(truth, estimate, limit_s=0.4)[1].stamps_ns
+    assert np.any((bridged > 3 * 10**8) & (bridged < 6 * 10**8))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ({"alignment": "SE3"}, "unknown alignment 'SE3'; did you mean 'se3'"),
+        ({"relation": "bogus"}, "unknown relation 'bogus'; known: full, trans_part"),
+        ({"relation": "angle_degrees"}, "did you mean 'angle_deg'"),
+        ({"pairing": "nearst"}, "unknown pairing 'nearst'; did you mean 'nearest'"),
+    ],
+)
+def test_unknown_words_are_errors(arguments: dict[str, str], hint: str) -> None:
+    truth = random_trajectory(1)
+    for function in (ape, rpe):
+        with pytest.raises(ConfigError, match=hint):
+            function(truth, truth, **arguments)
+    with pytest.raises(ConfigError, match="unknown unit of a step 'metres'"):
+        rpe(truth, truth, unit="metres")
+
+
 @pytest.mark.parametrize(
     ("stamp_ns", "text"),
     [
@@ -148,17 +202,14 @@ def test_tum_file_keeps_stamps_and_nine_decimals(tmp_path: Path) -> None:
 
 def test_interpolation_keeps_the_poses_and_follows_a_steady_motion() -> None:
     stamps = np.arange(0, 10**9, 10**8, dtype=np.int64)
-    seconds = stamps * 1e-9
-    turn = Rotation.from_euler("x", 0.3) * Rotation.from_rotvec(np.outer(seconds, (0, 0.5, 1.0)))
-    steady = Trajectory(stamps, np.outer(seconds, (1.0, 2.0, 3.0)), turn.as_quat())
+    steady = steady_motion(stamps)
     fine = np.arange(-(10**8), 11 * 10**8, 25 * 10**6, dtype=np.int64)
     found, valid = interpolate(steady, fine)
     np.testing.assert_array_equal(valid, (fine >= 0) & (fine <= stamps[-1]))
-    np.testing.assert_allclose(found.positions, np.outer(fine[valid] * 1e-9, (1.0, 2.0, 3.0)))
-    expected = Rotation.from_euler("x", 0.3) * Rotation.from_rotvec(
-        np.outer(fine[valid] * 1e-9, (0, 0.5, 1.0))
-    )
-    assert (expected.inv() * Rotation.from_quat(found.quaternions)).magnitude().max() < 1e-12
+    expected = steady_motion(fine[valid])
+    np.testing.assert_allclose(found.positions, expected.positions)
+    turns = Rotation.from_quat(expected.quaternions).inv() * Rotation.from_quat(found.quaternions)
+    assert turns.magnitude().max() < 1e-12
 
 
 def test_nothing_is_made_up_inside_a_gap() -> None:

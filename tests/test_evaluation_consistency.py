@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from slam_graph.evaluation.consistency import average_nees, mean_bounds, nees
-from slam_graph.evaluation.report import consistency_report, innovation_report
+from slam_graph.evaluation.evaluation_report import consistency_report, innovation_report
 from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
 from slam_graph.geometry.trajectory_alignment import Similarity
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from limits import HANG_S
 
-from slam_graph import pipeline
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -27,16 +27,16 @@ from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
+from slam_graph.pipeline.run import run as run_pipeline
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")
 SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tracks.features=50")]
-TIMEOUT_S = 600
 
 
 def compare(*arguments: str | Path) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=TIMEOUT_S
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=HANG_S
     )
 
 
@@ -82,7 +82,7 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
     (tracks,) = (folder / "tracks").iterdir()
     # the error of the start is drawn from its covariance, which is not to be reduced
     config = load_config(None, ["backend.initialization.fix_gauge=false"], algorithm="swf")
-    result = pipeline.run(open_dataset(tracks), config)
+    result = run_pipeline(open_dataset(tracks), config)
     truth = result.groundtruth
     assert truth is not None
     file = folder / "runs" / "sim_figure8_seed0" / "swf.npz"
@@ -154,7 +154,7 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     first = process.stderr.readline()
     assert first == "1/3 tracks of sim_figure8, seed 0\n"
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=TIMEOUT_S)
+    _, said = process.communicate(timeout=HANG_S)
     assert process.returncode == 130
     assert "interrupted; what is done is kept" in said
     kept = sorted((tmp_path / "tracks").iterdir())
@@ -236,7 +236,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         for command in commands
     ]
     try:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + HANG_S
         while not file.is_file() or not file.read_text().strip():
             assert time.monotonic() < deadline, "no scheduler"
             time.sleep(0.1)
@@ -245,7 +245,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         for process in reversed(processes):
             process.terminate()
         for process in reversed(processes):
-            process.wait(20)
+            process.wait(HANG_S)
 
 
 def test_a_dask_cluster_does_the_same(

@@ -11,7 +11,6 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from slam_graph.mapping import final_adjustment
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
@@ -29,6 +28,7 @@ from slam_graph.simulation.simulation_config import (
     TrackConfig,
 )
 from slam_graph.simulation.simulator import simulate
+from slam_graph.smoothing import final_adjustment
 from slam_graph.smoothing.drift_consensus import agreeing, by_drift
 from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
 from slam_graph.smoothing.frame_log import FrameLog

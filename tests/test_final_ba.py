@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from flight import FISHEYE, rig
-from slam_graph.mapping import final_adjustment
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import select
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run import run
 from slam_graph.results.run_result import RunResult
@@ -33,6 +32,7 @@ from slam_graph.simulation.simulation_config import (
     TrackConfig,
 )
 from slam_graph.simulation.simulator import simulate
+from slam_graph.smoothing import final_adjustment
 from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, pieces
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.recording_problem import nearest_keyframe

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from limits import HANG_S
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -36,7 +37,7 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     pytest.importorskip("ipykernel")
     notebook = nbformat.read(path, as_version=4)
     client = nbclient.NotebookClient(
-        notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}
+        notebook, timeout=HANG_S, resources={"metadata": {"path": str(tmp_path)}}
     )
     client.execute()  # raises at the first cell that fails
     shown = [out for cell in notebook.cells for out in cell.get("outputs", [])]

@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from limits import HANG_S
 
 ROOT = Path(__file__).parent.parent
 OFFLINE = ("--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
@@ -22,7 +23,7 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
         env=os.environ | environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANG_S,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pose_graphs import laps, turns
 from scipy.optimize import approx_fprime
-from slam_graph.mapping import pose_graph_certificate as dual
 
+from slam_graph.pose_graph import certificate as dual
 from slam_graph.pose_graph.certificate import certify
 from slam_graph.pose_graph.chordal import chordal_cost, stacked, whitened_rows
 from slam_graph.pose_graph.graph import PoseGraph, Poses

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of simulated motions, IMU streams and feature tracks."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -366,12 +365,9 @@ def test_the_start_is_the_truth_or_in_error_as_its_covariance_says() -> None:
     assert np.mean(squares) == pytest.approx(1.0, abs=0.2)
 
 
-def test_a_hundred_seconds_of_stereo_are_simulated_in_no_time() -> None:
+def test_a_frame_ends_every_period() -> None:
     sequence = tracks(trajectory="rooms", duration_s=100.0)
-    began = time.process_time()
-    count = sum(1 for _ in sequence.packets())
-    assert count == 2001
-    assert time.process_time() - began < 10.0
+    assert sum(1 for _ in sequence.packets()) == 2001
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of rendered images: geometry to a fraction of a pixel, exposure, blur and noise."""
 
-import time
 from typing import Any
 
 import cv2
@@ -183,12 +182,3 @@ def test_what_a_fisheye_sees_beyond_the_camera_model_is_black() -> None:
     assert image[0, 0] == 0
     assert image[256, 256] > 0
     assert 0.5 < np.mean(image > 0) < 0.95
-
-
-def test_rendering_is_fast() -> None:
-    sequence = images("rooms")
-    shot(sequence, 0)
-    began = time.process_time()
-    for index in (50, 100, 150):
-        shot(sequence, index)
-    assert (time.process_time() - began) / 6 < 0.3

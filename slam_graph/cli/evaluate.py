@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from slam_graph.cli.printing import echo_json, echo_table
-from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, PoseRelation
+from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
 
 if TYPE_CHECKING:
     from slam_graph.evaluation.ape import ErrorSeries
@@ -41,9 +41,12 @@ AlignOption = Annotated[
     Align | None, typer.Option("--align", help="Align before errors are taken.")
 ]
 MaxDifference = Annotated[
-    float,
+    float | None,
     typer.Option(
-        "--t_max_diff", min=0.0, help="How far apart in time poses may be to be compared, in s."
+        "--t_max_diff",
+        min=0.0,
+        help="Compare with the true pose nearest in time, as evo does, at most so many seconds "
+        "away; without it the truth is interpolated.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -56,7 +59,7 @@ def ape(
     align_se3: AlignFlag = False,
     correct_scale: ScaleFlag = False,
     align: AlignOption = None,
-    t_max_diff: MaxDifference = 0.01,
+    t_max_diff: MaxDifference = None,
     as_json: Json = False,
 ) -> None:
     """Absolute pose error of ESTIMATE against REFERENCE."""
@@ -64,7 +67,7 @@ def ape(
 
     mode = _alignment(align_se3, correct_scale, align)
     truth, guess = _read(reference), _read(estimate)
-    result = absolute_pose_error(truth, guess, relation, mode, t_max_diff)
+    result = absolute_pose_error(truth, guess, relation, mode, _pairing(t_max_diff), t_max_diff)
     _report("APE", result, relation, mode, {}, as_json)
 
 
@@ -92,7 +95,7 @@ def rpe(
     align_se3: AlignFlag = False,
     correct_scale: ScaleFlag = False,
     align: AlignOption = None,
-    t_max_diff: MaxDifference = 0.01,
+    t_max_diff: MaxDifference = None,
     as_json: Json = False,
 ) -> None:
     """Relative pose error (drift) of ESTIMATE against REFERENCE."""
@@ -109,6 +112,7 @@ def rpe(
         all_pairs,
         delta_tol,
         pairs_from_reference,
+        _pairing(t_max_diff),
         t_max_diff,
     )
     steps: dict[str, Any] = {
@@ -128,6 +132,11 @@ def _alignment(align_se3: bool, correct_scale: bool, align: Align | None) -> Ali
     if align_se3:
         return "sim3" if correct_scale else "se3"
     return "scale" if correct_scale else "none"
+
+
+def _pairing(t_max_diff: float | None) -> Pairing:
+    """How true poses are found: evo's way if its limit is given."""
+    return "interpolate" if t_max_diff is None else "nearest"
 
 
 def _read(path: Path) -> Trajectory:

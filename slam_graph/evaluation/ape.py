@@ -2,7 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Absolute pose error: how far each estimated pose is from the true one (ATE, for its positions).
 
-Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; numbers as evo's.
+The difference of two poses is E = T_reference⁻¹ T_estimate, with rotation R and translation t. The
+pose relation, under evo's names, says which part of it is the error:
+
+| relation | error | unit |
+|---|---|---|
+| `full` | Frobenius norm of E - I | none (mixes rad and m) |
+| `trans_part` | norm of t | m |
+| `rot_part` | Frobenius norm of R - I | none |
+| `angle_deg`, `angle_rad` | angle of R | deg, rad |
+
+Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; with `pairing="nearest"`
+the numbers are evo's.
 """
 
 from __future__ import annotations
@@ -13,12 +24,53 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
-from slam_graph.evaluation.choices import PoseRelation
-from slam_graph.evaluation.relations import errors, relative_poses
-from slam_graph.evaluation.statistics import Statistics
+from slam_graph.arrays import FloatArray
+from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
+from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import AlignmentMode, Similarity, align
+from slam_graph.geometry.trajectory_alignment import (
+    ALIGNMENT_MODES,
+    AlignmentMode,
+    Similarity,
+    align,
+)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Summary of N errors, in their unit (`sse`: in its square).
+
+    Attributes:
+        rmse: root of the mean square.
+        mean: arithmetic mean.
+        median: middle value.
+        std: standard deviation, divided by N.
+        min: smallest.
+        max: largest.
+        sse: sum of squares.
+    """
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    sse: float
+
+    @staticmethod
+    def of(errors: NDArray[np.float64]) -> Statistics:
+        """The statistics of (N,) errors, N ≥ 1."""
+        squares = errors * errors
+        return Statistics(
+            rmse=float(np.sqrt(squares.mean())),
+            mean=float(errors.mean()),
+            median=float(np.median(errors)),
+            std=float(errors.std()),
+            min=float(errors.min()),
+            max=float(errors.max()),
+            sse=float(squares.sum()),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +97,8 @@ def ape(
     estimate: Trajectory,
     relation: PoseRelation = "trans_part",
     alignment: AlignmentMode = "none",
-    max_difference_s: float = DEFAULT_MAX_DIFFERENCE_S,
+    pairing: Pairing = "interpolate",
+    limit_s: float | None = None,
 ) -> ErrorSeries:
     """Absolute pose error of an estimate.
 
@@ -54,19 +107,70 @@ def ape(
         estimate: the trajectory to judge.
         relation: which part of the difference of two poses counts.
         alignment: fitted over all poses that both share, before errors are taken.
-        max_difference_s: how far apart in time two poses may be to be compared.
+        pairing: whether the truth is interpolated at the times of the estimate, or the pose
+            nearest in time is taken.
+        limit_s: the longest gap or difference in time that is bridged; None: as `synchronize` says.
 
     Raises:
+        ConfigError: if there is no such relation, alignment or pairing.
         DataError: if the trajectories share no time, or cannot be aligned.
     """
-    truth, guess = synchronize(reference, estimate, max_difference_s)
-    similarity = align(truth.positions, guess.positions, alignment)
-    aligned = similarity.apply(guess)
+    require_known(relation, ERROR_UNITS, "relation")
+    truth, guess, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
     difference = relative_poses(
         Rotation.from_quat(truth.quaternions),
         truth.positions,
-        Rotation.from_quat(aligned.quaternions),
-        aligned.positions,
+        Rotation.from_quat(guess.quaternions),
+        guess.positions,
     )
     values = errors(*difference, relation)
     return ErrorSeries(guess.stamps_ns, values, Statistics.of(values), similarity, len(truth))
+
+
+def aligned_pair(
+    reference: Trajectory,
+    estimate: Trajectory,
+    alignment: AlignmentMode,
+    pairing: Pairing,
+    limit_s: float | None,
+) -> tuple[Trajectory, Trajectory, Similarity]:
+    """The truth and the estimate pose by pose, the estimate aligned, and the map that did so.
+
+    Raises:
+        ConfigError: if there is no such alignment or pairing.
+        DataError: if the trajectories share no time, or cannot be aligned.
+    """
+    require_known(alignment, ALIGNMENT_MODES, "alignment")
+    truth, guess = synchronize(reference, estimate, pairing, limit_s)
+    similarity = align(truth.positions, guess.positions, alignment)
+    return truth, similarity.apply(guess), similarity
+
+
+def relative_poses(
+    rotations_a: Rotation, positions_a: FloatArray, rotations_b: Rotation, positions_b: FloatArray
+) -> tuple[Rotation, FloatArray]:
+    """T_a⁻¹ T_b of N pairs of poses, as rotations and (N, 3) translations."""
+    inverse = rotations_a.inv()
+    return inverse * rotations_b, inverse.apply(positions_b - positions_a)
+
+
+def errors(rotations: Rotation, translations: FloatArray, relation: PoseRelation) -> FloatArray:
+    """The (N,) errors of N relative poses.
+
+    Args:
+        rotations: R of the relative poses.
+        translations: (N, 3) t of the relative poses, in metres.
+        relation: which part counts.
+
+    Raises:
+        ConfigError: if there is no such relation.
+    """
+    require_known(relation, ERROR_UNITS, "relation")
+    squared_distance: FloatArray = np.sum(translations**2, axis=1)
+    if relation == "trans_part":
+        return np.sqrt(squared_distance)
+    if relation in ("full", "rot_part"):
+        squared = np.sum((rotations.as_matrix() - np.eye(3)) ** 2, axis=(1, 2))
+        return np.asarray(np.sqrt(squared + (squared_distance if relation == "full" else 0.0)))
+    angles = np.asarray(rotations.magnitude(), dtype=np.float64)
+    return np.degrees(angles) if relation == "angle_deg" else angles

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of what can be asked of an evaluation; imports nothing, so that `--help` is fast."""
+"""The words that an evaluation understands; imports nothing heavy, so that `--help` is fast."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Collection
+from typing import Literal, get_args
+
+from slam_graph.errors import ConfigError
 
 PoseRelation = Literal["full", "trans_part", "rot_part", "angle_deg", "angle_rad"]
-"""Which part of the difference of two poses is the error (see `relations`)."""
+"""Which part of the difference of two poses is the error (see `ape`)."""
 
 ERROR_UNITS: dict[PoseRelation, str] = {
     "full": "",
@@ -18,6 +21,29 @@ ERROR_UNITS: dict[PoseRelation, str] = {
 }
 
 DeltaUnit = Literal["f", "m", "d", "r"]
-"""In what the steps of a relative error are measured."""
+"""The unit of the length of a step of a relative error."""
 
 STEP_UNITS: dict[DeltaUnit, str] = {"f": "frames", "m": "m", "d": "deg", "r": "rad"}
+
+Pairing = Literal["interpolate", "nearest"]
+"""How an estimated pose gets the true pose of its time (see `truth_pairing`)."""
+
+PAIRINGS: tuple[Pairing, ...] = get_args(Pairing)
+
+
+def require_known(word: str, known: Collection[str], what: str) -> None:
+    """Make sure that a word is one of those that are understood.
+
+    Args:
+        word: what the caller asked for.
+        known: all words that have a meaning there.
+        what: the argument, for the message.
+
+    Raises:
+        ConfigError: naming the argument and the known word that is most like `word`.
+    """
+    if word in known:
+        return
+    from slam_graph.settings.tree import closest  # imports pydantic: only when it is needed
+
+    raise ConfigError(f"unknown {what} '{word}'; {closest(str(word).lower(), known)}")

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray
-from slam_graph.geometry.interpolation import interpolate
+from slam_graph.evaluation.truth_pairing import paired, select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import Similarity
 
@@ -76,13 +76,12 @@ def nees(
         similarity: rigid map from the estimate's world to that of the truth.
     """
     estimate = (similarity or Similarity.identity()).apply(estimate)
-    true, valid = interpolate(truth, estimate.stamps_ns)
-    valid &= np.isfinite(pose_covariances).all(axis=(1, 2))
-    true = interpolate(truth, estimate.stamps_ns[valid])[0]
-    P = pose_covariances[valid]
-    rotations = Rotation.from_quat(estimate.quaternions[valid])
+    known = np.flatnonzero(np.isfinite(pose_covariances).all(axis=(1, 2)))
+    true, rows = paired(truth, select(estimate, known))
+    own, P = select(estimate, known[rows]), pose_covariances[known[rows]]
+    rotations = Rotation.from_quat(own.quaternions)
     e_rotation = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
-    e_position = rotations.inv().apply(true.positions - estimate.positions[valid])
+    e_position = rotations.inv().apply(true.positions - own.positions)
     e_pose = [
         gtsam.Pose3.Logmap(gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift))
         for turn, shift in zip(e_rotation, e_position, strict=True)

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Relative pose error: how far the estimated motion over a step is from the true one (drift).
 
-Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; numbers as evo's.
+Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems"; with `pairing="nearest"`
+the numbers are evo's.
 """
 
 from __future__ import annotations
@@ -12,13 +13,23 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import ErrorSeries
-from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
-from slam_graph.evaluation.choices import STEP_UNITS, DeltaUnit, PoseRelation
-from slam_graph.evaluation.relations import errors, relative_poses
-from slam_graph.evaluation.statistics import Statistics
+from slam_graph.evaluation.ape import (
+    ErrorSeries,
+    Statistics,
+    aligned_pair,
+    errors,
+    relative_poses,
+)
+from slam_graph.evaluation.choices import (
+    ERROR_UNITS,
+    STEP_UNITS,
+    DeltaUnit,
+    Pairing,
+    PoseRelation,
+    require_known,
+)
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import AlignmentMode, align
+from slam_graph.geometry.trajectory_alignment import AlignmentMode
 
 DEFAULT_TOLERANCE = 0.1
 
@@ -33,7 +44,8 @@ def rpe(
     all_pairs: bool = False,
     tolerance: float = DEFAULT_TOLERANCE,
     pairs_from_reference: bool = False,
-    max_difference_s: float = DEFAULT_MAX_DIFFERENCE_S,
+    pairing: Pairing = "interpolate",
+    limit_s: float | None = None,
 ) -> ErrorSeries:
     """Relative pose error of an estimate.
 
@@ -47,14 +59,17 @@ def rpe(
         all_pairs: every pair of poses that is `delta` apart, instead of consecutive steps.
         tolerance: with `all_pairs`, how far from `delta` a pair may be, as a fraction of it.
         pairs_from_reference: measure the steps along the reference instead of the estimate.
-        max_difference_s: how far apart in time two poses may be to be compared.
+        pairing: whether the truth is interpolated at the times of the estimate, or the pose
+            nearest in time is taken.
+        limit_s: the longest gap or difference in time that is bridged; None: as `synchronize` says.
 
     Raises:
+        ConfigError: if there is no such relation, alignment, unit or pairing.
         DataError: if the trajectories share no time, cannot be aligned, or have no such step.
     """
-    truth, guess = synchronize(reference, estimate, max_difference_s)
-    similarity = align(truth.positions, guess.positions, alignment)
-    aligned = similarity.apply(guess)
+    require_known(relation, ERROR_UNITS, "relation")
+    require_known(unit, STEP_UNITS, "unit of a step")
+    truth, aligned, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
     start, end = step_pairs(
         truth if pairs_from_reference else aligned, delta, unit, all_pairs, tolerance
     )
@@ -65,7 +80,7 @@ def rpe(
         )
     difference = relative_poses(*_motions(truth, start, end), *_motions(aligned, start, end))
     values = errors(*difference, relation)
-    stamps = guess.stamps_ns[end]
+    stamps = aligned.stamps_ns[end]
     return ErrorSeries(stamps, values, Statistics.of(values), similarity, len(truth))
 
 

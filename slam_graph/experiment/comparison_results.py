@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import synchronize
 from slam_graph.evaluation.consistency import nees
-from slam_graph.evaluation.report import truth_from_estimate
+from slam_graph.evaluation.evaluation_report import truth_from_estimate
+from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.results.result_files import appearing, write_text

@@ -13,8 +13,8 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import synchronize
-from slam_graph.evaluation.report import accuracy_report
+from slam_graph.evaluation.evaluation_report import accuracy_report
+from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import Similarity, align_yaw, umeyama
 from slam_graph.maps.map_model import SlamMap

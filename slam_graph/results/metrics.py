@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.report import accuracy_report, consistency_report
+from slam_graph.evaluation.evaluation_report import accuracy_report, consistency_report
 from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.loop_closure.close_loops import LoopClosures
 from slam_graph.results.run_logs import RunLogs

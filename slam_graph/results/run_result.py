@@ -17,8 +17,8 @@ from slam_graph.config import RunConfig, dump_yaml
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.association import select
-from slam_graph.evaluation.report import innovation_report
+from slam_graph.evaluation.evaluation_report import innovation_report
+from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import StateHistory, Trajectory, tum_lines
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.loop_closure.close_loops import LoopClosures

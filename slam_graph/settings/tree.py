@@ -7,7 +7,6 @@ So a fault that is found later, when the tree is checked against the schema, nam
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from slam_graph.errors import ConfigError
+from slam_graph.errors import closest as closest
 from slam_graph.settings.base import Settings
 
 __all__ = [
@@ -137,13 +137,6 @@ def validate(model: type[ModelT], tree: ConfigTree) -> ModelT:
         raise ConfigError(f"{_describe(model, tree, dict(faults[0]))}{more}") from error
 
 
-def closest(name: str, known: Iterable[str]) -> str:
-    """A hint for an unknown name: the most similar known one, or all if none is similar."""
-    known = list(known)
-    similar = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean '{similar[0]}'?" if similar else f"known: {', '.join(known)}"
-
-
 def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]) -> str:
     """One line about one fault that the schema found."""
     path: KeyPath = fault["loc"]
@@ -157,7 +150,9 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
     if fault["type"] == "missing":
         return f"{where}: key '{dotted}' is missing"
     message = str(fault["msg"]).removeprefix("Value error, ")
-    return f"{where}: {dotted}: {message[:1].lower()}{message[1:]}, got {fault['input']!r}"
+    got = repr(fault["input"])
+    message = f"{where}: {dotted}: {message[:1].lower()}{message[1:]}"
+    return message if got in message else f"{message}, got {got}"
 
 
 def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ErrorSeries, ape
-from slam_graph.evaluation.association import DEFAULT_MAX_DIFFERENCE_S, synchronize
 from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.geometry.trajectory_alignment import (
     AlignmentMode,
@@ -33,11 +33,7 @@ RPE_DELTA_M = 1.0
 Table = dict[str, Any]
 
 
-def accuracy_report(
-    reference: Trajectory,
-    estimate: Trajectory,
-    max_difference_s: float = DEFAULT_MAX_DIFFERENCE_S,
-) -> Table:
+def accuracy_report(reference: Trajectory, estimate: Trajectory) -> Table:
     """Absolute and relative errors, translation (m) and rotation (deg), under each alignment.
 
     Returns:
@@ -46,7 +42,7 @@ def accuracy_report(
         where the trajectories do not allow it.
     """
     return {
-        mode: _or_reason(partial(_errors_under, reference, estimate, mode, max_difference_s))
+        mode: _or_reason(partial(_errors_under, reference, estimate, mode))
         for mode in REPORTED_ALIGNMENTS
     }
 
@@ -143,11 +139,9 @@ def truth_from_estimate(
         return align_first_pose(true, own), "first_pose"
 
 
-def _errors_under(
-    reference: Trajectory, estimate: Trajectory, mode: AlignmentMode, max_difference_s: float
-) -> Table:
-    """The errors under one alignment."""
-    options: Table = {"alignment": mode, "max_difference_s": max_difference_s}
+def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:
+    """The errors under one alignment, against the truth interpolated at the estimate's times."""
+    options: Table = {"alignment": mode}
     steps: Table = {**options, "delta": RPE_DELTA_M, "unit": "m", "all_pairs": True}
     translation = ape(reference, estimate, "trans_part", **options)
     return {
