@@ -119,7 +119,7 @@ In Python the same are arguments, and settings that are loaded are changed by `w
 ```python
 import slam_graph as sg
 
-config = sg.load_config("msckf", {"backend.noise.pixel_sigma": 1.5}, cameras="mono")
+config = sg.load_config("msckf", {"backend.noise.pixel_sigma": 1.5}, duration_s=9)
 other = config.with_overrides({"backend.noise.pixel_sigma": 2.0}, seed=3)
 result = sg.run("demo", other)
 ```

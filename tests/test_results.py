@@ -21,6 +21,7 @@ from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
 from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
 from slam_graph.results.run_result import RunInput, RunResult
+from slam_graph.results.saved_run import load_result
 from slam_graph.sensors.rig import Rig
 
 NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
@@ -177,6 +178,30 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     assert metrics["timing"]["real_time_factor"] == pytest.approx(result.input.recorded_s / 2.0)
     assert (tmp_path / "out" / "trajectory.png").read_bytes()[:4] == b"\x89PNG"
     assert load_config(tmp_path / "out" / "config.yaml") == result.config
+
+
+def test_a_folder_without_a_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no result of a run here"):
+        load_result(tmp_path)
+    with pytest.raises(DataError, match="no result of a run here"):
+        load_result(tmp_path / "nowhere")
+
+
+def test_the_latest_result_of_a_recording_is_read(tmp_path: Path) -> None:
+    info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
+    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
+    folder = create_run_folder(tmp_path, "clip")
+    result.save(folder)
+    link_latest(folder)
+    saved = load_result(tmp_path / "clip")
+    assert (saved.status, len(saved.trajectory)) == ("ok", 0)
+    assert saved.smoothed is None
+    (folder / "map.ply").write_bytes(b"ply\n")
+    with pytest.raises(DataError, match="not a point cloud"):
+        saved.points  # noqa: B018
+    (folder / "states.csv").write_text("stamp_ns,a\n1,2\n")
+    with pytest.raises(DataError, match="not the states of a run"):
+        load_result(folder).sigmas  # noqa: B018
 
 
 def test_a_result_without_states_is_written_too(

@@ -23,12 +23,15 @@ __all__ = [
     "METRICS",
     "POINTS",
     "RIG",
+    "SIGMA_COLUMNS",
     "SMOOTHED",
     "STATES",
+    "STATE_COLUMNS",
     "TRAJECTORY",
     "read_states",
     "read_tum",
     "state_lines",
+    "vectors",
 ]
 
 TRAJECTORY = "trajectory.tum"
@@ -51,8 +54,6 @@ SIGMA_COLUMNS = (
     "sigma_gyro_bias_{}_rad_s",
 )
 COLUMNS = tuple(name.format(axis) for name in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz")
-VALUES = 3 * len(STATE_COLUMNS)
-"""The first so many columns are values, the others standard deviations."""
 
 
 def state_lines(history: StateHistory) -> Iterator[str]:
@@ -67,29 +68,35 @@ def state_lines(history: StateHistory) -> Iterator[str]:
         yield ",".join([str(stamp_ns), *cells]) + "\n"
 
 
-def read_states(path: Path) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Read what `state_lines` wrote.
+def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
+    """Read what `state_lines` wrote; the columns may be in any order.
 
     Returns:
-        Times (N,) in ns; velocity, gyroscope and accelerometer bias (N, 9); standard deviations
-        (N, 15) in the order of `NavState.covariance`, NaN where unknown.
+        Times (N,) in ns, and the other columns (N,) by name, NaN where empty.
 
     Raises:
         DataError: if the file is missing or another table.
     """
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines()
-        if header.split(",")[1:] != list(COLUMNS):
-            raise ValueError("other columns than expected")
+        names = header.split(",")[1:]
+        missing = [name for name in COLUMNS if name not in names]
+        if missing:
+            raise ValueError(f"no column '{missing[0]}'")
         cells = [line.split(",") for line in lines]
         stamps = np.array([int(row[0]) for row in cells], dtype=np.int64)
         values = [[float(cell) if cell else math.nan for cell in row[1:]] for row in cells]
-        table = np.array(values, dtype=np.float64).reshape(len(stamps), len(COLUMNS))
+        table = np.array(values, dtype=np.float64).reshape(len(stamps), len(names))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise DataError(f"{path}: not the states of a run ({error})") from error
-    return stamps, table[:, :VALUES], table[:, VALUES:]
+    return stamps, dict(zip(names, table.T, strict=True))
+
+
+def vectors(states: dict[str, FloatArray], column: str) -> FloatArray:
+    """The values (N, 3) along x, y, z of a column of `STATE_COLUMNS` or `SIGMA_COLUMNS`."""
+    return np.column_stack([states[column.format(axis)] for axis in "xyz"])
 
 
 def read_tum(path: Path) -> Trajectory:

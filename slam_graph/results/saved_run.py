@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig, load_config
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
@@ -111,20 +111,16 @@ class SavedRun:
     def trajectory(self) -> Trajectory:
         """The causal estimate, with velocities and biases."""
         poses = _trajectory(self.folder, names.TRAJECTORY)
-        stamps, values, _ = self._states
+        stamps, states = self._states
         if poses is None or not np.array_equal(stamps, poses.stamps_ns):
             raise DataError(f"{self.folder}: {names.STATES} and {names.TRAJECTORY} differ in time")
-        return replace(
-            poses,
-            velocities=values[:, 0:3],
-            gyro_biases=values[:, 3:6],
-            accel_biases=values[:, 6:9],
-        )
+        velocities, gyro, accel = (names.vectors(states, column) for column in names.STATE_COLUMNS)
+        return replace(poses, velocities=velocities, gyro_biases=gyro, accel_biases=accel)
 
     @property
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations of the states, in the order of `NavState.covariance`."""
-        return self._states[2]
+        return np.hstack([names.vectors(self._states[1], column) for column in names.SIGMA_COLUMNS])
 
     @cached_property
     def smoothed(self) -> Trajectory | None:
@@ -168,7 +164,7 @@ class SavedRun:
         return float(self.metrics["extent"]["coverage"])
 
     @cached_property
-    def _states(self) -> tuple[Any, FloatArray, FloatArray]:
+    def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:
         return names.read_states(self.folder / names.STATES)
 
 

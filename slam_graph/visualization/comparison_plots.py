@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of many curves: how algorithms compare over time and distance."""
+"""Pictures of many curves, for the comparison of algorithms over time or distance."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+
+__all__ = ["Curve", "Panel", "plot_panels"]
 
 PANEL_INCHES = (5.6, 3.3)
 DPI = 100
@@ -35,10 +37,10 @@ class Panel:
     """One diagram.
 
     Attributes:
-        xlabel, ylabel: of its axes.
-        curves: its lines; the same label has the same colour in all panels of a picture.
-        band: two values between which curves should lie, if any.
-        band_label: what the band is.
+        xlabel, ylabel: labels of its axes.
+        curves: its lines; one label has one colour in all panels of a picture.
+        band: lower and upper bound of a shaded band, if there is one.
+        band_label: label of the band.
     """
 
     xlabel: str
@@ -54,7 +56,7 @@ def plot_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
     Args:
         path: of the PNG.
         title: of the picture.
-        panels: at least one.
+        panels: one or more.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -87,7 +89,7 @@ def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
 
 
 def _spread(curves: Sequence[Curve]) -> float:
-    """Largest over smallest median."""
+    """Ratio of the largest to the smallest median."""
     known = [curve.y[np.isfinite(curve.y)] for curve in curves]
     medians = [float(np.median(values)) for values in known if len(values)]
     if not medians or min(medians) <= 0.0:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Feature tracks drawn on the images: where each feature is and the way that it came."""
+"""Feature tracks drawn on the images: the features and their recent paths."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 
+__all__ = ["Picture", "TrackPainter", "TrackVideo", "save_picture"]
+
 Picture = NDArray[np.uint8]
 
 TAIL_FRAMES = 15
-"""How much of its way is drawn behind a feature, and the age at which its colour is full."""
+"""Length of the path that is drawn behind a feature; also the age at which its colour is full."""
 
 FRAMES_PER_S = 20.0
 
@@ -62,7 +64,7 @@ class TrackPainter:
     def _mark(
         self, picture: NDArray[np.uint8], tail: deque[tuple[int, int]], age: int, shared: bool
     ) -> None:
-        """Draw one feature; places are in eighths of a pixel."""
+        """Draw one feature; coordinates are in eighths of a pixel (`shift=3` of OpenCV)."""
         share = min(age / TAIL_FRAMES, 1.0)
         colour = (255 * (1 - share), 160 * (1 - abs(2 * share - 1)) + 40, 255 * share)
         way = np.array(tail, np.int32).reshape(-1, 1, 2)
@@ -82,8 +84,8 @@ class TrackVideo:
         DataError: at the first picture, if it cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
         self._writer: cv2.VideoWriter | None = None
 
     def __enter__(self) -> Self:
@@ -110,12 +112,13 @@ class TrackVideo:
         self._writer.write(picture)
 
 
-def save_picture(path: Path, picture: Picture) -> None:
+def save_picture(path: Path | str, picture: Picture) -> None:
     """Write a picture as PNG.
 
     Raises:
         DataError: if it cannot be written.
     """
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     good, data = cv2.imencode(".png", picture)
     if not good:
@@ -127,5 +130,5 @@ def save_picture(path: Path, picture: Picture) -> None:
 
 
 def _padded(picture: Picture, height: int) -> Picture:
-    """A picture with black below, so that all are equally high."""
+    """A picture padded with black below, to a common height."""
     return np.pad(picture, ((0, height - picture.shape[0]), (0, 0), (0, 0)))
