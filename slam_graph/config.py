@@ -34,9 +34,9 @@ __all__ = [
     "load_config",
 ]
 
-DEFAULT_ALGORITHM = "msckf"
+_DEFAULT_ALGORITHM = "msckf"
 
-CAMERA_WORDS = {"mono": 1, "stereo": 2, "all": None}
+_CAMERA_WORDS = {"mono": 1, "stereo": 2, "all": None}
 
 
 def config_folder() -> Path:
@@ -73,7 +73,7 @@ def _named_algorithm(value: Any) -> Any:
 
 def _counted_cameras(value: Any) -> Any:
     """Read `mono`, `stereo` and `all` as numbers of cameras."""
-    return CAMERA_WORDS.get(value, value) if isinstance(value, str) else value
+    return _CAMERA_WORDS.get(value, value) if isinstance(value, str) else value
 
 
 class LimitsConfig(Settings):
@@ -100,7 +100,7 @@ class RunConfig(Settings):
     algorithm: Annotated[
         AlgorithmConfig,
         BeforeValidator(_named_algorithm, json_schema_input_type=str | AlgorithmConfig),
-    ] = Field(default_factory=lambda: _named_algorithm(DEFAULT_ALGORITHM))
+    ] = Field(default_factory=lambda: _named_algorithm(_DEFAULT_ALGORITHM))
     """Name of an algorithm, path of its YAML file, or its table of policies."""
     cameras: Annotated[
         int | None, BeforeValidator(_counted_cameras, json_schema_input_type=int | str | None)
@@ -199,7 +199,7 @@ def _changed(
     options: Mapping[str, Any],
 ) -> ConfigTree:
     """The tree with options and overrides merged into it, and the algorithm's table expanded."""
-    tree.values.setdefault("algorithm", DEFAULT_ALGORITHM)
+    tree.values.setdefault("algorithm", _DEFAULT_ALGORITHM)
     given = {name: _plain(value) for name, value in options.items() if value is not None}
     tree.merge(ConfigTree(given, {(name,): f"option {name}" for name in given}))
     changes = override_trees(overrides)

@@ -16,7 +16,7 @@ __all__ = ["Diagnostics"]
 
 logger = logging.getLogger("slam_graph")
 
-LOGGED_PER_KIND = 5
+_LOGGED_PER_KIND = 5
 """So many events of one kind are written to the log; further ones are only counted."""
 
 
@@ -33,8 +33,8 @@ class Diagnostics:
     def warn(self, kind: str, message: str) -> None:
         """Count one event of `kind` and log `message` if it is among the first of its kind."""
         self.counts[kind] += 1
-        if self.counts[kind] <= LOGGED_PER_KIND:
+        if self.counts[kind] <= _LOGGED_PER_KIND:
             last = (
-                " (further ones are only counted)" if self.counts[kind] == LOGGED_PER_KIND else ""
+                " (further ones are only counted)" if self.counts[kind] == _LOGGED_PER_KIND else ""
             )
             logger.warning("%s: %s%s", kind, message, last)

@@ -23,11 +23,12 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.ape import ape
 from slam_graph.experiment.comparison import load_configs, plan, with_variants
 from slam_graph.experiment.comparison_figures import binned_mean
-from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
+from slam_graph.experiment.comparison_results import ALIGNMENTS
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
 from slam_graph.pipeline.run import run as run_pipeline
+from slam_graph.results.metrics import peak_memory_mb
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")

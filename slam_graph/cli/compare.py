@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from slam_graph.experiment.executors import Executor
     from slam_graph.experiment.tasks import Task
 
+__all__ = ["compare"]
+
 
 def compare(
     data: Annotated[

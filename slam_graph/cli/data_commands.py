@@ -26,6 +26,8 @@ from slam_graph.cli.printing import echo_json, echo_table
 if TYPE_CHECKING:
     from slam_graph.datasets.sequence import Sequence
 
+__all__ = ["app"]
+
 app = typer.Typer(
     help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode=None
 )

@@ -35,10 +35,12 @@ if TYPE_CHECKING:
     from slam_graph.experiment.frontend_comparison import FrontendReport
     from slam_graph.pipeline.tracking import TrackedPacket
 
-EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
+__all__ = ["app"]
+
+_EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
 
-class RunByDefault(TyperGroup):
+class _RunByDefault(TyperGroup):
     """A group whose first command is the default: `frontend DATA`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -49,7 +51,7 @@ class RunByDefault(TyperGroup):
 
 
 app = typer.Typer(
-    cls=RunByDefault,
+    cls=_RunByDefault,
     help="Run the front end alone and look at its tracks: `frontend DATA` is `frontend run DATA`.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -102,7 +104,7 @@ def compare(
     frontends: Annotated[
         str,
         typer.Option("--frontends", help="METHOD or METHOD/DETECTOR, with commas between."),
-    ] = EVERYTHING,
+    ] = _EVERYTHING,
     algorithm: Annotated[
         str | None,
         typer.Option("--algorithm", help="Also estimate the trajectory from the tracks of each."),
@@ -135,7 +137,7 @@ def compare(
     if as_json:
         echo_json([_plain(report) for report in reports])
     else:
-        echo_table([COLUMNS, *map(_row, reports)])
+        echo_table([_COLUMNS, *map(_row, reports)])
 
 
 def _watch(
@@ -181,7 +183,7 @@ def _watch(
     return watch
 
 
-COLUMNS = (
+_COLUMNS = (
     "front end",
     "features",
     "length median",

@@ -31,6 +31,8 @@ from slam_graph.cli.options import (
 )
 from slam_graph.cli.run import execute, report
 
+__all__ = ["localize"]
+
 
 def localize(
     data: Data,

@@ -19,16 +19,18 @@ from slam_graph.cli.printing import echo_json, echo_table
 if TYPE_CHECKING:
     from slam_graph.maps.map_model import MapRecording, SlamMap
 
+__all__ = ["app"]
+
 app = typer.Typer(help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode=None)
 
-MapPath = Annotated[
+_MapPath = Annotated[
     Path, typer.Argument(metavar="MAP", help="Map file, or the folder of a run with one.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 
 
 @app.command()
-def info(path: MapPath, as_json: Json = False) -> None:
+def info(path: _MapPath, as_json: Json = False) -> None:
     """Show what a map holds."""
     from slam_graph.results.map_output import find_map, load_map
 
@@ -52,7 +54,7 @@ def info(path: MapPath, as_json: Json = False) -> None:
 
 @app.command()
 def export(
-    path: MapPath,
+    path: _MapPath,
     ply: Annotated[
         Path | None, typer.Option("--ply", help="Points, and keyframes in red, as a point cloud.")
     ] = None,
@@ -60,7 +62,7 @@ def export(
         Path | None,
         typer.Option("--tum", help="Poses of the keyframes; one file for each recording."),
     ] = None,
-    force: Force = False,
+    force: _Force = False,
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
@@ -87,7 +89,7 @@ def merge(
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
     config: ConfigFile = None,
     set_: Overrides = None,
-    force: Force = False,
+    force: _Force = False,
     as_json: Json = False,
 ) -> None:
     """Merge two maps of the same place; nothing is written if they do not overlap."""

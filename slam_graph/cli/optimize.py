@@ -21,11 +21,13 @@ from slam_graph.cli.options import (
 )
 from slam_graph.errors import ConfigError, DataError
 
-Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
-Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
-Format = Literal["auto", "pose_graph", "bal", "map"]
-Intrinsics = Literal["per_camera", "shared", "fixed"]
-Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
+__all__ = ["optimize"]
+
+_Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
+_Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
+_Format = Literal["auto", "pose_graph", "bal", "map"]
+_Intrinsics = Literal["per_camera", "shared", "fixed"]
+_Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
 
 def optimize(
@@ -38,18 +40,18 @@ def optimize(
         ),
     ],
     kind: Annotated[
-        Format, typer.Option("--format", help="Kind of FILE; auto detects it from the content.")
+        _Format, typer.Option("--format", help="Kind of FILE; auto detects it from the content.")
     ] = "auto",
-    method: Annotated[Method | None, typer.Option("--method", help="Optimisation method.")] = None,
+    method: Annotated[_Method | None, typer.Option("--method", help="Optimisation method.")] = None,
     initialization: Annotated[
-        Initial | None, typer.Option("--init", help="Source of the initial estimates.")
+        _Initial | None, typer.Option("--init", help="Source of the initial estimates.")
     ] = None,
     robust: Annotated[
-        Robust | None,
+        _Robust | None,
         typer.Option("--robust", help="Robust loss against false loop closures or outliers."),
     ] = None,
     intrinsics: Annotated[
-        Intrinsics | None,
+        _Intrinsics | None,
         typer.Option("--intrinsics", help="Which intrinsics bundle adjustment estimates."),
     ] = None,
     information: Annotated[
@@ -116,7 +118,7 @@ def optimize(
         optimize_bal(file, bundle_policy, save, output, as_json)
 
 
-def _seen_format(file: Path) -> Format:
+def _seen_format(file: Path) -> _Format:
     """The kind of a file, from its content; a folder is that of a run with a map."""
     from slam_graph.bundle_adjustment.bal_file import is_bal
 

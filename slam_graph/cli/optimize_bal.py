@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.results.bundle_result import BalResult
 
-MOST_LETTERS = 100
+__all__ = ["optimize_bal", "optimize_map"]
+
+_MOST_LETTERS = 100
 """The name of a recording is cut to this length in the name of a folder."""
 
 
@@ -78,7 +80,7 @@ def _name(content: SlamMap, file: Path) -> str:
 
     if file.name != MAP_NAME:
         return file.stem
-    return re.sub(r"[^\w.-]+", "_", content.recordings[0].name)[:MOST_LETTERS] + "_map"
+    return re.sub(r"[^\w.-]+", "_", content.recordings[0].name)[:_MOST_LETTERS] + "_map"
 
 
 def _write(

@@ -14,10 +14,12 @@ from pydantic import BaseModel
 
 from slam_graph.cli.logs import remove_if_empty
 
-Policy = TypeVar("Policy", bound=BaseModel)
+__all__ = ["read_policy", "timed", "write_result"]
+
+_Policy = TypeVar("_Policy", bound=BaseModel)
 
 
-class Result(Protocol):
+class _Result(Protocol):
     """The result of an optimisation."""
 
     def save(self, folder: Path) -> list[Path]:
@@ -26,11 +28,11 @@ class Result(Protocol):
 
 
 def read_policy(
-    kind: type[Policy],
+    kind: type[_Policy],
     file: Path | None,
     overrides: list[str],
     options: Mapping[tuple[str, str], Any],
-) -> Policy:
+) -> _Policy:
     """The settings: the file, then options, then overrides.
 
     Args:
@@ -53,7 +55,7 @@ def read_policy(
 
 
 def write_result(
-    result: Result, name: str, output: Path, log: list[str]
+    result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
     """Write all files into a new folder, named after the problem."""
     from slam_graph.results.result_files import create_run_folder, link_latest, write_text

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
     from slam_graph.results.pose_graph_result import PoseGraphResult
 
+__all__ = ["Wanted", "optimize_pose_graph_file"]
+
 
 @dataclass(frozen=True, slots=True)
 class Wanted:

@@ -12,6 +12,28 @@ import typer
 if TYPE_CHECKING:
     from slam_graph.datasets.sequence import RecordedSequence
 
+__all__ = [
+    "INTERRUPTED",
+    "Algorithm",
+    "Calibration",
+    "Cameras",
+    "ConfigFile",
+    "Data",
+    "Duration",
+    "Format",
+    "Groundtruth",
+    "Json",
+    "Output",
+    "Overrides",
+    "Progress",
+    "Rerun",
+    "RerunMode",
+    "Seed",
+    "Sources",
+    "Start",
+    "open_recording",
+]
+
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML file of settings, which replace the defaults."),
@@ -77,7 +99,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
 
-def sources_from(texts: list[str] | None) -> dict[str, str]:
+def _sources_from(texts: list[str] | None) -> dict[str, str]:
     """Where each sensor is, from texts ``sensor=where``."""
     pairs = [text.partition("=") for text in texts or []]
     for text, (sensor, _, where) in zip(texts or [], pairs, strict=True):
@@ -103,5 +125,5 @@ def open_recording(
         cameras=cameras,
         calibration=calibration,
         groundtruth=groundtruth,
-        sources=sources_from(sources),
+        sources=_sources_from(sources),
     )

@@ -9,9 +9,11 @@ import time
 from types import TracebackType
 from typing import Self
 
-BAR_WIDTH = 28
-TERMINAL_PERIOD_S = 0.1
-LOG_PERIOD_S = 10.0
+__all__ = ["ProgressBar"]
+
+_BAR_WIDTH = 28
+_TERMINAL_PERIOD_S = 0.1
+_LOG_PERIOD_S = 10.0
 
 
 class ProgressBar:
@@ -26,7 +28,7 @@ class ProgressBar:
         self._start_ns = start_ns
         self._length_ns = max(end_ns - start_ns, 1)
         self._terminal = sys.stderr.isatty()
-        self._period_s = TERMINAL_PERIOD_S if self._terminal else LOG_PERIOD_S
+        self._period_s = _TERMINAL_PERIOD_S if self._terminal else _LOG_PERIOD_S
         self._began = self._shown = time.monotonic()
         self._frames = 0
         self._line = ""
@@ -81,5 +83,5 @@ class ProgressBar:
 
 def _bar(part: float) -> str:
     """A bar of which a part is filled."""
-    filled = round(part * BAR_WIDTH)
-    return f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] "
+    filled = round(part * _BAR_WIDTH)
+    return f"[{'#' * filled}{'.' * (_BAR_WIDTH - filled)}] "

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.results.run_result import RunResult
 
+__all__ = ["execute", "report", "run"]
+
 
 def run(
     data: Data,
@@ -122,7 +124,7 @@ def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) ->
     else:
         echo_summary(result, folder, files)
     if result.status == "interrupted":
-        typer.echo(f"{result.message}; the result so far is written", err=True)
+        typer.echo(f"{result.message}; what was done so far is written", err=True)
         raise typer.Exit(INTERRUPTED)
     result.check()
 

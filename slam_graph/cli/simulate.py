@@ -23,13 +23,15 @@ if TYPE_CHECKING:
     from slam_graph.simulation.simulated_sequence import SimulatedSequence
     from slam_graph.simulation.simulation_config import SimulationConfig
 
-Kind = Literal["tracks", "images"]
+__all__ = ["simulate"]
+
+_Kind = Literal["tracks", "images"]
 
 
 def simulate(
     output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Folder to write.")],
     kind: Annotated[
-        Kind | None, typer.Option("--kind", help="Feature tracks, or an EuRoC folder of images.")
+        _Kind | None, typer.Option("--kind", help="Feature tracks, or an EuRoC folder of images.")
     ] = None,
     trajectory: Annotated[
         str | None,

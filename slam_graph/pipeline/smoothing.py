@@ -19,10 +19,10 @@ from slam_graph.smoothing.frame_log import FrameLog
 
 __all__ = ["Smoothing"]
 
-SMOOTHED = (*COMPLETED, "diverged")
+_SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
 
-FAILED = "no smoothed trajectory"
+_FAILED = "no smoothed trajectory"
 
 logger = logging.getLogger(__name__)
 
@@ -68,9 +68,9 @@ class Smoothing(Stage):
     def finish(self) -> None:
         """Solve the recording as a whole, if there is an estimate to start from."""
         result = self._result
-        if self._log is None or not len(result.history) or result.status not in SMOOTHED:
+        if self._log is None or not len(result.history) or result.status not in _SMOOTHED:
             return
-        with warn_on_failure(self._diagnostics, "final_ba_failed", FAILED):
+        with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             self._recording.close()
             try:
                 self._solve(self._log)
@@ -99,5 +99,5 @@ class Smoothing(Stage):
 
     def _give_up(self, error: Exception) -> None:
         self._log = None
-        with warn_on_failure(self._diagnostics, "final_ba_failed", FAILED):
+        with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             raise error

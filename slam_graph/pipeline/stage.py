@@ -29,7 +29,7 @@ __all__ = ["COMPLETED", "EstimatedFrame", "Stage", "warn_on_failure"]
 COMPLETED = ("ok", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
 
-MESSAGE_LENGTH = 200
+_MESSAGE_LENGTH = 200
 """Messages of other libraries are cut to this many characters."""
 
 logger = logging.getLogger(__name__)
@@ -110,5 +110,5 @@ def warn_on_failure(diagnostics: Diagnostics, kind: str, consequence: str) -> It
             error, SlamGraphError | cv2.error | RuntimeError | np.linalg.LinAlgError | OSError
         ):
             logger.exception("internal error")
-        reason = " ".join(str(error).split())[:MESSAGE_LENGTH]
+        reason = " ".join(str(error).split())[:_MESSAGE_LENGTH]
         diagnostics.warn(kind, f"{consequence}: {reason}")

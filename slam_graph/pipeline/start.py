@@ -16,17 +16,17 @@ from slam_graph.results.run_result import RunInput
 
 __all__ = ["KnownStart", "true_state"]
 
-LEAD_NS = 1_000_000_000
+_LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame: the IMU reaches back that far."""
 
-DIFFERENCE_NS = 25_000_000
+_DIFFERENCE_NS = 25_000_000
 """Half the step of the central difference that gives the velocity where the truth has none."""
 
-TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
+_TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
 """Standard deviations of the true rotation (rad), position (m), velocity (m/s), accelerometer bias
 (m/s²) and gyroscope bias (rad/s)."""
 
-UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
+_UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
 """Standard deviations of the accelerometer and gyroscope bias where the truth has none."""
 
 
@@ -57,7 +57,7 @@ class KnownStart:
         if mode not in ("auto", "given"):
             return KnownStart()
         state = sequence.initial_state()
-        if state is not None and not (asked.start_ns - LEAD_NS <= state.stamp_ns <= asked.end_ns):
+        if state is not None and not (asked.start_ns - _LEAD_NS <= state.stamp_ns <= asked.end_ns):
             state = None
         if state is None and mode == "given":
             raise DataError(
@@ -80,7 +80,7 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
 
     Velocity is taken from positions where the truth has none, and biases are zero.
     """
-    stamps = np.array([stamp_ns - DIFFERENCE_NS, stamp_ns, stamp_ns + DIFFERENCE_NS])
+    stamps = np.array([stamp_ns - _DIFFERENCE_NS, stamp_ns, stamp_ns + _DIFFERENCE_NS])
     near, valid = interpolate(truth, stamps)
     if not valid[1]:
         return None
@@ -92,9 +92,9 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
         velocity = (near.positions[-1] - near.positions[0]) / seconds
     else:
         return None
-    sigmas = TRUTH_SIGMAS
+    sigmas = _TRUTH_SIGMAS
     if near.accel_biases is None or near.gyro_biases is None:
-        sigmas = TRUTH_SIGMAS[:3] + UNKNOWN_BIAS_SIGMAS
+        sigmas = _TRUTH_SIGMAS[:3] + _UNKNOWN_BIAS_SIGMAS
     return NavState(
         stamp_ns,
         near.pose(middle),

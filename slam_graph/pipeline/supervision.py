@@ -24,7 +24,7 @@ from slam_graph.results.run_result import RunResult
 
 __all__ = ["Agreement", "DivergenceError", "check_sane", "interrupts_between_frames", "outcome"]
 
-LONGEST_GAP_S = 0.5
+_LONGEST_GAP_S = 0.5
 """A gap between two frames whose features were tested counts as at most this much time."""
 
 logger = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class Agreement:
         if innovations.tested == 0:
             return
         if self._last_ns is not None:
-            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, LONGEST_GAP_S)
+            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, _LONGEST_GAP_S)
         self._last_ns = stamp_ns
         self._tests.append((self._tested_s, innovations.tested, innovations.rejected))
         begin_s = self._tested_s - self._limits.disagreement_s

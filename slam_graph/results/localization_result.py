@@ -22,8 +22,8 @@ from slam_graph.maps.pose_filter import MapPoseFilter
 
 __all__ = ["LocalizationLog", "errors_in_map", "map_alignment"]
 
-POSE_WIDTH = 7
-LEAST_SHARED = 3
+_POSE_WIDTH = 7
+_LEAST_SHARED = 3
 """A map is aligned with the truth by at least this many keyframes."""
 
 
@@ -60,7 +60,7 @@ class LocalizationLog:
         self._located.append(located)
         if estimate is None:
             self._sigmas.append(np.nan)
-            self._poses.extend([np.nan] * POSE_WIDTH)
+            self._poses.extend([np.nan] * _POSE_WIDTH)
             return
         self._sigmas.append(estimate.position_sigma)
         quaternion: Any = estimate.pose.rotation().toQuaternion()  # unknown to the stubs
@@ -85,7 +85,7 @@ class LocalizationLog:
 
     def trajectory(self) -> Trajectory:
         """Poses in the world of the map, of the frames where they are known."""
-        rows = np.array(self._poses, dtype=np.float64).reshape(-1, POSE_WIDTH)[self.located]
+        rows = np.array(self._poses, dtype=np.float64).reshape(-1, _POSE_WIDTH)[self.located]
         return Trajectory(self.stamps_ns[self.located], rows[:, :3], rows[:, 3:])
 
     def csv_lines(self) -> Iterator[str]:
@@ -145,8 +145,8 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
             pairs.append(synchronize(truth, keyframes))
         except DataError:
             continue
-    if sum(len(true) for true, _ in pairs) < LEAST_SHARED:
-        raise DataError(f"the truth covers fewer than {LEAST_SHARED} keyframes of the map")
+    if sum(len(true) for true, _ in pairs) < _LEAST_SHARED:
+        raise DataError(f"the truth covers fewer than {_LEAST_SHARED} keyframes of the map")
     true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
     return align_yaw(true, own) if known.gravity_aligned else umeyama(true, own)
 

@@ -43,7 +43,7 @@ __all__ = [
 SCHEMA_VERSION = 1
 """Counts up whenever a key changes its name or meaning."""
 
-RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
+_RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
 
 Table = dict[str, Any]
 
@@ -60,7 +60,7 @@ def finite(value: Any) -> Any:
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     table = {"slam_graph": __version__, "python": platform.python_version()}
-    for package in RECORDED_PACKAGES:
+    for package in _RECORDED_PACKAGES:
         try:
             table[package] = version(package)
         except PackageNotFoundError:

@@ -14,10 +14,10 @@ from slam_graph.results.result_files import appearing
 
 __all__ = ["PointMap", "read_ply", "write_ply"]
 
-POINT_COLOUR = (200, 200, 200)
-CAMERA_COLOUR = (220, 30, 30)
+_POINT_COLOUR = (200, 200, 200)
+_CAMERA_COLOUR = (220, 30, 30)
 
-POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
+_POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
 
 RECENT = 10_000
 """Features are moved from the dictionary into the arrays when there are more than this."""
@@ -71,7 +71,7 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
     """
     finite = points[np.isfinite(points).all(axis=1)]
     fields: list[tuple[str, str, int]] = [("place", "<f8", 3)]
-    lines = list(POSITION_PROPERTIES)
+    lines = list(_POSITION_PROPERTIES)
     if centres is not None:
         fields.append(("colour", "u1", 3))
         lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
@@ -79,8 +79,8 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
     vertices = np.empty(len(places), fields)
     vertices["place"] = places
     if centres is not None:
-        vertices["colour"][: len(finite)] = POINT_COLOUR
-        vertices["colour"][len(finite) :] = CAMERA_COLOUR
+        vertices["colour"][: len(finite)] = _POINT_COLOUR
+        vertices["colour"][len(finite) :] = _CAMERA_COLOUR
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -106,6 +106,6 @@ def read_ply(path: Path | str) -> FloatArray:
     lines = header.decode("ascii", errors="replace").splitlines()
     properties = tuple(line for line in lines if line.startswith("property"))
     binary = "format binary_little_endian 1.0" in lines
-    if not separator or not binary or properties != POSITION_PROPERTIES or len(body) % 24:
+    if not separator or not binary or properties != _POSITION_PROPERTIES or len(body) % 24:
         raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
     return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +20,6 @@ __all__ = [
     "appearing",
     "create_run_folder",
     "link_latest",
-    "logged_to",
     "refuse_to_replace",
     "write_text",
 ]
@@ -131,23 +129,3 @@ def link_latest(folder: Path) -> Path:
     partial.symlink_to(folder.name)
     os.replace(partial, link)
     return link
-
-
-@contextmanager
-def logged_to(path: Path) -> Iterator[None]:
-    """Write what the package logs to a file, which appears when the block ends, well or not."""
-    partial = path.with_name(f".{path.name}.partial")
-    handler = logging.FileHandler(partial, mode="w", encoding="utf-8")
-    formatter = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
-    handler.setFormatter(formatter)
-    logger = logging.getLogger("slam_graph")
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(min(logging.INFO, logger.getEffectiveLevel()))
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-        logger.removeHandler(handler)
-        handler.close()
-        os.replace(partial, path)

@@ -53,12 +53,12 @@ SIGMA_COLUMNS = (
     "sigma_accel_bias_{}_m_s2",
     "sigma_gyro_bias_{}_rad_s",
 )
-COLUMNS = tuple(name.format(axis) for name in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz")
+_COLUMNS = tuple(name.format(axis) for name in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz")
 
 
 def state_lines(history: StateHistory) -> Iterator[str]:
     """Velocities, biases and standard deviations as CSV; sigmas are empty where unknown."""
-    yield ",".join(["stamp_ns", *COLUMNS]) + "\n"
+    yield ",".join(["stamp_ns", *_COLUMNS]) + "\n"
     trajectory = history.trajectory()
     parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
     rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
@@ -80,7 +80,7 @@ def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
     try:
         header, *lines = path.read_text(encoding="utf-8").splitlines()
         names = header.split(",")[1:]
-        missing = [name for name in COLUMNS if name not in names]
+        missing = [name for name in _COLUMNS if name not in names]
         if missing:
             raise ValueError(f"no column '{missing[0]}'")
         cells = [line.split(",") for line in lines]

@@ -17,16 +17,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 
-__all__ = [
-    "CalibrationLog",
-    "InnovationLog",
-    "RunLogs",
-    "StageTime",
-    "StepLog",
-    "Stopwatch",
-    "TimingLog",
-    "milliseconds",
-]
+__all__ = ["RunLogs", "Stopwatch", "TimingLog", "milliseconds"]
 
 
 class StepLog:

@@ -38,7 +38,7 @@ __all__ = ["Ending", "RunInput", "RunResult", "Status"]
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 
-TRUTH_MARGIN_NS = 1_000_000_000
+_TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
 
 
@@ -184,7 +184,7 @@ class RunResult:
         truth = self.input.truth
         if truth is None:
             return None
-        first, last = self.input.start_ns - TRUTH_MARGIN_NS, self.input.end_ns + TRUTH_MARGIN_NS
+        first, last = self.input.start_ns - _TRUTH_MARGIN_NS, self.input.end_ns + _TRUTH_MARGIN_NS
         near = (truth.stamps_ns >= first) & (truth.stamps_ns <= last)
         return select(truth, np.flatnonzero(near)) if near.any() else None
 

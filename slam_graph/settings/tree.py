@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 KeyPath = tuple[str | int, ...]
-ModelT = TypeVar("ModelT", bound=BaseModel)
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
 @dataclass
@@ -122,7 +122,7 @@ def override_trees(overrides: str | Iterable[str] | Mapping[str, Any]) -> list[C
     return trees
 
 
-def validate(model: type[ModelT], tree: ConfigTree) -> ModelT:
+def validate(model: type[_ModelT], tree: ConfigTree) -> _ModelT:
     """The typed settings of a tree.
 
     Raises:

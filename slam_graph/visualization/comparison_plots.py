@@ -15,11 +15,11 @@ from slam_graph.arrays import FloatArray
 
 __all__ = ["Curve", "Panel", "plot_panels"]
 
-PANEL_INCHES = (5.6, 3.3)
-DPI = 100
-COLUMNS = 2
+_PANEL_INCHES = (5.6, 3.3)
+_DPI = 100
+_COLUMNS = 2
 
-LOGARITHMIC_RANGE = 30.0
+_LOGARITHMIC_RANGE = 30.0
 """Curves whose medians differ by more than this factor are drawn on a logarithmic scale."""
 
 
@@ -61,10 +61,10 @@ def plot_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = min(COLUMNS, len(panels))
+    columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
-    size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
@@ -79,7 +79,7 @@ def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
         axes.axhspan(*panel.band, color="0.85", label=panel.band_label)
     for curve in panel.curves:
         axes.plot(curve.x, curve.y, color=colours[curve.label], linewidth=1.2, label=curve.label)
-    if _spread(panel.curves) > LOGARITHMIC_RANGE:
+    if _spread(panel.curves) > _LOGARITHMIC_RANGE:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0.0)

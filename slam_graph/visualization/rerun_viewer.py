@@ -22,12 +22,12 @@ __all__ = ["RerunViewer", "ViewerMode"]
 
 ViewerMode = Literal["save", "spawn", "connect"]
 
-TIMELINE = "time"
-STRIP_LENGTH = 50
+_TIMELINE = "time"
+_STRIP_LENGTH = 50
 """Poses in one strip of the path; finished strips are not sent again."""
 
-JPEG_QUALITY = 75
-FRUSTUM_M = 0.2
+_JPEG_QUALITY = 75
+_FRUSTUM_M = 0.2
 ESTIMATE_COLOR, TRUTH_COLOR = (0, 122, 255), (150, 150, 150)
 FEATURE_COLOR, MAP_COLOR = (0, 220, 0), (255, 160, 0)
 
@@ -73,7 +73,7 @@ class RerunViewer:
             lens = rr.Pinhole(
                 image_from_camera=camera.K,
                 resolution=(camera.width, camera.height),
-                image_plane_distance=FRUSTUM_M,
+                image_plane_distance=_FRUSTUM_M,
             )
             self._log(entity, placed, static=True)
             self._log(entity, lens, static=True)
@@ -86,7 +86,7 @@ class RerunViewer:
         points: FloatArray,
     ) -> None:
         """Send one frame."""
-        self._stream.set_time(TIMELINE, timestamp=np.datetime64(features.stamp_ns, "ns"))
+        self._stream.set_time(_TIMELINE, timestamp=np.datetime64(features.stamp_ns, "ns"))
         self._show_cameras(frame, features)
         if state is None:
             return
@@ -119,7 +119,7 @@ class RerunViewer:
         images = frame.images if isinstance(frame, CameraFrame) else ()
         for index, image in enumerate(images):
             if image is not None:
-                picture = rr.Image(image, color_model="L").compress(jpeg_quality=JPEG_QUALITY)
+                picture = rr.Image(image, color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
                 self._log(f"world/body/cam{index}/image", picture)
         for index, seen in enumerate(features.cameras):
             marks = rr.Points2D(seen.pixels, colors=FEATURE_COLOR, radii=2.0)
@@ -135,7 +135,7 @@ class RerunViewer:
         self._strip.append(np.array(position))
         path = rr.LineStrips3D([self._strip], colors=ESTIMATE_COLOR)
         self._log(f"world/path/{self._strips:05d}", path)
-        if len(self._strip) >= STRIP_LENGTH:
+        if len(self._strip) >= _STRIP_LENGTH:
             self._strip, self._strips = self._strip[-1:], self._strips + 1
         series = {
             "velocity": state.velocity,

@@ -15,14 +15,14 @@ from slam_graph.geometry.trajectory import Trajectory
 
 __all__ = ["plot_bundle", "plot_errors", "plot_pose_graph"]
 
-TRAJECTORY_INCHES = (11.0, 4.5)
-PROBLEM_INCHES = (11.0, 5.2)
-DPI = 110
-MOST_POINTS = 50_000
+_TRAJECTORY_INCHES = (11.0, 4.5)
+_PROBLEM_INCHES = (11.0, 5.2)
+_DPI = 110
+_MOST_POINTS = 50_000
 """Of larger scenes an even selection of the points is drawn."""
-SHOWN_SPAN = 3.0
+_SHOWN_SPAN = 3.0
 """The scene is shown as far as this many times the distance within which 95 % of the points are."""
-SMALLEST_PX = 1e-9
+_SMALLEST_PX = 1e-9
 """Lower end of the logarithmic histogram of errors."""
 
 
@@ -46,7 +46,7 @@ def plot_errors(
         rotation_errors_deg: (N,) absolute errors.
         stamps_ns: (N,) their times.
     """
-    figure = _figure(title, TRAJECTORY_INCHES)
+    figure = _figure(title, _TRAJECTORY_INCHES)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1.0))
     _plot_top_view(figure.add_subplot(grid[:, 0]), truth, estimate)
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
@@ -94,7 +94,7 @@ def plot_pose_graph(
         edges: (M, 2) rows of the poses that each edge joins.
         rejected: (M,) which edges the optimisation rejected; they are drawn only before it.
     """
-    figure = _figure(title, PROBLEM_INCHES)
+    figure = _figure(title, _PROBLEM_INCHES)
     in_space = before.shape[1] == 3
     for place, (name, positions) in enumerate((("before", before), ("after", after)), 1):
         axes: Any = figure.add_subplot(1, 2, place, projection="3d" if in_space else None)
@@ -137,12 +137,12 @@ def plot_bundle(
         centres: (C, 3) of the cameras.
         errors_px: lengths of the reprojection errors, by the name of the stage.
     """
-    figure = _figure(title, PROBLEM_INCHES)
+    figure = _figure(title, _PROBLEM_INCHES)
     scene, histogram = figure.subplots(1, 2)
     flat, flat_centres = _flattened(points, centres)
-    scene.plot(*flat[:: 1 + len(flat) // MOST_POINTS].T, ".", markersize=1, color="0.5")
+    scene.plot(*flat[:: 1 + len(flat) // _MOST_POINTS].T, ".", markersize=1, color="0.5")
     scene.plot(*flat_centres.T, "^", markersize=4, color="tab:red")
-    reach = SHOWN_SPAN * max(
+    reach = _SHOWN_SPAN * max(
         float(np.quantile(np.abs(flat), 0.95)), float(np.quantile(np.abs(flat_centres), 0.95)) / 2
     )
     if 0 < reach < np.abs(flat).max():
@@ -151,7 +151,7 @@ def plot_bundle(
     scene.set_title("points and cameras", fontsize="medium")
     shown = {stage: errors[np.isfinite(errors)] for stage, errors in errors_px.items()}
     bounds = np.concatenate([np.quantile(errors, (0.01, 1.0)) for errors in shown.values()])
-    bins = np.geomspace(np.clip(bounds.min(), SMALLEST_PX, 0.1), max(bounds.max(), 1.0), 80)
+    bins = np.geomspace(np.clip(bounds.min(), _SMALLEST_PX, 0.1), max(bounds.max(), 1.0), 80)
     for stage, errors in shown.items():
         histogram.hist(errors, bins=bins, histtype="step", label=stage)
     histogram.set(xscale="log", xlabel="reprojection error [px]", ylabel="observations")
@@ -175,7 +175,7 @@ def _figure(title: str, size_inches: tuple[float, float]) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size_inches, dpi=DPI, layout="constrained")
+    figure = Figure(figsize=size_inches, dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     return figure

@@ -20,10 +20,10 @@ __all__ = ["Picture", "TrackPainter", "TrackVideo", "save_picture"]
 
 Picture = NDArray[np.uint8]
 
-TAIL_FRAMES = 15
+_TAIL_FRAMES = 15
 """Length of the path that is drawn behind a feature; also the age at which its colour is full."""
 
-FRAMES_PER_S = 20.0
+_FRAMES_PER_S = 20.0
 
 
 class TrackPainter:
@@ -53,7 +53,7 @@ class TrackPainter:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
             tails = self._tails[number]
             for j, (u, v) in zip(camera.ids.tolist(), camera.pixels.tolist(), strict=True):
-                tail = tails.setdefault(j, deque(maxlen=TAIL_FRAMES))
+                tail = tails.setdefault(j, deque(maxlen=_TAIL_FRAMES))
                 tail.append((round(8 * u), round(8 * v)))
                 self._mark(picture, tail, self._ages[j], everywhere[j] > 1)
             self._tails[number] = {j: tail for j, tail in tails.items() if j in seen[number]}
@@ -65,7 +65,7 @@ class TrackPainter:
         self, picture: NDArray[np.uint8], tail: deque[tuple[int, int]], age: int, shared: bool
     ) -> None:
         """Draw one feature; coordinates are in eighths of a pixel (`shift=3` of OpenCV)."""
-        share = min(age / TAIL_FRAMES, 1.0)
+        share = min(age / _TAIL_FRAMES, 1.0)
         colour = (255 * (1 - share), 160 * (1 - abs(2 * share - 1)) + 40, 255 * share)
         way = np.array(tail, np.int32).reshape(-1, 1, 2)
         cv2.polylines(picture, [way], False, colour, 1, cv2.LINE_AA, 3)
@@ -106,7 +106,7 @@ class TrackVideo:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (picture.shape[1], picture.shape[0])
-            self._writer = cv2.VideoWriter(str(self._path), code, FRAMES_PER_S, size)
+            self._writer = cv2.VideoWriter(str(self._path), code, _FRAMES_PER_S, size)
             if not self._writer.isOpened():
                 raise DataError(f"{self._path}: cannot be written as a video; use .mp4")
         self._writer.write(picture)
