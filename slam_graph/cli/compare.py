@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slam_graph.cli.options import (
-    INTERRUPTED,
-    ConfigFile,
-    Json,
-    Overrides,
-)
+from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
@@ -45,21 +40,21 @@ def compare(
         ),
     ] = False,
     seeds: Annotated[
-        int, typer.Option("--seeds", min=1, help="Number of seeds to run everything with.")
+        int, typer.Option("--seeds", min=1, help="How many seeds to run everything with.")
     ] = 1,
     output: Annotated[
         Path, typer.Option("--output", help="Folder of tracks, results and report.")
     ] = Path("results/comparison"),
     workers: Annotated[
         int | None,
-        typer.Option("--workers", min=1, help="Parallel processes; one per core by default."),
+        typer.Option("--workers", min=1, help="Processes at a time; all cores if not said."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler that does the work."),
+        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to do the work."),
     ] = None,
     duration: Annotated[
-        float | None, typer.Option("--duration", help="Seconds to run; to the end by default.")
+        float | None, typer.Option("--duration", help="Seconds to run; all if not said.")
     ] = None,
     cameras: Annotated[
         str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
@@ -69,9 +64,7 @@ def compare(
     sim_set: Annotated[
         list[str] | None,
         typer.Option(
-            "--sim-set",
-            metavar="KEY=VALUE",
-            help="Change a simulation setting; repeatable.",
+            "--sim-set", metavar="KEY=VALUE", help="Set one value of all simulations; repeatable."
         ),
     ] = None,
     groundtruth: Annotated[
@@ -87,7 +80,7 @@ def compare(
 ) -> None:
     """Run several algorithms on the same feature tracks, and report how they compare.
 
-    Run again with the same OUTPUT, it does only what is missing.
+    Given the same OUTPUT again, only what has not been done yet is done.
     """
     from slam_graph.config import load_config
     from slam_graph.experiment.comparison import compare as run_comparison
@@ -95,10 +88,10 @@ def compare(
     from slam_graph.experiment.comparison_report import write_report
     from slam_graph.experiment.sources import find_sources
 
-    options = {"duration_s": duration, "cameras": cameras}
+    said = {"duration_s": duration, "cameras": cameras}
     names = [name for name in algorithms.split(",") if name]
     configs = load_configs(
-        names, lambda name: load_config(config, set_ or (), algorithm=name, **options)
+        names, lambda name: load_config(config, set_ or (), algorithm=name, **said)
     )
     if without_fej:
         configs = with_variants(configs)
@@ -106,10 +99,10 @@ def compare(
     executor = _executor(workers, scheduler)
     try:
         comparison = run_comparison(
-            sources, configs, seeds, output, executor, _report if progress else _ignore
+            sources, configs, seeds, output, executor, _tell if progress else _ignore
         )
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; {output} keeps what is done; repeat the command", err=True)
+        typer.echo(f"interrupted; what is done is kept in {output}: say the same again", err=True)
         raise typer.Exit(INTERRUPTED) from None
     rows, files = write_report(comparison)
     if as_json:
@@ -139,14 +132,14 @@ def _executor(workers: int | None, scheduler: str | None) -> Executor:
     return DaskCluster(scheduler)
 
 
-def _report(task: Task, failure: str | None, count: int, total: int) -> None:
-    """Report on stderr that a task has ended."""
+def _tell(task: Task, failure: str | None, count: int, total: int) -> None:
+    """Say on stderr that a task has ended."""
     ending = "" if failure is None else f": failed: {failure}"
     typer.echo(f"{count}/{total} {task.name}{ending}", err=True)
 
 
 def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
-    """Report nothing."""
+    """Say nothing."""
 
 
 def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Path]) -> None:
@@ -154,15 +147,15 @@ def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Pat
     from slam_graph.experiment.comparison_report import COLUMNS, cells
 
     table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)]
-    echo_table(_informative(table))
+    echo_table(_telling(table))
     if comparison.skipped:
-        typer.echo(f"\n{comparison.skipped} tasks were done before")
+        typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
     typer.echo("  " + " ".join(file.name for file in files))
 
 
-def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """A table without empty columns, and without the column of data where all have the same."""
+def _telling(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A table without the columns in which nothing is known, and with one data set without it."""
     columns = [
         values
         for values in zip(*table, strict=True)
@@ -172,9 +165,11 @@ def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
 
 
 def _leave(comparison: Comparison) -> None:
-    """Raise, for exit code 1, if a task failed; a run that diverged is a result."""
+    """Exit code 1 if something could not be done; a run that diverged is a result."""
     from slam_graph.errors import DataError
 
     if comparison.failures:
         name, reason = next(iter(comparison.failures.items()))
-        raise DataError(f"{len(comparison.failures)} tasks failed; the first: {name}: {reason}")
+        raise DataError(
+            f"{len(comparison.failures)} tasks could not be done; the first: {name}: {reason}"
+        )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph simulate`: a simulated recording with its exact ground truth."""
+"""`slam-graph simulate`: a sequence that never happened, with its exact truth."""
 
 from __future__ import annotations
 
@@ -11,11 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from slam_graph.cli.options import (
-    ConfigFile,
-    Json,
-    Overrides,
-)
+from slam_graph.cli.options import ConfigFile, Json, Overrides
 from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.cli.progress import ProgressBar
 
@@ -25,25 +21,24 @@ if TYPE_CHECKING:
 
 __all__ = ["simulate"]
 
-_Kind = Literal["tracks", "images"]
+Kind = Literal["tracks", "images"]
 
 
 def simulate(
     output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Folder to write.")],
     kind: Annotated[
-        _Kind | None, typer.Option("--kind", help="Feature tracks, or an EuRoC folder of images.")
+        Kind | None, typer.Option("--kind", help="Feature tracks, or an EuRoC folder of images.")
     ] = None,
     trajectory: Annotated[
         str | None,
         typer.Option(
             "--trajectory",
             metavar="figure8|rooms|random|PATH",
-            help="A synthetic trajectory, or a ground truth or EuRoC folder to follow.",
+            help="A made-up trajectory, or a ground truth or EuRoC folder to fly along.",
         ),
     ] = None,
     real_imu: Annotated[
-        bool | None,
-        typer.Option("--real-imu", help="Use the IMU samples recorded there."),
+        bool | None, typer.Option("--real-imu", help="Use the IMU that was recorded there.")
     ] = None,
     cameras: Annotated[
         int | None, typer.Option("--cameras", help="Number of cameras of the rig.")
@@ -54,14 +49,13 @@ def simulate(
     start: Annotated[
         float | None, typer.Option("--start", help="Seconds into a recorded trajectory.")
     ] = None,
-    duration: Annotated[float | None, typer.Option("--duration", help="Length in seconds.")] = None,
-    rate: Annotated[float | None, typer.Option("--rate", help="Frames per second.")] = None,
+    duration: Annotated[float | None, typer.Option("--duration", help="Seconds to fly.")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Frames in a second.")] = None,
     features: Annotated[
-        int | None, typer.Option("--features", help="Maximum number of features in an image.")
+        int | None, typer.Option("--features", help="Most features in an image.")
     ] = None,
     pixel_sigma: Annotated[
-        float | None,
-        typer.Option("--pixel-sigma", help="Noise of feature positions, pixels."),
+        float | None, typer.Option("--pixel-sigma", help="Noise of features, pixels.")
     ] = None,
     outliers: Annotated[
         float | None, typer.Option("--outliers", help="Share of wrong observations.")
@@ -77,9 +71,9 @@ def simulate(
     ] = True,
     as_json: Json = False,
 ) -> None:
-    """Simulate IMU, and feature tracks or rendered images, with their exact ground truth.
+    """Simulate a flight: IMU, and feature tracks or rendered images, with their exact truth.
 
-    OUTPUT is a recording like any other. The same settings and seed write the same bytes.
+    OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
     """
     from slam_graph.datasets.formats.euroc_writer import refuse_existing
     from slam_graph.simulation.simulator import simulate as make
@@ -91,7 +85,7 @@ def simulate(
         "outliers": outliers,
         "loss": loss,
     }
-    given = {
+    said = {
         "kind": kind,
         "trajectory": trajectory,
         "real_imu": real_imu,
@@ -104,7 +98,7 @@ def simulate(
         "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
     }
     refuse_existing(output)
-    sequence = make(_settings(config, set_ or [], given))
+    sequence = make(_settings(config, set_ or [], said))
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
         write(sequence, output, None if bar is None else lambda t: bar.advance(t, True))
@@ -112,15 +106,15 @@ def simulate(
 
 
 def _settings(file: Path | None, overrides: list[str], options: dict[str, Any]) -> SimulationConfig:
-    """The settings: the file, then options, then overrides."""
+    """The settings: file under options under overrides."""
     from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
     from slam_graph.simulation.simulation_config import SimulationConfig
 
     tree = ConfigTree()
     if file is not None:
         tree.merge(read_tree(file))
-    given = {name: value for name, value in options.items() if value is not None}
-    tree.merge(ConfigTree(given, {(name,): f"option {name}" for name in given}))
+    said = {name: value for name, value in options.items() if value is not None}
+    tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
     for text in overrides:
         tree.merge(override(text))
     return validate(SimulationConfig, tree)
