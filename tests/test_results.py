@@ -16,7 +16,7 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.results.metrics import finite
+from slam_graph.results.metrics import SCHEMA_VERSION, finite
 from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
 from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
@@ -166,7 +166,7 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     assert float(rows[0]["sigma_position_body_x_m"]) == pytest.approx(0.01)
 
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert metrics["schema_version"] == 1
+    assert metrics["schema_version"] == SCHEMA_VERSION
     assert metrics["extent"]["coverage"] == 1.0
     assert metrics["accuracy"]["se3"]["ate"]["translation_m"]["rmse"] < 0.0061
     freer = [metrics["accuracy"][mode]["ate"] for mode in ("none", "yaw", "se3", "sim3")]

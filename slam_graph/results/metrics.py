@@ -40,7 +40,7 @@ __all__ = [
     "versions",
 ]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Counts up whenever a key changes its name or meaning."""
 
 _RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
