@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray
-from slam_graph.bundle_adjustment.bal_cost import moved
+from slam_graph.bundle_adjustment.bal_cost import retract
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem, project
 
 HALF_IMAGE_PX = (640.0, 480.0)
@@ -61,7 +61,7 @@ def ring(
     camera, point = camera[seen], point[seen]
     measured = pixels[seen] + noise_px * rng.standard_normal((len(camera), 2))
     by_camera = perturbation * CAMERA_SIGMAS * rng.standard_normal((cameras, CAMERA_DIM))
-    start = moved(truth, by_camera, perturbation * POINT_SIGMA * rng.standard_normal((points, 3)))
+    start = retract(truth, by_camera, perturbation * POINT_SIGMA * rng.standard_normal((points, 3)))
     return MadeUp(BalProblem(start, camera, point, measured, f"ring_{cameras}_{points}"), truth)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import slam_graph
 from benchmarks.suite import Outcome
 from slam_graph.config import RunConfig, load_config
-from slam_graph.experiment.comparison import Comparison, compare, load_configs
+from slam_graph.experiment.comparison_plan import Comparison, load_configs, run_tasks
 from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
 from slam_graph.experiment.sources import Source
@@ -60,7 +60,7 @@ def compared(
         seeds: how many.
         workers: processes at a time; as many as there are cores if not said.
     """
-    return compare(sources, configs, seeds, folder, LocalProcesses(workers), _tell)
+    return run_tasks(sources, configs, seeds, folder, LocalProcesses(workers), _tell)
 
 
 def results_of(comparison: Comparison, data: str, algorithm: str) -> list[tuple[RunTask, Table]]:

@@ -50,7 +50,7 @@ def rooms(seed: int, duration_s: float, cameras: int, looks: int) -> RunResult:
         cameras=cameras,
         landmarks=LandmarkConfig(density=4.0),
         tracks=TrackConfig(
-            features=80, loss=0.02, outliers=0.01, descriptors=True, descriptor_looks=looks
+            features=80, loss=0.02, outliers=0.01, descriptors=True, distinct_descriptors=looks
         ),
     )
     settings = load_config(None, ["loop_closure.enabled=true"])
@@ -114,11 +114,11 @@ def false_loops(closures: LoopClosures, truth: Trajectory) -> np.ndarray:
 def place_query(folder: Path) -> Outcome:
     """The CPU time of a query in databases of 50 to 5000 keyframes."""
     outcome, rng = Outcome(), np.random.default_rng(0)
-    looks = rng.integers(0, 256, (20_000, 32), dtype=np.uint8)
-    vocabulary = Vocabulary.train([looks], WORDS, len(looks), 2, rng)
+    pool = rng.integers(0, 256, (20_000, 32), dtype=np.uint8)
+    vocabulary = Vocabulary.train([pool], WORDS, rng, len(pool), 2)
 
     def keyframe() -> np.ndarray:
-        return looks[rng.integers(0, len(looks), DESCRIPTORS)]
+        return pool[rng.integers(0, len(pool), DESCRIPTORS)]
 
     database, times = PlaceDatabase(WORDS), {}
     queries = [keyframe() for _ in range(QUERIES)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps: second halves of flights located in maps of the first, both made one, and adjustment."""
+"""Maps: second halves of flights located in maps of the first, and both maps merged."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ import numpy as np
 
 from benchmarks.metric import Metric, info
 from benchmarks.suite import Benchmark, Outcome
-from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
-from slam_graph.maps.map_adjustment import adjust_map
 from slam_graph.maps.map_merge import merge_maps
 from slam_graph.maps.map_model import SlamMap
 from slam_graph.pipeline.run import run
@@ -155,28 +153,6 @@ def merged(folder: Path) -> Outcome:
     return outcome
 
 
-def adjusted(folder: Path) -> Outcome:
-    """Maps of first halves before and after their bundle adjustment, which must not worsen them."""
-    outcome = Outcome()
-    for cameras, name in ((2, "stereo"), (1, "mono")):
-        before, after, pixels = [], [], []
-        for seed in range(SEEDS):
-            made = mapped(flight(seed, cameras, False), HALF_S)
-            if made.slam_map is None:
-                return Outcome(failure=f"{name}, seed {seed}: {made.message or 'no map'}")
-            done = adjust_map(made.slam_map)
-            before.append(keyframe_errors(done.before, made))
-            after.append(keyframe_errors(done.after, made))
-            solution = done.solution
-            pixels.append(reprojection_errors(solution.part.problem, solution.minimum.estimates))
-        outcome.metrics += [
-            Metric(f"{name}_error_ratio", rms(after) / rms(before), "", "lower", 1.0),
-            info(f"{name}_rmse_m", rms(after), "m"),
-            info(f"{name}_reprojection_px", rms(pixels), "px"),
-        ]
-    return outcome
-
-
 def keyframe_errors(content: SlamMap, result: RunResult) -> np.ndarray:
     """(K,) errors of the keyframes of a map, all recordings aligned as one."""
     assert result.input.truth is not None
@@ -209,5 +185,4 @@ BENCHMARKS = {
     ),
     "map_mh01": Benchmark("The second half of MH_01 in the map of the first", (MH01,), real),
     "map_merge": Benchmark("Maps of both halves of flights made one", (), merged),
-    "map_adjusted": Benchmark("Maps of flights before and after bundle adjustment", (), adjusted),
 }

@@ -13,7 +13,6 @@ from benchmarks.running import Run
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 DURATION_S = 10.0
 
@@ -76,7 +75,7 @@ def _runs(settings: dict[str, Any], moving_object: dict[str, float] | None) -> d
     )
     with tempfile.TemporaryDirectory() as folder:
         images = Path(folder) / "images"
-        write(simulate(config), images)
+        simulate(config).save(images)
         return {
             f"{word}.{algorithm}": Run(images, algorithm, cameras)
             for word, cameras in (("mono", 1), ("stereo", 2))

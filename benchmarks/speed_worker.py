@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.formats.euroc import EurocSequence
-from slam_graph.datasets.sequence import FrameStream
+from slam_graph.datasets.sequence import FrameStream, ReaderOptions
 from slam_graph.pipeline.run import NullProgress, run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.visualization.viewer import NullViewer
@@ -118,7 +118,7 @@ class DecodedInTurn(EurocSequence):
     """
 
     def __init__(self, path: Path, cameras: int | None = None) -> None:
-        super().__init__(path, cameras)
+        super().__init__(path, ReaderOptions(cameras=cameras))
         self.decoding = Watch()
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:

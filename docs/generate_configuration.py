@@ -18,7 +18,6 @@ from pydantic_core import to_jsonable_python
 
 from slam_graph.bundle_adjustment.bal_policy import BalPolicy
 from slam_graph.config import RunConfig, load_config
-from slam_graph.maps.map_config import MapBalPolicy
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
 PAGE = Path(__file__).with_name("configuration.md")
@@ -51,9 +50,9 @@ TEN_THAT_MATTER = (
         "A descriptor such as `orb` bridges larger motions, with shorter and less accurate tracks.",
     ),
     Advice(
-        "frontend.equalization",
-        "Images are dark or have low contrast, and few features are found.",
-        "`clahe` brings out weak texture; it costs time and raises the noise of the features.",
+        "frontend.max_features",
+        "You have time to spare, or none.",
+        "More features give a little more accuracy; the time of front end and back end grows.",
     ),
     Advice(
         "backend.noise.pixel_sigma",
@@ -154,20 +153,9 @@ slam-graph optimize problem.txt --set cost.robust_width_px=1.5 --set gauss_newto
 ```
 """
 
-MAPS = """\
-## Bundle adjustment of maps
-
-The settings of `slam-graph optimize` for a map:
-
-```sh
-slam-graph optimize results/MONDAY/latest --set prior.position_sigma=0.02
-```
-"""
-
 POLICIES: tuple[tuple[str, type[BaseModel]], ...] = (
     (POSE_GRAPHS, PoseGraphPolicy),
     (BUNDLES, BalPolicy),
-    (MAPS, MapBalPolicy),
 )
 
 EXPERT = """\

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
-    from slam_graph.backend.build_estimator import build_estimator
     from slam_graph.backend.estimator import Estimator
     from slam_graph.bundle_adjustment.bal_file import read_bal
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from slam_graph.config import RunConfig, load_config
     from slam_graph.datasets.dataset_registry import open_dataset
     from slam_graph.datasets.groundtruth import read_groundtruth
+    from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation.ape import ape
     from slam_graph.evaluation.rpe import rpe
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from slam_graph.frontend.build_frontend import build_frontend
     from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
     from slam_graph.loop_closure.close_loops import close_loops
-    from slam_graph.maps.map_adjustment import adjust_map
-    from slam_graph.maps.map_config import MapBalPolicy
     from slam_graph.maps.map_merge import merge_maps
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.pipeline.run import run
@@ -55,7 +53,6 @@ __all__ = [
     "BalPolicy",
     "Estimator",
     "FeatureFrame",
-    "MapBalPolicy",
     "NavState",
     "PoseGraphPolicy",
     "Rig",
@@ -68,13 +65,12 @@ __all__ = [
     "Trajectory",
     "__version__",
     "adjust_bundle",
-    "adjust_map",
     "ape",
-    "build_estimator",
     "build_frontend",
     "certify",
     "close_loops",
     "compare",
+    "dataset_from_arrays",
     "load_config",
     "load_map",
     "load_result",
@@ -94,7 +90,6 @@ _HOME = {
     "BalPolicy": "slam_graph.bundle_adjustment.bal_policy",
     "Estimator": "slam_graph.backend.estimator",
     "FeatureFrame": "slam_graph.sensors.measurements",
-    "MapBalPolicy": "slam_graph.maps.map_config",
     "NavState": "slam_graph.geometry.trajectory",
     "PoseGraphPolicy": "slam_graph.pose_graph.pose_graph_policy",
     "Rig": "slam_graph.sensors.rig",
@@ -106,13 +101,12 @@ _HOME = {
     "StateHistory": "slam_graph.geometry.trajectory",
     "Trajectory": "slam_graph.geometry.trajectory",
     "adjust_bundle": "slam_graph.bundle_adjustment.bal_solve",
-    "adjust_map": "slam_graph.maps.map_adjustment",
     "ape": "slam_graph.evaluation.ape",
-    "build_estimator": "slam_graph.backend.build_estimator",
     "build_frontend": "slam_graph.frontend.build_frontend",
     "certify": "slam_graph.pose_graph.certificate",
     "close_loops": "slam_graph.loop_closure.close_loops",
     "compare": "slam_graph.experiment.comparison",
+    "dataset_from_arrays": "slam_graph.datasets.memory_sequence",
     "load_config": "slam_graph.config",
     "load_map": "slam_graph.results.map_output",
     "load_result": "slam_graph.results.saved_run",

@@ -222,7 +222,7 @@ def _plain(value: Any) -> Any:
 
 def dump_yaml(config: BaseModel) -> str:
     """The settings as YAML that `load_config` reads back, each with its meaning as a comment."""
-    return "\n".join(_yaml_lines(config, "")) + "\n"
+    return "\n".join(_yaml_lines(config, config.model_dump(mode="json"), "")) + "\n"
 
 
 def _expand_algorithm(tree: ConfigTree) -> None:
@@ -239,16 +239,17 @@ def _expand_algorithm(tree: ConfigTree) -> None:
     tree.where |= {("algorithm", *path): place for path, place in table.where.items()}
 
 
-def _yaml_lines(config: BaseModel, indent: str) -> Iterator[str]:
-    """The lines of one table."""
-    plain = config.model_dump(mode="json")
+def _yaml_lines(config: BaseModel, plain: dict[str, Any], indent: str) -> Iterator[str]:
+    """The lines of those settings of a table that are in its dump `plain`."""
     for name, info in type(config).model_fields.items():
+        if name not in plain:
+            continue
         if info.description:
             yield f"{indent}# {' '.join(info.description.split())}"
         value = getattr(config, name)
         if isinstance(value, BaseModel):
             yield f"{indent}{name}:"
-            yield from _yaml_lines(value, indent + "  ")
+            yield from _yaml_lines(value, plain[name], indent + "  ")
         else:
             text = yaml.safe_dump(plain[name], default_flow_style=True, width=10_000)
             yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()}"

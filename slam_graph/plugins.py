@@ -46,6 +46,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         group: group of entry points, such as `slam_graph.detectors`.
         kind: what a part is, for messages, such as "detector".
         home: module that registers the package's own parts when it is imported.
+        names: of these parts, so that they are known without importing `home`.
         accepts: whether an object can be such a part; by default, whether it can be called.
     """
 
@@ -54,11 +55,13 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         group: str,
         kind: str,
         home: str | None = None,
+        names: tuple[str, ...] = (),
         accepts: Callable[[object], bool] = callable,
     ) -> None:
         self.group = group
         self.kind = kind
         self._home = home
+        self._names = names
         self._accepts = accepts
         self._parts: dict[str, PartT] = {}
         self._plugins: dict[str, list[EntryPoint]] | None = None
@@ -94,10 +97,11 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         return self._parts[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._own() or name in self._offered()
+        return name in self._names or name in self._own() or name in self._offered()
 
     def __iter__(self) -> Iterator[str]:
-        yield from dict.fromkeys([*self._own(), *self._offered()])
+        own = self._parts if self._names else self._own()
+        yield from dict.fromkeys([*self._names, *own, *self._offered()])
 
     def __len__(self) -> int:
         return len(list(iter(self)))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.camera import Camera
@@ -110,9 +110,9 @@ class Flight:
             round(t_s * NS_PER_S),
             gtsam.Pose3(gtsam.Rot3(self.rotation(at).as_matrix()[0]), self.positions(at)[0]),
             self.velocities(at)[0],
-            self.gyro_bias,
-            self.accel_bias,
-            None if sigmas is None else np.diag(np.repeat(sigmas, 3) ** 2),
+            accel_bias=self.accel_bias,
+            gyro_bias=self.gyro_bias,
+            covariance=None if sigmas is None else np.diag(np.repeat(sigmas, 3) ** 2),
         )
 
 
@@ -139,6 +139,19 @@ def features(
     """What the cameras see of the points, with noise where `rng` is given."""
     at = np.array([t_s])
     R, p = flight.rotation(at).as_matrix()[0], flight.positions(at)[0]
+    return features_from(R, p, rig, points, round(t_s * NS_PER_S), rng, sigma_px)
+
+
+def features_from(
+    R: FloatArray,
+    p: FloatArray,
+    rig: Rig,
+    points: FloatArray,
+    stamp_ns: int,
+    rng: np.random.Generator | None = None,
+    sigma_px: float = 1.0,
+) -> FeatureFrame:
+    """What the cameras see of the points from a pose of the body, world_R_body and position."""
     in_body = (points - p) @ R
     cameras = []
     for mounted in rig.cameras:
@@ -157,7 +170,7 @@ def features(
         if rng is not None:
             noisy = noisy + rng.normal(0.0, sigma_px, noisy.shape)
         cameras.append(FeatureObservations(ids, noisy, camera.undistort(noisy)))
-    return FeatureFrame(round(t_s * NS_PER_S), tuple(cameras))
+    return FeatureFrame(stamp_ns, tuple(cameras))
 
 
 def packets(
@@ -189,7 +202,7 @@ def scene(
     min_frames: int = 2,
 ) -> tuple[Observations, Geometry]:
     """The observations from some times, and the true poses and points that go with them."""
-    window = TrackWindow()
+    window = FeatureTracks()
     for number, t_s in enumerate(times_s.tolist()):
         window.add(number, features(flight, rig, points, t_s, rng, sigma_px))
     ids, lengths = window.lengths()

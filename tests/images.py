@@ -26,7 +26,7 @@ STEREO = Rig(
         RigCamera(CAMERA, gtsam.Pose3(gtsam.Rot3(), [BASELINE_M, 0, 0]), name="right"),
     )
 )
-CONFIG = FrontendConfig(features=120, grid=(6, 4))
+CONFIG = FrontendConfig(max_features=120, grid=(6, 4))
 
 
 def painted(seed: int = 3) -> Spline:

@@ -24,21 +24,21 @@ YAW_DRIFT, POSITION_DRIFT = 5e-3, 0.01
 """rad/√s, and m/√s on each axis."""
 
 CONFIG = LoopClosureConfig(
-    places=PlaceConfig(words=500, training_iterations=3),
+    places=PlaceConfig(words=500),
     odometry_rotation_sigma=YAW_DRIFT,
     odometry_position_sigma=POSITION_DRIFT,
 )
 
 
 def tour(
-    seed: int, duration_s: float = 75.0, looks: int = 2000
+    seed: int, duration_s: float = 75.0, descriptors: int = 2000
 ) -> tuple[Rig, list[Keyframe], Trajectory, Trajectory]:
     """A flight without an estimator: the truth plus a random walk stands in for its trajectory.
 
     Args:
         seed: of everything.
         duration_s: how long; a lap takes 40 s.
-        looks: how many different descriptors there are.
+        descriptors: how many different ones there are.
 
     Returns:
         The rig, keyframes at drifting poses, the drifting trajectory, and the truth.
@@ -50,7 +50,9 @@ def tour(
         rate_hz=4.0,
         flight=FlightConfig(hover_s=0.0),
         landmarks=LandmarkConfig(density=4.0),
-        tracks=TrackConfig(features=80, outliers=0.01, descriptors=True, descriptor_looks=looks),
+        tracks=TrackConfig(
+            features=80, outliers=0.01, descriptors=True, distinct_descriptors=descriptors
+        ),
     )
     sequence = cast(SimulatedTracks, simulate(config))
     truth = sequence.groundtruth()

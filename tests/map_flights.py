@@ -7,21 +7,20 @@ import numpy as np
 
 from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
-from slam_graph.loop_closure.loop_pose_graph import stacked
 from slam_graph.maps.map_building import build_map
 from slam_graph.maps.map_model import MapRecording, SlamMap
+from slam_graph.pose_graph.graph import Poses
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
-from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.simulator import euroc_rig, simulate
 
-PLACES = PlaceConfig(words=50, training_iterations=2)
+PLACES = PlaceConfig(words=50)
 SPACING_M = 0.5
 
 
 class World:
-    """A wall of points with random looks, and views of it.
+    """A wall of points with random descriptors, and views of it.
 
     Args:
         seed: of everything.
@@ -32,7 +31,7 @@ class World:
         rng = np.random.default_rng(seed)
         self.rig: Rig = euroc_rig()
         self.points = rng.uniform([4.0, -4.0, -2.0], [8.0, 8.0, 2.0], (points, 3))
-        self.looks = rng.integers(0, 256, (points, 32), dtype=np.uint8)
+        self.descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """world_T_body of a view: the camera looks along world x, and goes to the side."""
@@ -53,7 +52,7 @@ class World:
             world_T_body or pose,
             seen,
             rays[seen],
-            self.looks[seen],
+            self.descriptors[seen],
             body[seen],
         )
 
@@ -62,7 +61,7 @@ class World:
         keyframes = [self.view(number) for number in views]
         return build_map(
             keyframes,
-            stacked([k.world_T_body for k in keyframes]),
+            Poses.from_gtsam([k.world_T_body for k in keyframes]),
             MapRecording("wall", "causal", self.rig),
             [],
             PLACES,

@@ -5,7 +5,6 @@
 import numpy as np
 import pytest
 
-from slam_graph.backend.backend_config import AdaptiveNoiseConfig
 from slam_graph.backend.cost.adaptive_noise import DensityScale
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
@@ -19,7 +18,7 @@ COVARIANCE = np.array([[2.0, 0.4, 0.0], [0.4, 1.0, -0.3], [0.0, -0.3, 0.5]])
 
 def factors(corrections: np.ndarray) -> np.ndarray:
     """The factor after each of some corrections (N, 3), whose covariance is said to be as above."""
-    scale = DensityScale(AdaptiveNoiseConfig())
+    scale = DensityScale()
     history = []
     for correction in corrections:
         scale.observe(correction, COVARIANCE, DT_S)

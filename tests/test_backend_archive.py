@@ -30,7 +30,12 @@ class Filter:
 
     def step(self, frame: int, tracked: set[int], rng: np.random.Generator) -> None:
         """A new frame and new features, random measurements of them, and all else leaves."""
-        self.state.insert_imu_state(frame, NavState(frame, gtsam.Pose3(), *np.zeros((3, 3)), None))
+        self.state.insert_imu_state(
+            frame,
+            NavState(
+                frame, gtsam.Pose3(), np.zeros(3), accel_bias=np.zeros(3), gyro_bias=np.zeros(3)
+            ),
+        )
         again = self.archive.due(np.array(sorted(tracked)))
         if len(again):
             self.prior = self.archive.recall(again, self.prior, self.state)

@@ -8,16 +8,15 @@ from flight import Flight, rig, room, scene
 from scipy.linalg import null_space
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import GatingConfig
 from slam_graph.backend.cost.feature_factors import (
     ReducedFeatures,
     WhitenedObservations,
     reduce_features,
-    robust_weights,
     whiten,
 )
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import LossName, RobustLoss
 
 FRAMES = 8
 SIGMA_PX = 1.5
@@ -34,7 +33,7 @@ def case(request: pytest.FixtureRequest) -> Case:
     points = truth.points + rng.normal(0.0, 0.1, truth.points.shape)
     at = Geometry(truth.rotations, truth.positions, points)
     projection = RigProjection(cameras)
-    linear = whiten(obs, projection, at, at, SIGMA_PX, GatingConfig())
+    linear = whiten(obs, projection, at, at, SIGMA_PX, RobustLoss())
     return obs, linear, reduce_features(obs, linear)
 
 
@@ -120,7 +119,7 @@ def test_jacobians_are_taken_at_the_first_estimates() -> None:
     obs, first = scene(Flight(), cameras, room(50, rng), np.linspace(0.0, 1.0, 4), rng)
     current = Geometry(first.rotations, first.positions + 0.05, first.points)
     projection = RigProjection(cameras)
-    linear = whiten(obs, projection, first, current, 2.0, GatingConfig(robust_loss="none"))
+    linear = whiten(obs, projection, first, current, 2.0, RobustLoss("none"))
     np.testing.assert_allclose(linear.r * 2.0, projection.residuals(obs, current)[0])
     by_pose, by_point = projection.jacobians(obs, first)
     np.testing.assert_allclose(linear.by_pose * 2.0, by_pose)
@@ -134,17 +133,17 @@ ERRORS = np.linspace(0.0, 20.0, 401)
 def test_weights_are_the_slope_of_the_loss(width: float) -> None:
     """A weight is ρ'(e) / e: Huber is quadratic, then linear; Cauchy is logarithmic."""
     e = ERRORS[1:]
-    huber = robust_weights(e, GatingConfig(robust_loss="huber", robust_width=width))
+    huber = RobustLoss("huber", width).weights(e)
     np.testing.assert_allclose(huber * e, np.minimum(e, width))
-    cauchy = robust_weights(e, GatingConfig(robust_loss="cauchy", robust_width=width))
+    cauchy = RobustLoss("cauchy", width).weights(e)
     loss = 0.5 * width**2 * np.log1p((e / width) ** 2)
     np.testing.assert_allclose((cauchy * e)[1:-1], np.gradient(loss, e)[1:-1], rtol=2e-2, atol=2e-3)
-    np.testing.assert_array_equal(robust_weights(e, GatingConfig(robust_loss="none")), 1.0)
+    np.testing.assert_array_equal(RobustLoss("none").weights(e), 1.0)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "none"])
-def test_weights_start_at_one_and_never_grow(loss: str) -> None:
-    weights = robust_weights(ERRORS, GatingConfig.model_validate({"robust_loss": loss}))
+def test_weights_start_at_one_and_never_grow(loss: LossName) -> None:
+    weights = RobustLoss(loss).weights(ERRORS)
     assert weights[0] == 1.0
     assert np.all(np.diff(weights) <= 0.0)
     assert np.all(weights > 0.0)
@@ -155,8 +154,8 @@ def test_an_outlier_weighs_less() -> None:
     cameras = rig(1)
     obs, at = scene(Flight(), cameras, room(50, rng), np.linspace(0.0, 1.0, 4))
     obs.pixels[0] += 50.0
-    plain = whiten(obs, RigProjection(cameras), at, at, 1.0, GatingConfig(robust_loss="none"))
-    robust = whiten(obs, RigProjection(cameras), at, at, 1.0, GatingConfig(robust_width=2.45))
+    plain = whiten(obs, RigProjection(cameras), at, at, 1.0, RobustLoss("none"))
+    robust = whiten(obs, RigProjection(cameras), at, at, 1.0, RobustLoss(width=2.45))
     root = np.sqrt(2.45 / np.hypot(50.0, 50.0))
     np.testing.assert_allclose(robust.r[0], plain.r[0] * root, rtol=1e-9)
     np.testing.assert_allclose(robust.by_pose[0], plain.by_pose[0] * root)

@@ -54,9 +54,8 @@ def trial(rng: np.random.Generator) -> Trial:
     state = State()
     for i in range(FRAMES):
         pose = gtsam.Pose3(gtsam.Rot3(truth.rotations[i]), truth.positions[i])
-        state.insert_imu_state(
-            i, NavState(0, pose.retract(error[i]), np.zeros(3), np.zeros(3), np.zeros(3))
-        )
+        zeros = {name: np.zeros(3) for name in ("velocity", "accel_bias", "gyro_bias")}
+        state.insert_imu_state(i, NavState(0, pose.retract(error[i]), **zeros))
     layout = Layout(dims_of(X(i) for i in range(FRAMES)))
     return Trial(obs, layout, root @ root.T, state)
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dynamics: preintegration against motions in closed form, its covariance, and the buffer."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -13,14 +14,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.imu_factor import (
-    ImuBuffer,
-    imu_factor,
-    predict,
-    preintegrate,
-    preintegration_params,
-)
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate, preintegration_params
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
 
@@ -46,8 +42,8 @@ def test_constant_rate_and_acceleration_at_once() -> None:
         0,
         gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.7), np.array([1.0, 2.0, 3.0])),
         np.array([0.5, -1.0, 0.2]),
-        np.array([0.01, -0.02, 0.03]),
-        np.array([0.1, 0.2, -0.1]),
+        accel_bias=np.array([0.1, 0.2, -0.1]),
+        gyro_bias=np.array([0.01, -0.02, 0.03]),
     )
     length_s = 1.0
     R_0 = Rotation.from_matrix(start.world_T_body.rotation().matrix())
@@ -73,8 +69,8 @@ def test_constant_rate_and_acceleration_at_once() -> None:
                 + 0.5 * acceleration * length_s**2,
             ),
             start.velocity + acceleration * length_s,
-            start.gyro_bias,
-            start.accel_bias,
+            accel_bias=start.accel_bias,
+            gyro_bias=start.gyro_bias,
         )
         predicted = predict(start, pim, 10**9)
         assert predicted.stamp_ns == 10**9
@@ -105,7 +101,7 @@ def test_a_change_of_bias_is_corrected_to_first_order() -> None:
     start = flight.nav_state(0.0)
     samples = flight.imu(0.0, 0.5)
     small = np.array([2e-3, -1e-3, 1e-3])
-    other = NavState(0, start.world_T_body, start.velocity, small, 10 * small)
+    other = replace(start, accel_bias=10 * small, gyro_bias=small)
     corrected = predict(other, preintegrate(samples, NO_BIAS, PARAMS), 5 * 10**8)
     bias = gtsam.imuBias.ConstantBias(other.accel_bias, other.gyro_bias)
     anew = predict(other, preintegrate(samples, bias, PARAMS), 5 * 10**8)

@@ -13,13 +13,18 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
-from slam_graph.backend.cost.imu_factor import ImuBuffer
-from slam_graph.backend.cost.zero_velocity import StandstillDetector, zero_velocity_factors
+from slam_graph.backend.cost.zero_velocity import (
+    POSITION_SIGMA,
+    VELOCITY_SIGMA,
+    StandstillDetector,
+    zero_velocity_factors,
+)
 from slam_graph.backend.estimator import Estimator
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.pipeline.run import run
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
 Motion = Callable[[float], FloatArray]
@@ -118,11 +123,11 @@ def test_the_factors_hold_the_pose_and_stop_the_velocity() -> None:
     for i in (3, 4):
         values.insert(X(i), pose)
         values.insert(V(i), np.zeros(3))
-    factors = zero_velocity_factors(3, 4, CONFIG)
+    factors = zero_velocity_factors(3, 4)
     assert sum(f.error(values) for f in factors) == 0.0
-    values.update(V(4), np.array([CONFIG.velocity_sigma, 0.0, 0.0]))
+    values.update(V(4), np.array([VELOCITY_SIGMA, 0.0, 0.0]))
     assert sum(f.error(values) for f in factors) == pytest.approx(0.5)
-    values.update(X(4), pose.retract(np.array([0, 0, 0, 0, CONFIG.position_sigma, 0.0])))
+    values.update(X(4), pose.retract(np.array([0, 0, 0, 0, POSITION_SIGMA, 0.0])))
     assert sum(f.error(values) for f in factors) == pytest.approx(1.0)
 
 

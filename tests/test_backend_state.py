@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import B, E, L, T, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
@@ -14,7 +14,14 @@ from slam_graph.backend.cost.cost import Cost, NewFeatures
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.marginalization.marginalize import marginalize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.state import State, dim, dims_of, imu_state_keys
+from slam_graph.backend.solve.state import (
+    State,
+    dim,
+    dims_of,
+    distortion_key,
+    imu_state_keys,
+    letter_and_index,
+)
 from slam_graph.geometry.trajectory import NavState
 
 KEYS = [L(5), X(0), X(1), V(1), B(1)]
@@ -48,6 +55,24 @@ def assert_same_values(a: gtsam.Values, b: gtsam.Values, atol: float = 1e-12) ->
 def test_dimensions() -> None:
     assert [dim(key) for key in KEYS] == [3, 6, 6, 3, 6]
     assert imu_state_keys(3) == (X(3), V(3), B(3))
+
+
+@pytest.mark.parametrize("coefficients", [1, 2, 4, 5, 12])
+def test_the_key_of_distortion_coefficients_holds_their_number(coefficients: int) -> None:
+    keys = [distortion_key(camera, coefficients) for camera in range(3)]
+    assert len(set(keys)) == 3
+    assert [dim(key) for key in keys] == [coefficients] * 3
+    assert [letter_and_index(key) for key in keys] == [("d", camera) for camera in range(3)]
+    for key in (*KEYS, L(2**40), E(2), T(0)):
+        symbol = gtsam.Symbol(key)
+        assert letter_and_index(key) == (chr(symbol.chr()), symbol.index())
+    made = State()
+    values = gtsam.Values()
+    values.insert(keys[1], np.arange(float(coefficients)))
+    made.insert_calibration(values)
+    made.update(Layout(dims_of(keys[1:2])), np.ones(coefficients))
+    made.relinearize()
+    np.testing.assert_array_equal(made.first.atVector(keys[1]), 1.0 + np.arange(coefficients))
 
 
 def test_a_state_goes_in_and_comes_out() -> None:

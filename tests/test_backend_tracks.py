@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))
@@ -24,7 +24,7 @@ def seen(turn: NDArray[np.float64], place: NDArray[np.float64], ids: slice) -> F
 def test_parallax_is_of_the_place_and_not_of_the_direction() -> None:
     turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
     here, there = np.zeros(3), np.array([0.4, -0.1, 0.2])
-    tracks = TrackWindow()
+    tracks = FeatureTracks()
     tracks.add(0, seen(np.eye(3), here, slice(0, 40)))
     tracks.add(1, seen(turn, here, slice(0, 40)))
     tracks.add(2, seen(turn, there, slice(10, 50)))

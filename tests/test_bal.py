@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bal import SMALL, by_gtsam
 from benchmarks.bal_problems import ring
 from slam_graph.bundle_adjustment import bal_schur
-from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, moved, reprojection_errors
+from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, reprojection_errors, retract
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.bundle_adjustment.bal_policy import (
     BalCostPolicy,
@@ -57,7 +57,7 @@ def derivative(problem: BalProblem, by_camera: np.ndarray, by_point: np.ndarray)
     step = 1e-6
     there, back = (
         project(
-            moved(problem.estimates, sign * step * by_camera, sign * step * by_point),
+            retract(problem.estimates, sign * step * by_camera, sign * step * by_point),
             problem.camera,
             problem.point,
         )[0]
@@ -245,6 +245,6 @@ def test_what_cannot_be_estimated_stays_and_is_counted() -> None:
 
 
 def test_what_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bal_schur, "MOST_CAMERAS", 4)
+    monkeypatch.setattr(bal_schur, "_MAX_CAMERAS", 4)
     with pytest.raises(EstimationError, match="too large: 5 cameras"):
         adjust_bundle(ring(5, 40).problem)

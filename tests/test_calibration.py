@@ -128,7 +128,7 @@ def test_omnidirectional_cameras_of_kalibr(chain: Path) -> None:
     camera = read_kalibr(chain).cameras[0].camera
     assert (camera.distortion, camera.coefficients) == ("double_sphere", (-0.2, 0.6))
     edit_text(chain, "-0.2, 0.6", "-0.2, 1.6")
-    with pytest.raises(DataError, match="alpha of a double sphere"):
+    with pytest.raises(DataError, match="alpha of camera model 'double_sphere'"):
         read_kalibr(chain)
 
 

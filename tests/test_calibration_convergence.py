@@ -33,7 +33,6 @@ from slam_graph.sensors.measurements import (
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import FlightConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 KINDS = ("extrinsics", "time_offset", "intrinsics")
 SIGMAS = np.array([2e-3, 1e-3, 0.02, 0.02, 2e-3])
@@ -210,7 +209,7 @@ def test_a_run_reports_the_calibration(tmp_path: Path) -> None:
         duration_s=4.0, cameras=1, rate_hz=10.0, trajectory="random", flight=flight
     )
     sequence = simulate(config)
-    write(sequence, tmp_path / "flight")
+    sequence.save(tmp_path / "flight")
     write_kalibr(wrong(sequence.rig, ("extrinsics", "time_offset"), -1), tmp_path / "wrong.yaml")
     options = ["run", str(tmp_path / "flight"), "--no-progress"]
     options += ["--calibration", str(tmp_path / "wrong.yaml")]

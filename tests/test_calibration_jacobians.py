@@ -9,9 +9,11 @@ import gtsam_unstable
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, packets, rig, room, scene
+from fov_camera import FOV
 from gtsam.symbol_shorthand import E, L, X
 from scipy.linalg import eigh
-from test_calibration_convergence import wrong
+from scipy.stats import chi2
+from test_calibration_convergence import calibrate, wrong
 from test_estimator_first_estimates import CONFIG, WEAK, claimed_information
 
 from slam_graph.arrays import FloatArray
@@ -30,9 +32,16 @@ from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 from slam_graph.config import load_config
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS
 from slam_graph.sensors.measurements import FeatureFrame
 
 PLAIN = replace(RADTAN, distortion="none", coefficients=())
+MEI = replace(
+    RADTAN, fx=760.0, fy=758.0, distortion="mei", coefficients=(0.9, -0.1, 0.03, 2e-4, 1e-4)
+)
+SPHERES = replace(RADTAN, distortion="double_sphere", coefficients=(0.1, 0.55))
+CAMERAS = [RADTAN, FISHEYE, PLAIN, MEI, SPHERES, replace(FOV, width=752, height=480)]
+each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.distortion)
 ALL = CalibrationConfig(extrinsics=True, time_offset=True, intrinsics=True, distortion=True)
 OFF = CalibrationConfig()
 STEP = 1e-6
@@ -70,14 +79,18 @@ def pixels(
     return obs.pixels - projection.residuals(obs, at)[0]
 
 
-@pytest.mark.parametrize("camera", [RADTAN, FISHEYE, PLAIN], ids=["radtan", "equidistant", "none"])
+def test_every_camera_model_is_tested() -> None:
+    assert {camera.distortion for camera in CAMERAS} == set(CAMERA_MODELS)
+
+
+@each_camera
 def test_derivatives_are_the_numerical_ones(camera: Camera) -> None:
     variables, state, prior, obs, points = case(camera)
     projection = CalibratedProjection(variables, state)
     at = Geometry(*projection.poses(state.estimate, obs.frames), points)
     by_pose, by_point, by_calibration = projection.all_jacobians(obs, at)
     layout = prior.layout.extended({X(i): 6 for i in range(len(TIMES))})
-    assert layout.size == by_calibration.shape[2] + 36 == (29 if camera.coefficients else 21) + 36
+    assert layout.size == by_calibration.shape[2] + 36 == 21 + 2 * len(camera.coefficients) + 36
 
     def moved(column: int, step: float) -> FloatArray:
         other = state.copy()
@@ -172,6 +185,26 @@ def final_state(name: str, calibration: CalibrationConfig) -> tuple[NavState, Es
         state = estimator.add_frame(packet.frame)
     assert state is not None
     return state, estimator
+
+
+@each_camera
+def test_distortion_is_calibrated_online_with_every_camera_model(camera: Camera) -> None:
+    """A coefficient that is off by a standard deviation comes to the truth, as near as claimed."""
+    count = len(camera.coefficients)
+    sigma = CalibrationConfig().distortion_sigma
+    off = tuple(np.array(camera.coefficients) + sigma * np.eye(max(count, 1))[0, :count])
+    nominal = rig(1, replace(camera, coefficients=off))
+    if not count:
+        assert not CalibrationVariables(nominal, CalibrationConfig(distortion=True)).keys
+        return
+    estimate, _ = calibrate("msckf", nominal, rig(1, camera), ("distortion",), 4.0)
+    names = [parameter.name for parameter in estimate.parameters()]
+    assert names == [f"cam0_distortion_{n}" for n in range(count)]
+    error = np.subtract(estimate.rig.cameras[0].camera.coefficients, camera.coefficients)
+    covariance = estimate.covariances["d0"]
+    assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, count)
+    assert np.sqrt(covariance[0, 0]) < 0.7 * sigma
+    assert abs(error[0]) < 0.7 * sigma
 
 
 @pytest.mark.parametrize("name", ["msckf", "okvis", "ekf"])

@@ -8,14 +8,15 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from fov_camera import FOV, FieldOfView
 
 from slam_graph.backend.gtsam_smoothers.smoother_factors import calibration
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.image_frontend import ImageFrontend
-from slam_graph.sensors.camera import WIDE as WIDE_MODELS
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS, MAX_TANGENT, register_camera_model
 from slam_graph.sensors.measurements import CameraFrame
 from slam_graph.sensors.rig import Rig, RigCamera
 
@@ -41,8 +42,8 @@ MEI = Camera(
 )
 SPHERES = Camera(157.3, 157.2, 255.1, 256.8, "double_sphere", (-0.179, 0.5916), 512, 512)
 NARROW = Camera(313.2, 313.2, 638.7, 514.4, "double_sphere", (-0.1834, 0.5931), 1280, 1024)
-ALL = [PINHOLE, RADTAN, EQUIDISTANT, WIDE, MEI, SPHERES, NARROW]
-NAMES = ["none", "radtan", "equidistant", "wide", "mei", "double_sphere", "narrow"]
+ALL = [PINHOLE, RADTAN, EQUIDISTANT, WIDE, MEI, SPHERES, NARROW, FOV]
+NAMES = ["none", "radtan", "equidistant", "wide", "mei", "double_sphere", "narrow", "atan_fov"]
 each_camera = pytest.mark.parametrize("camera", ALL, ids=NAMES)
 
 
@@ -55,7 +56,11 @@ def image_grid(camera: Camera) -> np.ndarray:
 def pixel_grid(camera: Camera) -> np.ndarray:
     """Pixels all over the image; of a wide lens those that are less than 80° off its axis."""
     pixels = image_grid(camera)
-    return pixels[camera.visible(pixels)[1]] if camera.distortion in WIDE_MODELS else pixels
+    return pixels[camera.visible(pixels)[1]] if camera.model.sees_sideways else pixels
+
+
+def test_every_model_is_tested() -> None:
+    assert {camera.distortion for camera in ALL} == set(CAMERA_MODELS)
 
 
 @each_camera
@@ -124,15 +129,66 @@ def test_equidistant_agrees_with_gtsam(camera: Camera) -> None:
 
 
 def test_mei_agrees_with_gtsam() -> None:
-    oracle, _ = calibration(MEI)
+    oracle = MEI.gtsam_calibration()
+    assert oracle is not None
     m = MEI.undistort(pixel_grid(MEI))
     assert len(m) > 500
     np.testing.assert_allclose(MEI.distort(m)[0], [oracle.uncalibrate(p) for p in m], atol=1e-8)
 
 
-def test_what_gtsam_does_not_know_is_refused_for_its_smoothers() -> None:
-    with pytest.raises(ConfigError, match="distortion 'double_sphere'"):
-        calibration(SPHERES)
+@each_camera
+def test_gtsam_has_the_same_camera_or_none(camera: Camera) -> None:
+    """Projection and both derivatives of GTSAM's calibration are ours."""
+    if camera.gtsam_calibration() is None:
+        with pytest.raises(ConfigError, match=f"distortion '{camera.distortion}'"):
+            calibration(camera)
+        return
+    oracle, factor = calibration(camera)
+    m = camera.undistort(pixel_grid(camera))[::13]
+    pixels, jacobian = camera.distort(m)
+    assert len(m) > 40
+    np.testing.assert_allclose(pixels, [oracle.uncalibrate(p) for p in m], atol=1e-8)
+    noise = gtsam.noiseModel.Unit.Create(2)
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose3())
+    for row, point in enumerate(m):
+        values.insert(row + 1, np.append(point, 1.0))
+        linear = factor(pixels[row], noise, 0, row + 1, oracle).linearize(values)
+        A, b = linear.jacobian()
+        np.testing.assert_allclose(A[:, 6:8], jacobian[row], rtol=1e-7, atol=1e-5)
+        np.testing.assert_allclose(b, 0.0, atol=1e-8)
+
+
+@each_camera
+def test_the_valid_field_of_view_is_one_to_one(camera: Camera) -> None:
+    angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for share in (0.2, 0.6, 0.97):
+        m = share * camera.max_tangent * rays
+        np.testing.assert_allclose(camera.visible(camera.distort(m)[0])[0], m, atol=1e-6)
+
+
+def test_points_beyond_the_fold_of_a_polynomial_are_not_visible() -> None:
+    """r (1 - 0.4 r²) is largest at r = 0.913; further points come back into the image."""
+    folding = replace(RADTAN, coefficients=(-0.4, 0.0, 0.0, 0.0))
+    assert folding.max_tangent == pytest.approx(np.sqrt(1.0 / 1.2), abs=0.03)
+    inside, beyond = folding.distort(np.array([[0.8, 0.0], [1.2, 0.0]]))[0]
+    assert folding.visible(np.array([inside]))[1].all()
+    assert not folding.visible(np.array([beyond]))[1].any() or np.all(
+        np.abs(folding.visible(np.array([beyond]))[0]) < folding.max_tangent
+    )
+    assert RADTAN.max_tangent == MAX_TANGENT
+
+
+def test_a_name_is_given_to_one_model_only() -> None:
+    assert register_camera_model(FieldOfView) is FieldOfView  # again is no fault
+
+    class Other(FieldOfView):
+        """Another model of the same name."""
+
+    with pytest.raises(ConfigError, match="camera model 'atan_fov' is registered already"):
+        register_camera_model(Other)
+    assert CAMERA_MODELS["atan_fov"] is FieldOfView
 
 
 @pytest.mark.parametrize("camera", [SPHERES, NARROW], ids=["wide", "narrow"])
@@ -157,7 +213,7 @@ def test_every_pixel_is_a_point_or_said_not_to_be(camera: Camera) -> None:
     np.testing.assert_allclose(camera.distort(plane[visible])[0], pixels[visible], atol=1e-7)
     radius = np.linalg.norm(pixels - (camera.cx, camera.cy), axis=1)
     edge = camera.project(np.array([[np.tan(np.deg2rad(80)), 0.0, 1.0]]))[0, 0] - camera.cx
-    if camera.distortion in WIDE_MODELS:
+    if camera.model.sees_sideways:
         assert np.all(visible[radius < 0.98 * edge])
         assert not np.any(visible[radius > 1.02 * edge])
     else:
@@ -168,7 +224,7 @@ def test_a_front_end_leaves_out_what_a_fisheye_sees_sideways() -> None:
     rng = np.random.default_rng(3)
     image = cv2.resize(rng.integers(0, 255, (128, 128), dtype=np.uint8), (512, 512))
     rig = Rig((RigCamera(WIDE, gtsam.Pose3()),))
-    tracker = ImageFrontend(rig, FrontendConfig(features=400), 0, Diagnostics())
+    tracker = ImageFrontend(rig, FrontendConfig(max_features=400), 0, Diagnostics())
     features = tracker.track(CameraFrame(0, (np.asarray(image, np.uint8),))).cameras[0]
     length = np.linalg.norm(features.normalized, axis=1)
     assert len(features) > 100
@@ -193,7 +249,7 @@ def test_no_points_in_no_points_out(camera: Camera) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"distortion": "spherical"}, "unknown distortion model 'spherical'"),
+        ({"distortion": "spherical"}, "unknown camera model 'spherical'"),
         ({"coefficients": (0.1, 0.2)}, "has 4 coefficients, got 2"),
         ({"fx": 0.0}, "focal lengths must be positive"),
     ],

@@ -31,6 +31,18 @@ def test_dump_explains_every_setting() -> None:
 
 
 @pytest.mark.parametrize("name", algorithm_names())
+def test_every_algorithm_survives_a_round_trip(tmp_path: Path, name: str) -> None:
+    """What its engine does not use is not written, as it would be refused when it is read."""
+    config = load_config(algorithm=name)
+    text = dump_yaml(config)
+    assert load_config(write(tmp_path, text)) == config
+    own = config.algorithm.engine == "square_root"
+    assert ("cost" in yaml.safe_load(text)["algorithm"]) == own
+    assert ("smoother" in yaml.safe_load(text)["algorithm"]) != own
+    assert RunConfig.model_validate_json(config.model_dump_json()) == config
+
+
+@pytest.mark.parametrize("name", algorithm_names())
 def test_every_algorithm_that_ships_loads_under_its_name(name: str) -> None:
     assert load_config(algorithm=name).algorithm.name == name
 
@@ -92,6 +104,20 @@ def test_cameras_are_counted_or_named(word: str, count: int | None) -> None:
         ("- 1\n", r"my.yaml:1: expected a table"),
         ("algorithm: mscfk\n", r"my.yaml:1: unknown algorithm 'mscfk'; did you mean 'msckf'\?"),
         ("algorithm:\n  cost: {}\n", r"my.yaml:1: key 'algorithm.name' is missing"),
+        (
+            "algorithm:\n  name: a\n  engine: isam2\n  cost: {}\n",
+            r"my.yaml:4: 'algorithm.cost' is not used by engine 'isam2', whose settings are in "
+            r"smoother; remove it, or set algorithm.engine to square_root$",
+        ),
+        (
+            "algorithm:\n  name: a\n  smoother: {lag_s: 2.0}\n",
+            r"my.yaml:3: 'algorithm.smoother' is not used by engine 'square_root', whose settings "
+            r"are in cost, gauss_newton, marginalization; remove it, or set algorithm.engine to",
+        ),
+        (
+            "algorithm:\n  name: a\n  engine: isam2\n  smoother: {max_iterations: 2}\n",
+            r"my.yaml:4: 'algorithm.smoother' has 'max_iterations', which engine 'isam2' does not",
+        ),
         ("algorithm:\n  name: a\n  cots: {}\n", r"my.yaml:3: unknown key 'algorithm.cots'"),
     ],
 )
@@ -110,12 +136,24 @@ def test_faults_name_file_and_line(tmp_path: Path, text: str, message: str) -> N
         ("seed=[", "--set seed=.: the value is not YAML"),
         ("sead=1", "--set sead=1: unknown key 'sead'; did you mean 'seed'"),
         ("seed.deep=1", "--set seed.deep=1: seed: "),
+        (
+            "algorithm.smoother.lag_s=2",
+            "--set algorithm.smoother.lag_s=2: 'algorithm.smoother' is not",
+        ),
         ("algorithm=nothing", "--set algorithm=nothing: unknown algorithm"),
     ],
 )
 def test_faults_name_the_override(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(overrides=[text])
+
+
+@pytest.mark.parametrize("key", ["noise.imu_gap_scale", "initialization.motion_prior"])
+def test_a_setting_that_became_a_constant_says_where_it_is(key: str) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"'backend.{key}' is a constant now: \w+ in slam_graph/"
+    ):
+        load_config(overrides=[f"backend.{key}=1"])
 
 
 def test_a_missing_file_is_said(tmp_path: Path) -> None:

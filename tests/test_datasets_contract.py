@@ -18,7 +18,7 @@ from recordings_public import (
 from recordings_ros import write_bag
 
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.datasets.formats.track_recording import TrackRecorder
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 

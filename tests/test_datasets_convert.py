@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
-from slam_graph.datasets.convert import convert_to_euroc
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.formats.euroc_writer import convert_to_euroc
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.pipeline.run import run

@@ -19,6 +19,7 @@ from recordings import (
 )
 
 from slam_graph.datasets.formats.euroc import EurocSequence
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.pairing import ABSENT, group_by_time
 from slam_graph.errors import DataError
 from slam_graph.sensors.kalibr_calibration import write_kalibr
@@ -236,7 +237,7 @@ def test_bad_camera_row(folder: Path) -> None:
 
 def test_too_many_cameras(folder: Path) -> None:
     with pytest.raises(DataError) as error:
-        EurocSequence(folder, cameras=3)
+        EurocSequence(folder, ReaderOptions(cameras=3))
     one_line(error, "3 cameras", "has 2")
 
 
@@ -245,7 +246,8 @@ def test_no_groundtruth(folder: Path) -> None:
     sequence, _ = run_through(folder)
     assert sequence.groundtruth() is None
     assert not sequence.info().has_groundtruth
-    given = EurocSequence(folder, groundtruth=folder / "elsewhere" / "data.csv").groundtruth()
+    options = ReaderOptions(groundtruth=folder / "elsewhere" / "data.csv")
+    given = EurocSequence(folder, options).groundtruth()
     assert given is not None
 
 
@@ -272,11 +274,11 @@ def test_other_calibration(folder: Path, tmp_path: Path) -> None:
     own = EurocSequence(folder)
     write_kalibr(own.rig.select(1), tmp_path / "mono.yaml")
     (folder / "mav0" / "cam0" / "sensor.yaml").unlink()
-    sequence = EurocSequence(folder, calibration=tmp_path / "mono.yaml")
+    sequence = EurocSequence(folder, ReaderOptions(calibration=tmp_path / "mono.yaml"))
     assert sequence.info().cameras == 1
     assert sequence.rig.cameras[0].body_T_camera.equals(own.rig.cameras[0].body_T_camera, 1e-12)
     with pytest.raises(DataError):
-        EurocSequence(folder, cameras=2, calibration=tmp_path / "mono.yaml")
+        EurocSequence(folder, ReaderOptions(2, tmp_path / "mono.yaml"))
 
 
 # --- real recordings ------------------------------------------------------------------------------

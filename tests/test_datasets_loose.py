@@ -97,7 +97,7 @@ def test_without_times_the_container_is_taken_at_its_word(tmp_path: Path) -> Non
 
 def test_a_stream_without_a_frame_rate_needs_times(tmp_path: Path) -> None:
     path = write_video(tmp_path, "flight.mjpeg", "MJPG")
-    refused(path, "container tells no frame rate; give --source stamps=FILE or")
+    refused(path, "container has no frame rate; give --source stamps=FILE or")
     times = write_times(tmp_path / "when.csv")
     sequence = open_dataset(path, sources={"stamps": str(times)})
     assert [frame.stamp_ns for frame in frames_of(sequence)] == STAMPS_NS

@@ -22,7 +22,7 @@ from slam_graph.datasets.data_checks import check_sequence
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 
 
 def test_formats_are_guessed(tmp_path: Path) -> None:
@@ -44,8 +44,8 @@ def test_unknown_path_names_all_formats(tmp_path: Path) -> None:
 def test_missing_path_and_unknown_format(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file or folder"):
         open_dataset(tmp_path / "nothing")
-    with pytest.raises(DataError, match=r"unknown data set format 'kitty'; known: .*euroc"):
-        open_dataset(tmp_path, format="kitty")
+    with pytest.raises(ConfigError, match=r"unknown data set format 'eurok'; .*'euroc'.*kitti_raw"):
+        open_dataset(tmp_path, format="eurok")
     with pytest.raises(DataError, match=r"tracks\.csv|calib\.yaml"):
         open_dataset(tmp_path, format="openvins_sim")
 
@@ -156,7 +156,7 @@ def test_wrong_calibration_and_units_are_found(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace(",9.8", ",0.98"))  # g instead of m/s²
     texts = found(tmp_path)
     assert any("principal point" in text for text in texts["error"])
-    assert any("at rest instead of" in text for text in texts["error"])
+    assert any("at rest, expected" in text for text in texts["error"])
     assert any("the calibration says 100.0 Hz" in text for text in texts["warning"])
 
 

@@ -69,7 +69,9 @@ def test_calibration_in_the_bag(tmp_path: Path) -> None:
 
 def test_calibration_that_the_bag_lacks_is_asked_for(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bare", calibrated=False)
-    with pytest.raises(DataError, match=r"'/cam0/camera_info' is missing; give --calibration"):
+    with pytest.raises(
+        DataError, match=r"no topic '/cam0/camera_info'; give --calibration; the bag has .*/imu0"
+    ):
         open_dataset(bag)
     rig = open_dataset(write_bag(tmp_path / "whole")).rig
     write_kalibr(rig, tmp_path / "chain.yaml")

@@ -12,7 +12,9 @@ from recordings import edit_line, edit_text, write_euroc, write_lines, write_ope
 
 from slam_graph.datasets.formats.eqvio import EqvioTracks, wheel_tracks
 from slam_graph.datasets.formats.openvins_sim import OpenvinsSimulation
-from slam_graph.datasets.formats.track_recording import TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
+from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.euroc_calibration import read_euroc_rig
@@ -21,7 +23,6 @@ from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, I
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 
 def features(sequence: OpenvinsSimulation | EqvioTracks) -> list[FeatureFrame]:
@@ -65,7 +66,7 @@ def test_wheel_is_the_start_of_v1_01(data_dir: Path) -> None:
     """Its calibration, IMU and stamps are EuRoC's own."""
     euroc = data_dir / "euroc" / "V1_01_easy_static_2s" / "mav0"
     truth = data_dir / "euroc_inertial" / "V1_01_easy"
-    sequence = EqvioTracks(wheel_tracks(), groundtruth=truth)
+    sequence = EqvioTracks(wheel_tracks(), ReaderOptions(groundtruth=truth))
     expected = read_euroc_rig(euroc, ["cam0"]).cameras[0]
     ours = sequence.rig.cameras[0]
     assert ours.body_T_camera.equals(expected.body_T_camera, 1e-9)
@@ -286,7 +287,7 @@ def test_another_calibration_moves_the_normalised_points(simulated: Path, tmp_pa
     other = read_euroc_rig(write_euroc(tmp_path / "flight") / "mav0", ["cam0", "cam1"])
     write_kalibr(other, tmp_path / "other.yaml")
     replay = TrackRecordingSequence(
-        tmp_path / "recorded", cameras=1, calibration=tmp_path / "other.yaml"
+        tmp_path / "recorded", ReaderOptions(1, tmp_path / "other.yaml")
     )
     frame = next(iter(replay.frames()))
     assert isinstance(frame, FeatureFrame)
@@ -298,7 +299,7 @@ def test_another_calibration_moves_the_normalised_points(simulated: Path, tmp_pa
 def test_descriptors_are_replayed_bit_by_bit(tmp_path: Path) -> None:
     tracks = TrackConfig(features=20, descriptors=True)
     source = simulate(SimulationConfig(duration_s=1.0, rate_hz=10.0, tracks=tracks))
-    write(source, tmp_path / "recorded")
+    source.save(tmp_path / "recorded")
     replay = TrackRecordingSequence(tmp_path / "recorded")
     frames = [f for f in source.frames() if isinstance(f, FeatureFrame)]
     for first in (0, 4):

@@ -62,6 +62,20 @@ def test_sources_that_are_named_exist() -> None:
     assert not missing
 
 
+def test_every_page_is_in_the_index() -> None:
+    linked = {target for target, _ in LINK.findall((ROOT / "docs" / "index.md").read_text())}
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    notebooks = {f"../notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert not (pages | notebooks | {"../README.md", "../CONTRIBUTING.md"}) - linked
+
+
+def test_every_group_of_entry_points_is_in_the_documents() -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "slam_graph").rglob("*.py"))
+    groups = set(re.findall(r"Registry\(\s*\"(slam_graph\.[a-z_]+)\"", sources))
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert not {group for group in groups if f"| `{group}` |" not in page}
+
+
 def generator() -> Any:
     """The script that writes the pages of settings, as a module."""
     script = ROOT / "docs" / "generate_configuration.py"

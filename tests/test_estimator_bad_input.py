@@ -271,3 +271,21 @@ def test_a_start_waits_for_good_data_and_then_succeeds(
     assert state is not None
     ours, true = (s.world_T_body.rotation().unrotate(s.velocity) for s in (state, truth))
     assert np.linalg.norm(ours - true) < 0.15
+
+
+@pytest.mark.parametrize("name", ["msckf", "fixed_lag_isam2"])
+def test_a_dropped_frame_rejects_no_features(recording: list[Packet], name: str) -> None:
+    """What the frame before it has rejected is not said twice."""
+    estimator = Estimator(RIG, load_config(algorithm=name).algorithm, GIVEN)
+    estimator.start(FALGORITHM.nav_state(0.0, SURE))
+    for packet in during(2.0, 4.0, mixed_up)(recording):
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+        if len(estimator.rejected):
+            break
+    assert len(estimator.rejected) > 0
+    assert isinstance(packet.frame, FeatureFrame)
+    assert estimator.add_frame(packet.frame) is None
+    assert len(estimator.rejected) == 0
+    assert estimator.innovations.tested == 0

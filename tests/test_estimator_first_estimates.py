@@ -15,13 +15,14 @@ from scipy.linalg import eigh
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
-from slam_graph.backend.cost.imu_factor import imu_factor, preintegrate, preintegration_params
+from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.marginalization.observability import unseen_directions
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.config import load_config
+from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
 from slam_graph.sensors.measurements import FeatureFrame
 
 CONFIG = BackendConfig(initialization=InitializationConfig(mode="given", fix_gauge=False))

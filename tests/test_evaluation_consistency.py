@@ -48,9 +48,9 @@ def noisy_history(
                 # the truth is at `error` from the estimate: truth = estimate ⊕ error
                 pose.compose(gtsam.Pose3.Expmap(error).inverse()),
                 np.zeros(3),
-                np.zeros(3),
-                np.zeros(3),
-                covariance,
+                accel_bias=np.zeros(3),
+                gyro_bias=np.zeros(3),
+                covariance=covariance,
             )
         )
     return history
@@ -112,7 +112,9 @@ def test_history_gives_back_what_it_was_given() -> None:
     state = NavState(
         START_NS,
         gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)),
-        *rng.normal(size=(3, 3)),
+        rng.normal(size=3),
+        accel_bias=rng.normal(size=3),
+        gyro_bias=rng.normal(size=3),
     )
     history = StateHistory()
     history.append(state)

@@ -21,8 +21,9 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.ape import ape
-from slam_graph.experiment.comparison import load_configs, plan, with_variants
+from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
+from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
 from slam_graph.experiment.comparison_results import ALIGNMENTS
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
@@ -157,7 +158,7 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=HANG_S)
     assert process.returncode == 130
-    assert "interrupted; what is done is kept" in said
+    assert "interrupted; finished tasks are kept" in said
     kept = sorted((tmp_path / "tracks").iterdir())
     assert kept[0].name.startswith("sim_figure8_seed0_")
     assert all((folder / "meta.yaml").is_file() for folder in kept), "something half done"
@@ -193,9 +194,9 @@ def test_seeds_and_algorithms_make_the_plan(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "truths", "message"),
     [
-        (["sim:no_such"], {}, "no_such: no such file or folder, and not one of figure8"),
-        (["sim:rooms", "sim:rooms"], {}, "another source is called 'sim_rooms' too"),
-        (["sim:rooms"], {"demo": "x"}, "no recording in DATA is called 'demo'"),
+        (["sim:no_such"], {}, "no_such: no such file or folder; known: figure8"),
+        (["sim:rooms", "sim:rooms"], {}, "another source is also called 'sim_rooms'"),
+        (["sim:rooms"], {"demo": "x"}, "no recording called 'demo'"),
     ],
 )
 def test_faults_in_what_is_named(names: list[str], truths: dict, message: str) -> None:
@@ -294,3 +295,33 @@ def test_a_start_with_an_error_of_its_covariance_keeps_that_covariance(tmp_path:
         sources = find_sources(["sim:figure8"], 2.0, [f"start.error={error}"])
         _, (task,) = plan(sources, configs, 1, tmp_path)
         assert task.config.backend.initialization.fix_gauge is fixed
+
+
+def test_compare_from_python(tmp_path: Path) -> None:
+    """One algorithm over chosen seeds; a second call with one more does only that."""
+    told: list[str] = []
+    options = {"simulation": ["duration_s=4", "rate_hz=10", "tracks.features=40"]}
+    arguments = {**options, "output": str(tmp_path), "workers": 1}
+    first = compare_algorithms("sim:figure8", "swf", seeds=[100, 101], **arguments)
+    assert [task.seed for task in first.runs] == [100, 101]
+    assert first.rows[0]["algorithm"] == "swf"
+    assert first.rows[0]["status"] == {"ok": 2}
+    assert all(file.is_file() for file in first.files)
+    second = compare_algorithms(
+        ["sim:figure8"],
+        ["swf"],
+        seeds=[101, 102],
+        progress=lambda task, *_: told.append(task.name),
+        **arguments,
+    )
+    assert second.skipped == 2
+    assert told == ["tracks of sim_figure8, seed 102", "swf on sim_figure8, seed 102"]
+
+
+def test_compare_with_unknown_names() -> None:
+    with pytest.raises(ConfigError, match=r"unknown algorithm 'mskcf'; did you mean 'msckf'\?"):
+        compare_algorithms("sim:figure8", "mskcf")
+    with pytest.raises(DataError, match="did you mean 'figure8'"):
+        compare_algorithms("sim:figure9")
+    with pytest.raises(ConfigError, match="give only one"):
+        compare_algorithms("sim:figure8", workers=2, scheduler="tcp://127.0.0.1:1")

@@ -29,13 +29,13 @@ from slam_graph.simulation.simulation_config import (
 )
 from slam_graph.simulation.simulator import simulate
 from slam_graph.smoothing import final_adjustment
-from slam_graph.smoothing.drift_consensus import agreeing, by_drift
+from slam_graph.smoothing.drift_consensus import consistent_matches, drift_jacobian
 from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.projected_matches import Scene
-from slam_graph.smoothing.recording_keyframes import read_piece, triangulated
+from slam_graph.smoothing.recording_segment import read_segment, triangulated
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.smoothing.track_fusion import fused, relabelled
+from slam_graph.smoothing.track_fusion import fused_labels, relabelled
 
 LENGTH_S = 40.0
 BROKEN_EVERY_S = 5.0
@@ -94,16 +94,16 @@ def drifting(truth: Trajectory, metres: float, radians: float) -> Trajectory:
 
 def scene_of(log: FrameLog, poses: Trajectory) -> Scene:
     backend = BackendConfig()
-    piece = read_piece(log, log.keyframes, log.rig, backend.zero_velocity)
-    seen = piece.seen_by_keyframes()
+    segment = read_segment(log, log.keyframes, log.rig, backend.zero_velocity)
+    seen = segment.seen_by_keyframes()
     seen = seen.subset(seen.counts > 3)
-    rows = np.searchsorted(poses.stamps_ns, piece.keyframe_stamps_ns)
+    rows = np.searchsorted(poses.stamps_ns, segment.keyframe_stamps_ns)
     matrices = np.array([poses.pose(int(row)).matrix() for row in rows])
     rotations, positions = matrices[:, :3, :3], matrices[:, :3, 3]
     projection = RigProjection(log.rig)
     points, usable = triangulated(seen, (rotations, positions), projection, backend)
     first = np.searchsorted(seen.feature, np.arange(len(seen.ids)))
-    times_s = piece.keyframe_stamps_ns[seen.frame[first]] * 1e-9
+    times_s = segment.keyframe_stamps_ns[seen.frame[first]] * 1e-9
     return Scene(seen, Geometry(rotations, positions, points), usable, times_s, projection, 1.0)
 
 
@@ -121,7 +121,7 @@ def test_what_is_fused_is_one_landmark(
     truth = sequence.groundtruth()
     assert truth is not None
     scene = scene_of(log, drifting(truth, *drift))
-    label = fused(scene, 8.0)
+    label = fused_labels(scene)
     landmarks = scene.seen.ids // 1000
     joined = np.flatnonzero(label != np.arange(len(label)))
     right = landmarks[joined] == landmarks[label[joined]]
@@ -137,7 +137,7 @@ def test_poses_that_are_off_by_more_than_the_reach_fuse_nothing_wrong(
     truth = sequence.groundtruth()
     assert truth is not None
     scene = scene_of(log, drifting(truth, 1.0, 0.2))
-    label = fused(scene, 8.0)
+    label = fused_labels(scene)
     landmarks = scene.seen.ids // 1000
     joined = np.flatnonzero(label != np.arange(len(label)))
     wrong = np.sum(landmarks[joined] != landmarks[label[joined]])
@@ -193,7 +193,7 @@ def test_points_that_are_nowhere_are_left_out(log: FrameLog, sequence: Sequence)
     scene = scene_of(log, truth)
     points, usable = scene.at.points.copy(), scene.usable.copy()
     points[5], usable[5] = np.nan, False
-    label = fused(replace(scene, at=replace(scene.at, points=points), usable=usable), 8.0)
+    label = fused_labels(replace(scene, at=replace(scene.at, points=points), usable=usable))
     assert label[5] == 5
     assert np.sum(label == 5) == 1
     assert np.sum(label != np.arange(len(label))) > 100
@@ -224,10 +224,10 @@ def test_tracks_are_adjusted_as_they_are_if_fusion_fails(
 def test_a_common_drift_is_found_among_wrong_matches() -> None:
     rng = np.random.default_rng(1)
     by_point, arms = rng.normal(0.0, 100.0, (20, 2, 3)), rng.normal(0.0, 3.0, (20, 3))
-    J = by_drift(by_point, arms)
+    J = drift_jacobian(by_point, arms)
     offsets = J @ [0.02, -0.03, 0.01, 0.005] + rng.normal(0.0, 0.3, (20, 2))
     offsets[12:] = rng.uniform(-10.0, 10.0, (8, 2))
-    agree, left = agreeing(J, offsets, 3.0, 0.001, 1, rng)
+    agree, left = consistent_matches(J, offsets, 3.0, 0.001, 1, rng)
     assert agree[:12].all()
     assert agree[12:].sum() <= 1
     assert np.all(left[:12] < 3.0)
@@ -238,16 +238,16 @@ def test_chance_agrees_on_no_drift() -> None:
     found = 0
     for _ in range(200):
         count = int(rng.integers(3, 30))
-        J = by_drift(rng.normal(0.0, 100.0, (count, 2, 3)), rng.normal(0.0, 3.0, (count, 3)))
+        J = drift_jacobian(rng.normal(0.0, 100.0, (count, 2, 3)), rng.normal(0.0, 3.0, (count, 3)))
         radius, angle = 10.0 * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
         offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        agree, _ = agreeing(J, offsets, 3.0, 0.01, 200, rng)
+        agree, _ = consistent_matches(J, offsets, 3.0, 0.01, 200, rng)
         found += bool(agree.any())
     assert found <= 1
 
 
 def test_a_turn_about_the_vertical_is_what_its_derivative_says() -> None:
     arm, turn = np.array([[1.0, 2.0, 0.5]]), 1e-6
-    J = by_drift(np.eye(3)[None, :2], arm)
+    J = drift_jacobian(np.eye(3)[None, :2], arm)
     moved = gtsam.Rot3.Yaw(turn).matrix() @ arm[0] - arm[0]
     np.testing.assert_allclose(J[0, :, 3], moved[:2] / turn, atol=1e-5)

@@ -33,9 +33,9 @@ from slam_graph.simulation.simulation_config import (
 )
 from slam_graph.simulation.simulator import simulate
 from slam_graph.smoothing import final_adjustment
-from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, pieces
+from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, segments
+from slam_graph.smoothing.frame_averaging import nearest_keyframe
 from slam_graph.smoothing.frame_log import FrameLog
-from slam_graph.smoothing.recording_problem import nearest_keyframe
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 LENGTH_S = 8.0
@@ -74,8 +74,10 @@ class Kept:
     def adjusted(
         self, causal: Trajectory, config: FinalBaConfig = DEFAULT, report: Any = None
     ) -> FinalBa:
-        told = report or (lambda *_: None)
-        return adjust_recording(self.log, causal, self.sequence.rig, BackendConfig(), config, told)
+        report = report or (lambda *_: None)
+        return adjust_recording(
+            self.log, causal, self.sequence.rig, BackendConfig(), config, report
+        )
 
 
 Keep = Callable[[SimulatedSequence], Kept]
@@ -103,8 +105,8 @@ def disturbed(truth: Trajectory, seed: int = 0) -> Trajectory:
         truth.positions + drift,
         truth.quaternions,
         truth.velocities + rng.normal(0.0, 0.05, (len(truth), 3)),
-        truth.gyro_biases,
-        truth.accel_biases,
+        accel_biases=truth.accel_biases,
+        gyro_biases=truth.gyro_biases,
     )
 
 
@@ -141,13 +143,13 @@ def test_the_time_before_the_start_is_covered(keep: Keep) -> None:
     assert ape(kept.truth, result.trajectory, "trans_part", "yaw").statistics.max < 2e-3
 
 
-def test_pieces_join_to_one_trajectory(keep: Keep) -> None:
+def test_segments_join_to_one_trajectory(keep: Keep) -> None:
     kept = keep(flight(2, sigma=1.0))
     whole = kept.adjusted(kept.truth)
-    config = FinalBaConfig(max_keyframes=20, overlap_keyframes=10)
+    config = FinalBaConfig(max_keyframes=20)
     steps: list[tuple[int, int, int]] = []
     cut = kept.adjusted(kept.truth, config, lambda *numbers: steps.append(numbers))
-    assert cut.summary.pieces > 1
+    assert cut.summary.segments > 1
     np.testing.assert_array_equal(cut.trajectory.stamps_ns, whole.trajectory.stamps_ns)
     assert worst_m(whole.trajectory, cut.trajectory) < 0.02
     assert [step[2] for step in steps] == list(range(1, cut.summary.iterations + 1))
@@ -155,12 +157,12 @@ def test_pieces_join_to_one_trajectory(keep: Keep) -> None:
 
 
 @pytest.mark.parametrize("keyframes", [3, 20, 21, 57, 100])
-def test_pieces_cover_all_keyframes_and_overlap(keyframes: int) -> None:
-    ranges = list(pieces(keyframes, FinalBaConfig(max_keyframes=20, overlap_keyframes=6)))
+def test_segments_cover_all_keyframes_and_overlap(keyframes: int) -> None:
+    ranges = list(segments(keyframes, 20))
     assert ranges[0][0] == 0
     assert ranges[-1][1] == keyframes
     assert all(stop - first <= 20 for first, stop in ranges)
-    assert all(a[1] - b[0] >= 6 for a, b in pairwise(ranges))
+    assert all(a[1] - b[0] >= 10 for a, b in pairwise(ranges))
 
 
 def test_outliers_and_frames_without_features_are_survived(keep: Keep) -> None:
@@ -227,7 +229,7 @@ def test_a_failure_leaves_the_causal_estimate_and_one_warning(
     def broken(*_: object) -> Iterator[tuple[int, int]]:
         raise fault
 
-    monkeypatch.setattr(final_adjustment, "pieces", broken)
+    monkeypatch.setattr(final_adjustment, "segments", broken)
     result = run(open_dataset("demo"), load_config(overrides=["duration_s=3", "min_coverage=0.1"]))
     assert result.status == "ok"
     assert len(result.history) > 0

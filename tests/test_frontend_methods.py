@@ -27,15 +27,20 @@ from images import (
 
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.build_frontend import build_frontend
-from slam_graph.frontend.descriptors import DESCRIPTORS, Orb
-from slam_graph.frontend.frontend_config import FrontendConfig, MatchingConfig
+from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
 from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
+from slam_graph.sensors.imu_buffer import (
+    ImuBuffer,
+    predict,
+    preintegrate,
+    preintegration_params,
+)
 from slam_graph.sensors.measurements import CameraFrame, ImuData
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 S = 1_000_000_000
 
@@ -68,10 +73,9 @@ def test_matches_are_found_in_any_order_and_only_in_the_window() -> None:
     order = rng.permutation(100)
     offered = wanted[order] ^ (rng.random((100, 32)) < 0.03).astype(np.uint8)
     moved = places[order] + np.float32(3.0)
-    config = MatchingConfig(search_radius_px=10.0)
-    found = match(wanted, offered, places, moved, Orb(), config)
+    found = match(wanted, offered, places, moved, 64.0, search_radius_px=10.0)
     np.testing.assert_array_equal(order[found], np.arange(100))
-    far = match(wanted, offered, places + np.float32(15.0), moved, Orb(), config)
+    far = match(wanted, offered, places + np.float32(15.0), moved, 64.0, search_radius_px=10.0)
     assert np.all(far != found)
 
 
@@ -79,14 +83,14 @@ def test_ambiguous_matches_are_refused_and_no_keypoint_is_given_twice() -> None:
     rng = np.random.default_rng(2)
     one = bits(rng, 1)
     twins = np.concatenate([one, one ^ np.uint8(0)])
-    at, config = np.zeros((2, 2), np.float32), MatchingConfig(mutual=False)
+    at = np.zeros((2, 2), np.float32)
     apart = np.array([[0, 0], [8, 0]], np.float32)
-    assert match(one, twins, at[:1], apart, Orb(), config)[0] == -1
+    assert match(one, twins, at[:1], apart, 64.0, mutual=False)[0] == -1
     # the same corner found twice does not rival itself
-    assert match(one, twins, at[:1], at, Orb(), config)[0] == 0
+    assert match(one, twins, at[:1], at, 64.0, mutual=False)[0] == 0
     other = one.copy()
     other[0, 0] ^= 1
-    found = match(np.concatenate([other, one]), one, at, at[:1], Orb(), config)
+    found = match(np.concatenate([other, one]), one, at, at[:1], 64.0, mutual=False)
     assert found.tolist() == [-1, 0]
 
 
@@ -147,7 +151,7 @@ def test_suppression_keeps_the_first_and_its_distance() -> None:
 
 def test_imu_motion_follows_a_flight() -> None:
     flight = Flight(gyro_bias=np.array([0.01, -0.02, 0.03]), accel_bias=np.array([0.1, 0, -0.1]))
-    motion = ImuMotion()
+    motion = ImuMotion(ImuNoise(), 9.81)
     motion.add(flight.imu(0.0, 2.0))
     assert motion.pose(S) is None
     motion.state = flight.nav_state(1.0)
@@ -159,6 +163,29 @@ def test_imu_motion_follows_a_flight() -> None:
     assert pose is not None
     assert np.linalg.norm(pose.logmap(truth)) < 1e-3
     assert motion.rotation(S, 3 * S) is None
+
+
+@pytest.mark.parametrize("gravity", [9.81, 1.62])
+def test_imu_motion_is_the_prediction_of_the_back_end(gravity: float) -> None:
+    """Both integrate alike, under the gravity of the settings."""
+    flight = Flight(gyro_bias=np.array([0.01, -0.02, 0.03]), accel_bias=np.array([0.1, 0, -0.1]))
+    motion, buffer, state = ImuMotion(ImuNoise(), gravity), ImuBuffer(), flight.nav_state(1.0)
+    for start_s in (0.0, 0.5, 1.0):
+        for taker in (motion, buffer):
+            taker.add(flight.imu(start_s, start_s + 0.5))
+    motion.state = state
+    end_ns = round(1.3 * S)
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+    params = preintegration_params(ImuNoise(), gravity)
+    pim = preintegrate(buffer.between(S, end_ns), bias, params)
+    pose, rotation = motion.pose(end_ns), motion.rotation(S, end_ns)
+    assert pose is not None
+    assert rotation is not None
+    predicted = predict(state, pim, end_ns).world_T_body
+    np.testing.assert_array_equal(pose.matrix(), predicted.matrix())
+    np.testing.assert_allclose(rotation.matrix(), pim.deltaRij().matrix(), atol=1e-6)
+    fallen = flight.nav_state(1.3).world_T_body.translation() - pose.translation()
+    np.testing.assert_allclose(fallen, [0, 0, 0.5 * (gravity - 9.81) * 0.3**2], atol=2e-3)
 
 
 def gyro(rate: list[float], end_s: float) -> ImuData:
@@ -194,7 +221,7 @@ def test_a_rejected_feature_is_dropped_if_so_configured(texture: Spline) -> None
         frontend = build_frontend(MONO, config)
         (before,) = feed(frontend, (view(texture),))
         rejected = before.cameras[0].ids[:10]
-        frontend.hear(Feedback(rejected=rejected))
+        frontend.receive_feedback(Feedback(rejected=rejected))
         after = frontend.track(CameraFrame(1, (view(texture, shift(1, 0)),)))
         assert np.any(np.isin(rejected, after.cameras[0].ids)) != drop
         assert frontend.frame_stats["rejected_gate"] == (10 if drop else 0)
@@ -211,7 +238,7 @@ def test_features_off_the_map_are_dropped(texture: Spline) -> None:
     at_rest = Flight(position=np.zeros(3), angles=np.zeros(3))
     imu = at_rest.imu(0.0, 0.1)
     state = at_rest.nav_state(0.0)
-    frontend.hear(Feedback(state, ids=seen.ids, points=points))
+    frontend.receive_feedback(Feedback(state, ids=seen.ids, points=points))
     second = frontend.track(CameraFrame(50_000_000, (view(texture),)), imu)
     assert frontend.frame_stats["rejected_map"] == 10
     assert not np.any(np.isin(seen.ids[:10], second.cameras[0].ids))

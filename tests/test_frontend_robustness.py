@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.frontend.association import Match
+from slam_graph.frontend.association import Association
 from slam_graph.frontend.lucas_kanade import CornerTracking
 from slam_graph.pipeline.run import run
 from slam_graph.results.run_result import RunResult
@@ -106,14 +106,14 @@ def test_random_matches_do_little_harm(
     """Three matches in ten are replaced by random ones, in every frame anew."""
     rng, follow = np.random.default_rng(0), CornerTracking.follow
 
-    def spoilt(self: CornerTracking, before: Any, image: Image, guess: Any) -> Match:
-        match = follow(self, before, image, guess)
+    def spoilt(self: CornerTracking, before: Any, image: Image, guess: Any) -> Association:
+        found = follow(self, before, image, guess)
         wrong = rng.random(len(before)) < 0.3
-        points = match.points.copy()
+        points = found.points.copy()
         size = np.array(image.shape[::-1])
         points[wrong] = rng.uniform(10, size - 10, (np.count_nonzero(wrong), 2))
-        fates = {cause: lost & ~wrong for cause, lost in match.fates.items()}
-        return Match(points, match.good | wrong, fates)
+        lost = {cause: features & ~wrong for cause, features in found.lost.items()}
+        return Association(points, found.good | wrong, lost)
 
     monkeypatch.setattr(CornerTracking, "follow", spoilt)
     result = run(open_dataset(folder), load_config(duration_s=8))

@@ -33,8 +33,7 @@ from pydantic import ValidationError
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.build_frontend import build_frontend
-from slam_graph.frontend.detectors import DETECTORS
-from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera
@@ -149,7 +148,7 @@ def test_normalized_coordinates_belong_to_the_pixels(texture: Spline) -> None:
 def test_features_spread_over_the_image_and_keep_their_distance(texture: Spline) -> None:
     (frame,) = feed(build_frontend(MONO, CONFIG), (view(texture),))
     pixels = frame.cameras[0].pixels
-    assert len(pixels) == CONFIG.features
+    assert len(pixels) == CONFIG.max_features
     cells = set(
         zip((pixels[:, 0] // 80).astype(int), (pixels[:, 1] // 80).astype(int), strict=True)
     )
@@ -285,8 +284,10 @@ def test_bad_frames_are_refused(texture: Spline) -> None:
 def test_bad_options_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match="featurs"):
         FrontendConfig(featurs=100)  # type: ignore[call-arg]
-    with pytest.raises(ConfigError, match="unknown front end 'magic'"):
-        build_frontend(MONO, FrontendConfig(method="magic"))
+    with pytest.raises(ValidationError, match=r"unknown front end 'magic'; known: sift, .*, klt"):
+        FrontendConfig(method="magic")
+    with pytest.raises(ValidationError, match="unknown detector 'harriss'; did you mean 'harris'"):
+        FrontendConfig(detector="harriss")
     with pytest.raises(ConfigError, match="missing or not a readable image"):
         build_frontend(MONO, FrontendConfig(masks=(tmp_path / "nowhere.png",)))
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))

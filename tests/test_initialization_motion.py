@@ -11,12 +11,12 @@ from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegration_params
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.dynamic_start import StartGuess, StartWindow, guess_states
+from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess, guess_states
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
 from slam_graph.config import load_config
@@ -24,11 +24,11 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
 PARAMS = preintegration_params(rig().imu, 9.81)
 TIMES = np.linspace(0.0, 1.5, 11)
-SPACING_S = InitializationConfig().frame_spacing_s
 MOTION = BackendConfig(initialization=InitializationConfig(mode="motion"))
 
 
@@ -78,12 +78,12 @@ def test_alignment_bears_pixel_noise(cameras: int) -> None:
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("movers", [60, 130])
-def test_the_imu_tells_the_static_world_from_an_object(cameras: int, movers: int) -> None:
+@pytest.mark.parametrize("dynamic", [60, 130])
+def test_the_imu_tells_the_static_world_from_an_object(cameras: int, dynamic: int) -> None:
     """Even where most features are on the object, which moves as the room of another flight."""
-    rng, mounted, window = np.random.default_rng(5), rig(cameras), TrackWindow()
+    rng, mounted, window = np.random.default_rng(5), rig(cameras), FeatureTracks()
     flight, other = Flight(), Flight(position_rate=np.array([2.5, -1.2, 1.6]))
-    still, moving = room(400, rng), room(movers * 4, rng)
+    still, moving = room(400, rng), room(dynamic * 4, rng)
     for number, t_s in enumerate(TIMES.tolist()):
         seen = features(flight, mounted, still, t_s, rng, 0.5)
         object_seen = features(other, mounted, moving, t_s, rng, 0.5)
@@ -101,23 +101,23 @@ def test_the_imu_tells_the_static_world_from_an_object(cameras: int, movers: int
     motion = exact_motion(flight, TIMES)
     static = static_features(obs, motion, RigProjection(mounted), 9.81, 3.0 / 458.0, rng)
     true = obs.ids < len(still)
-    assert (np.sum(~true) > np.sum(true)) == (movers > 100)
+    assert (np.sum(~true) > np.sum(true)) == (dynamic > 100)
     assert np.mean(static[true]) > 0.95
     assert np.mean(static[~true]) < 0.05
 
 
 def window_of(
     flight: Flight, points: FloatArray, cameras: int, rng: np.random.Generator | None
-) -> tuple[StartWindow, ImuBuffer]:
+) -> tuple[StartFrames, ImuBuffer]:
     """A start window, with the noise of a tracker and an IMU where `rng` is given."""
     mounted, imu = rig(cameras), ImuBuffer()
     stamps, frames = [], []
-    for packet in packets(flight, mounted, points, 1.5, rng, 1.0 / SPACING_S, 0.2):
+    for packet in packets(flight, mounted, points, 1.5, rng, 1.0 / FRAME_SPACING_S, 0.2):
         assert isinstance(packet.frame, FeatureFrame)
         imu.add(packet.imu)
         stamps.append(packet.frame.stamp_ns)
         frames.append(packet.frame)
-    return StartWindow(stamps, frames), imu
+    return StartFrames(stamps, frames), imu
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -176,7 +176,7 @@ def test_a_guess_says_what_it_lacks() -> None:
 def test_a_window_is_thinned_from_its_end() -> None:
     stamps = [50_000_000 * k for k in range(21)]
     frames = [FeatureFrame(t, ()) for t in stamps]
-    thin = StartWindow.thinned(stamps, frames, 0.15)
+    thin = StartFrames.thinned(stamps, frames, 0.15)
     assert thin.stamps_ns[-1] == stamps[-1]
     assert set(np.diff(thin.stamps_ns)) == {150_000_000}
     assert [f.stamp_ns for f in thin.frames] == thin.stamps_ns

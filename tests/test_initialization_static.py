@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, PriorConfig
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.initializer import start_from
-from slam_graph.backend.initialization.static_start import (
+from slam_graph.backend.initialization.first_state import (
     fix_gauge,
     level_rotation,
     prior_covariance,
+    start_from,
     state_at_rest,
 )
 from slam_graph.backend.solve.state import imu_state_keys
@@ -83,9 +83,9 @@ def random_state(seed: int) -> NavState:
         0,
         gtsam.Pose3(gtsam.Rot3(R), rng.normal(size=3)),
         rng.normal(size=3),
-        np.zeros(3),
-        np.zeros(3),
-        0.1 * root @ root.T,
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=0.1 * root @ root.T,
     )
 
 

@@ -15,8 +15,13 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.loop_closure.close_loops import LoopClosures, close_loops, correct_by
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
-from slam_graph.loop_closure.loop_pose_graph import level, split
-from slam_graph.loop_closure.loop_verification import FLOOR_SIGMAS, LoopVerifier, tilt
+from slam_graph.loop_closure.loop_pose_graph import level_graph, split_yaw
+from slam_graph.loop_closure.loop_verification import (
+    FLOOR_SIGMAS,
+    SIGMA_PX,
+    LoopVerifier,
+    tilt_error,
+)
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.sensors.rig import Rig
@@ -107,20 +112,19 @@ def test_a_tilted_loop_is_refused(flown: Tour) -> None:
     second = replace(first, world_T_body=lying)
     assert verifier.verify([first, second], 0, 1) is None
     assert verifier.verify([first, second], 0, 1, gravity=False) is not None
-    assert tilt(first.world_T_body, lying, gtsam.Pose3()) == pytest.approx(0.2)
+    assert tilt_error(first.world_T_body, lying, gtsam.Pose3()) == pytest.approx(0.2)
 
 
 def test_covariance_of_a_loop_is_that_of_its_noise(flown: Tour) -> None:
     rig, keyframes, _, _ = flown
     first, mounted = keyframes[20], rig.cameras[0]
-    sigma_px = 5.0
-    config = VerificationConfig(sigma_px=sigma_px, max_error_px=40.0)
+    config = VerificationConfig(max_error_px=40.0)
     verifier = LoopVerifier(mounted, config)
     camera = mounted.body_T_camera
     seen = (first.points - camera.translation()) @ camera.rotation().matrix()
     errors, covariances = [], []
     for seed in range(60):
-        noise = np.random.default_rng(seed).normal(size=(len(seen), 2)) * sigma_px / 458.0
+        noise = np.random.default_rng(seed).normal(size=(len(seen), 2)) * SIGMA_PX / 458.0
         second = replace(first, normalized=seen[:, :2] / seen[:, 2:] + noise)
         loop = verifier.verify([first, second], 0, 1)
         assert loop is not None
@@ -163,12 +167,12 @@ def test_level_graphs_have_level_optima() -> None:
     measured = exact.compose(Poses(noise, 0.02 * rng.normal(size=(count, 3))))
     information = np.tile(np.diag([2500.0] * 3 + [1e4] * 3), (count, 1, 1))
     edges = np.column_stack([i, j])
-    graph = level(PoseGraph(np.arange(count), truth, edges, measured, information))
+    graph = level_graph(PoseGraph(np.arange(count), truth, edges, measured, information))
     poses = optimize_pose_graph(graph).poses
     np.testing.assert_allclose(poses.rotations[:, 2], np.tile([0, 0, 1.0], (count, 1)), atol=1e-3)
     # measurements without noise lead back to the truth
-    graph = level(PoseGraph(np.arange(count), truth, edges, exact, information))
-    upright, rest = split(truth)
+    graph = level_graph(PoseGraph(np.arange(count), truth, edges, exact, information))
+    upright, rest = split_yaw(truth)
     poses = optimize_pose_graph(graph).poses.compose(rest)
     np.testing.assert_allclose(poses.rotations, truth.rotations, atol=1e-6)
     np.testing.assert_allclose(poses.translations, upright.translations, atol=1e-6)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure on rendered images: a place that is seen again is recognised by its looks."""
+"""Loop closure on rendered images: a place that is seen again is recognised by its appearance."""
 
 from typing import cast
 

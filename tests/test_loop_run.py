@@ -17,7 +17,6 @@ from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import SavedRun, load_result
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
 
 SETTINGS = ("--set", "loop_closure.places.words=300")
 
@@ -35,7 +34,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tracks=TrackConfig(features=70, descriptors=True),
     )
     folder = tmp_path_factory.mktemp("loops") / "tour"
-    write(simulate(config), folder)
+    simulate(config).save(folder)
     return folder
 
 
@@ -111,7 +110,7 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
     assert tested == names
 
 
-def test_tracks_without_looks_are_said_to_have_no_loops() -> None:
+def test_tracks_without_descriptors_are_said_to_have_no_loops() -> None:
     tracks = TrackConfig(features=30)
     sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
     result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))

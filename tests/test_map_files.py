@@ -81,7 +81,6 @@ def test_a_crash_while_saving_leaves_the_old_map(file: Path) -> None:
     code = f"""
 import os, signal
 import numpy as np
-from slam_graph.maps import map_file
 from slam_graph.results.map_output import load_map, save_map
 content, left = load_map({str(file)!r}), [8]
 write = np.lib.format.write_array

@@ -7,14 +7,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from map_flights import PLACES, World
+from map_flights import World
 
 from slam_graph.errors import DataError
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.maps.map_config import LocalizationConfig
 from slam_graph.maps.map_localization import MapLocalizer
 from slam_graph.maps.map_places import MapPlaces
-from slam_graph.maps.pose_filter import MapPoseFilter, upright
+from slam_graph.maps.pose_filter import MapPoseFilter, with_roll_and_pitch
 
 CONFIG = LocalizationConfig()
 SIGMAS = np.array([0.004] * 3 + [0.02] * 3)
@@ -32,7 +32,7 @@ def noisy(pose: gtsam.Pose3, sigmas: np.ndarray, rng: np.random.Generator) -> gt
 
 @pytest.mark.parametrize("level", [True, False])
 def test_the_filter_is_as_wrong_as_it_says(level: bool) -> None:
-    """NEES over many flights with odometry that drifts and sightings that are off as they say."""
+    """NEES over many flights with odometry that drifts and matchs that are off as they say."""
     config = CONFIG.model_copy(update={"map_rotation_sigma": 1e-6, "map_position_sigma": 1e-6})
     rng, size, values = np.random.default_rng(1), 4 if level else 6, []
     for _ in range(150):
@@ -58,15 +58,15 @@ def test_the_filter_is_as_wrong_as_it_says(level: bool) -> None:
                     tilt = rng.normal(0.0, config.odometry_rotation_sigma * np.sqrt(0.2), 2)
                     turn = gtsam.Rot3.Expmap(np.array([*tilt, 0.0]))
                     odom = gtsam.Pose3(turn.compose(odom.rotation()), odom.translation())
-            sighting = noisy(true, SIGMAS, rng)
+            match = noisy(true, SIGMAS, rng)
             stamp_ns = step * 200_000_000
             if filter_ is None:
                 covariance = np.diag(SIGMAS**2)
-                filter_ = MapPoseFilter(config, level, odom, sighting, covariance, stamp_ns)
+                filter_ = MapPoseFilter(config, level, odom, match, covariance, stamp_ns)
                 continue
             filter_.move(stamp_ns, odom)
             if step % 4 == 0:
-                filter_.correct(sighting, np.diag(SIGMAS**2))
+                filter_.correct(match, np.diag(SIGMAS**2))
         assert filter_ is not None
         turn = gtsam.Rot3.Logmap(true.rotation().compose(filter_.pose.rotation().inverse()))
         angle = turn[2:] if level else turn
@@ -78,8 +78,8 @@ def test_the_filter_is_as_wrong_as_it_says(level: bool) -> None:
 
 def test_roll_and_pitch_are_those_of_the_run() -> None:
     rng = np.random.default_rng(0)
-    odom, sighting = random_pose(rng), random_pose(rng)
-    filter_ = MapPoseFilter(CONFIG, True, odom, sighting, np.diag(SIGMAS**2), 0)
+    odom, match = random_pose(rng), random_pose(rng)
+    filter_ = MapPoseFilter(CONFIG, True, odom, match, np.diag(SIGMAS**2), 0)
     for step in range(1, 10):
         odom = random_pose(rng)
         filter_.move(step * 10**8, odom)
@@ -87,7 +87,7 @@ def test_roll_and_pitch_are_those_of_the_run() -> None:
         np.testing.assert_allclose(
             filter_.pose.rotation().matrix()[2], odom.rotation().matrix()[2], atol=1e-12
         )
-    assert upright(odom, odom).equals(odom, 1e-12)
+    assert with_roll_and_pitch(odom, odom).equals(odom, 1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def world() -> World:
 
 def localizer(world: World, **changes: float) -> MapLocalizer:
     config = CONFIG.model_copy(update={"period_s": 0.0, **changes})
-    places = MapPlaces(world.map(), world.rig, PLACES, VerificationConfig(), config.neighbours)
+    places = MapPlaces(world.map(), world.rig, VerificationConfig(), config.neighbours)
     return MapLocalizer(places, config)
 
 
@@ -112,19 +112,19 @@ def fly(world: World, located: MapLocalizer, number: int, steps: range) -> list[
         view = world.view(number + step, pose)
         located.move(view.stamp_ns, pose)
         if located.wants(view.stamp_ns):
-            located.see(view)
+            located.match(view)
         if located.located and located.filter is not None:
             away = located.filter.pose.translation() - world.pose(number + step).translation()
             errors.append(float(np.linalg.norm(away)))
     return errors
 
 
-def test_a_run_is_located_once_three_sightings_agree(world: World) -> None:
+def test_a_run_is_located_once_three_matchs_agree(world: World) -> None:
     located = localizer(world)
     errors = fly(world, located, 0, range(5))
     assert len(errors) == 3
     assert max(errors) < 1e-3
-    assert (located.queries, located.believed, located.restarts) == (5, 5, 1)
+    assert (located.queries, located.accepted, located.starts) == (5, 5, 1)
 
 
 def test_the_calibration_of_the_map_does_not_matter(world: World) -> None:
@@ -135,32 +135,32 @@ def test_the_calibration_of_the_map_does_not_matter(world: World) -> None:
     strange = replace(strange, rig=replace(strange.rig, cameras=(camera,)))
     poses = []
     for content in (known, replace(known, recordings=(strange,))):
-        places = MapPlaces(content, world.rig, PLACES, VerificationConfig(), 10)
-        sighting = places.locate(world.view(2), 1, gravity=True)
-        assert sighting is not None
-        poses.append(sighting.world_T_body)
+        places = MapPlaces(content, world.rig, VerificationConfig(), 10)
+        match = places.locate(world.view(2), 1, gravity=True)
+        assert match is not None
+        poses.append(match.world_T_body)
     assert poses[0].equals(poses[1], 1e-12)
     assert poses[0].equals(world.pose(2), 1e-3)
 
 
-def test_a_false_sighting_is_left_out(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_false_match_is_left_out(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     located = localizer(world)
     fly(world, located, 0, range(3))
     right = MapPlaces.locate
 
     def wrong(self: MapPlaces, *arguments: object, **options: object) -> object:
-        sighting = right(self, *arguments, **options)  # type: ignore[arg-type]
-        if sighting is None:
+        match = right(self, *arguments, **options)  # type: ignore[arg-type]
+        if match is None:
             return None
         shift = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0.5, 0.0]))
-        return replace(sighting, world_T_body=shift.compose(sighting.world_T_body))
+        return replace(match, world_T_body=shift.compose(match.world_T_body))
 
     monkeypatch.setattr(MapPlaces, "locate", wrong)
     assert max(fly(world, located, 0, range(3, 5))) < 0.01
-    assert located.restarts == 1
+    assert located.starts == 1
     # if they go on and agree with each other, it is the filter that is wrong
     fly(world, located, 0, range(3, 5))
-    assert located.restarts == 2
+    assert located.starts == 2
 
 
 def test_who_has_been_carried_off_is_found_again(world: World) -> None:
@@ -173,17 +173,17 @@ def test_who_has_been_carried_off_is_found_again(world: World) -> None:
         pose = far.compose(world.pose(step))
         view = replace(view, world_T_body=pose, stamp_ns=view.stamp_ns + 10**10)
         located.move(view.stamp_ns, pose)
-        located.see(view)
+        located.match(view)
         assert located.filter is not None
         away = located.filter.pose.translation() - world.pose(step).translation()
         errors.append(float(np.linalg.norm(away)))
-    assert located.restarts == 2
+    assert located.starts == 2
     assert errors[0] > 1.0
     assert max(errors[2:]) < 0.01
 
 
 def test_odometry_that_makes_no_sense_leaves_it_lost(world: World) -> None:
-    """A run that has diverged contradicts every sighting, and the sightings each other."""
+    """A run that has diverged contradicts every match, and the matchs each other."""
     located = localizer(world)
     fly(world, located, 0, range(3))
     assert located.located
@@ -193,9 +193,9 @@ def test_odometry_that_makes_no_sense_leaves_it_lost(world: World) -> None:
         pose = gtsam.Pose3(ODOM_T_MAP.compose(world.pose(step % 5)).rotation(), rng.normal(size=3))
         stamp_ns = (10 + step) * 10**9
         located.move(stamp_ns, pose)
-        located.see(replace(view, world_T_body=pose, stamp_ns=stamp_ns))
+        located.match(replace(view, world_T_body=pose, stamp_ns=stamp_ns))
     assert not located.located
-    assert located.restarts == 1
+    assert located.starts == 1
 
 
 def test_it_is_lost_when_nothing_has_been_seen_for_long(world: World) -> None:
@@ -208,6 +208,6 @@ def test_it_is_lost_when_nothing_has_been_seen_for_long(world: World) -> None:
 
 
 def test_descriptors_of_another_kind_are_refused(world: World) -> None:
-    places = MapPlaces(world.map(), world.rig, PLACES, VerificationConfig(), 10)
+    places = MapPlaces(world.map(), world.rig, VerificationConfig(), 10)
     with pytest.raises(DataError, match=r"flight.*512 bits.*256"):
         places.check(np.zeros((3, 64), np.uint8), "flight")

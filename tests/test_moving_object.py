@@ -17,10 +17,9 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.rendering import cast
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import SimulatedImages
 from slam_graph.simulation.simulation_config import SimulationConfig
-from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.simulator import euroc_rig, simulate
 from slam_graph.simulation.world import World
 
 RUN_S = 4.0

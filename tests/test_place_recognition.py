@@ -30,7 +30,7 @@ def places() -> list[np.ndarray]:
 def vocabulary(places: list[np.ndarray]) -> Vocabulary:
     rng = np.random.default_rng(2)
     seen = [noisy(place, rng) for place in places]
-    return Vocabulary.train(seen, 1000, 5000, 3, rng)
+    return Vocabulary.train(seen, 1000, rng, 5000, 3)
 
 
 def test_a_place_is_found_again(places: list[np.ndarray], vocabulary: Vocabulary) -> None:
@@ -71,7 +71,7 @@ def test_words_are_medians_of_what_they_stand_for() -> None:
     rng = np.random.default_rng(6)
     true = rng.integers(0, 256, (20, 32), dtype=np.uint8)
     seen = noisy(np.repeat(true, 50, axis=0), rng)
-    vocabulary = Vocabulary.train([seen], 60, 10_000, 8, rng)
+    vocabulary = Vocabulary.train([seen], 60, rng, 10_000, 8)
     bits = np.unpackbits(vocabulary.words[:, None] ^ true[None], axis=2).sum(axis=2)
     # several words may share a cluster, but the nearest to each is nearer than what was seen of it
     assert np.median(bits.min(axis=0)) < 0.08 * 256 / 2

@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Registries of named parts, and installed packages that add to them."""
 
+import json
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import pytest
+from images import CAMERA, painted, shift, view
 
 from slam_graph.errors import ConfigError
 from slam_graph.plugins import Choice, Registry
@@ -112,3 +117,96 @@ def test_a_setting_names_a_part(site: Path) -> None:
     tree = ConfigTree({"shape": "dics"}, {("shape",): "draw.yaml:3"})
     with pytest.raises(ConfigError, match=r"^draw.yaml:3: shape: unknown shape 'dics'; .*'disc'\?"):
         validate(Drawing, tree)
+
+
+# --- a package that is installed ------------------------------------------------------------------
+
+EXAMPLE = Path(__file__).parent / "plugin_example"
+ROOT = Path(__file__).parent.parent
+TIMEOUT_S = 600
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Environment variables with which Python finds the example, installed into a fresh folder."""
+    pytest.importorskip("hatchling")
+    target = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
+    command += ["--disable-pip-version-check", "--no-build-isolation", "--target", str(target)]
+    subprocess.run([*command, str(EXAMPLE)], check=True, timeout=TIMEOUT_S)
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT)])}
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in the format of the example: a texture that moves before a camera at rest."""
+    texture, stamps = painted(), np.arange(0, 300_000_000, 5_000_000)
+    path = tmp_path_factory.mktemp("flight") / "flight.npz"
+    np.savez(
+        path,
+        images=np.array([view(texture, shift(2.0 * k, 1.0 * k)) for k in range(6)]),
+        image_stamps_ns=np.arange(6) * 50_000_000,
+        imu_stamps_ns=stamps,
+        gyro=np.zeros((len(stamps), 3)),
+        accel=np.tile([0.0, 0.0, 9.81], (len(stamps), 1)),
+        intrinsics=np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]),
+        body_T_camera=np.eye(4),
+    )
+    return path
+
+
+def slam_graph(
+    environment: dict[str, str], folder: Path, *arguments: str
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "slam_graph.cli.main", *arguments],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+
+
+def test_a_plugin_is_used_from_yaml_and_command_line(
+    environment: dict[str, str], flight: Path, tmp_path: Path
+) -> None:
+    """Its data set, found by its content, its descriptor and its detector."""
+    (tmp_path / "own.yaml").write_text("frontend:\n  method: patch\n  min_distance_px: 8\n")
+    options = ("--config", "own.yaml", "--set", "frontend.detector=laplacian", "--json")
+    done = slam_graph(environment, tmp_path, "frontend", str(flight), *options)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["tracks"]["frames"] == 6
+    assert report["tracks"]["features"] > 30
+    assert "lost_match" in report["counts"]  # patches are matched, not tracked
+
+
+def test_a_plugin_brings_a_format_and_a_front_end(
+    environment: dict[str, str], flight: Path, tmp_path: Path
+) -> None:
+    options = ("--format", "npz", "--set", "frontend.method=every_other", "--record", "tracks")
+    done = slam_graph(environment, tmp_path, "frontend", str(flight), *options)
+    assert done.returncode == 0, done.stderr
+    rows = np.fromfile(tmp_path / "tracks" / "features.bin", [("id", "<i8"), ("rest", "<f8", (4,))])
+    assert len(rows) > 100
+    assert np.all(rows["id"] % 2 == 0)
+
+
+def test_a_plugin_that_cannot_be_loaded_is_named_where_it_is_used(
+    environment: dict[str, str], flight: Path, tmp_path: Path
+) -> None:
+    """Everything else goes on, as the other tests show."""
+    used = ("frontend", str(flight), "--set", "frontend.detector=unfinished")
+    done = slam_graph(environment, tmp_path, *used)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "detector 'unfinished' of slam-graph-example 0.1: cannot load" in line
+    assert "No module named 'a_library_that_nobody_has'" in line
+
+
+def test_the_schema_lists_the_parts_of_plugins(environment: dict[str, str], tmp_path: Path) -> None:
+    done = slam_graph(environment, tmp_path, "config", "schema")
+    settings = json.loads(done.stdout)["$defs"]["FrontendConfig"]["properties"]
+    assert {"auto", "shi_tomasi", "laplacian"} <= set(settings["detector"]["enum"])
+    assert {"klt", "orb", "patch", "every_other"} <= set(settings["method"]["enum"])

@@ -9,7 +9,7 @@ import pytest
 from pose_graphs import laps, turns
 from scipy.optimize import approx_fprime
 
-from slam_graph.pose_graph import certificate as dual
+from slam_graph.pose_graph import certificate
 from slam_graph.pose_graph.certificate import certify
 from slam_graph.pose_graph.chordal import chordal_cost, stacked, whitened_rows
 from slam_graph.pose_graph.graph import PoseGraph, Poses
@@ -79,15 +79,15 @@ def test_the_bound_holds_for_all_poses(dimension: int) -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_derivatives_are_those_of_the_objective(dimension: int) -> None:
     graph, truth = laps(dimension, 0.1, poses=6, lap=3)
-    free, rows = dual._free_tangents(graph), whitened_rows(graph)
+    free, rows = certificate._free_tangents(graph), whitened_rows(graph)
 
     def cost(step: np.ndarray) -> float:
-        return 0.5 * chordal_cost(graph, dual._retracted(truth, step, free))
+        return 0.5 * chordal_cost(graph, certificate._retracted(truth, step, free))
 
     def slope(step: np.ndarray) -> np.ndarray:
-        return dual._derivatives(rows, dual._retracted(truth, step, free), free)[0]
+        return certificate._derivatives(rows, certificate._retracted(truth, step, free), free)[0]
 
-    gradient, hessian = dual._derivatives(rows, truth, free)
+    gradient, hessian = certificate._derivatives(rows, truth, free)
     zero = np.zeros(len(free))
     scale = np.abs(gradient).max()
     np.testing.assert_allclose(gradient, approx_fprime(zero, cost, 1e-7), atol=1e-4 * scale)
@@ -100,11 +100,11 @@ def test_derivatives_are_those_of_the_objective(dimension: int) -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_smallest_eigenvalue_is_that_of_the_dense_matrix(dimension: int) -> None:
     graph, truth = laps(dimension, 0.3, poses=12, lap=4)
-    S, trace = dual.dual(whitened_rows(graph), truth)
+    S, trace = certificate._dual(whitened_rows(graph), truth)
     n, dense = len(truth), S.toarray()
     reduced = dense[n:, n:] - dense[n:, :n] @ np.linalg.pinv(dense[:n, :n]) @ dense[:n, n:]
     expected = np.linalg.eigvalsh(reduced)[0]
-    assert dual.smallest_eigenvalue(S, graph) == pytest.approx(expected, rel=1e-6)
+    assert certificate._smallest_eigenvalue(S, graph) == pytest.approx(expected, rel=1e-6)
     best = certify(graph, truth).objective
     assert trace + expected * dimension * n <= best
 

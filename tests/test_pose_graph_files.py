@@ -10,7 +10,7 @@ import pytest
 from pose_graphs import laps
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 from slam_graph.pose_graph.gtsam_graph import edge_factors, factor_graph, values_of
 
@@ -146,3 +146,9 @@ def test_ids_need_not_begin_at_zero_nor_be_in_order(tmp_path: Path) -> None:
     assert graph.keys.tolist() == [-3, 900]
     assert graph.edges.tolist() == [[1, 0]]
     assert graph.is_odometry.tolist() == [True]
+
+
+def test_an_unknown_meaning_of_the_information_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "graph.g2o").write_text(V3 + E3)
+    with pytest.raises(ConfigError, match="did you mean 'quaternion'"):
+        read_pose_graph(tmp_path / "graph.g2o", rotation_information="quaternions")

@@ -141,7 +141,9 @@ def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
     for index in range(len(estimate)):
         stamp, zero = int(estimate.stamps_ns[index]), np.zeros(3)
         covariance = np.eye(15) * 1e-4
-        result.history.append(NavState(stamp, estimate.pose(index), zero, zero, zero, covariance))
+        biases = {"accel_bias": zero, "gyro_bias": zero}
+        state = NavState(stamp, estimate.pose(index), zero, **biases, covariance=covariance)
+        result.history.append(state)
         result.logs.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
     result.ending.wall_s = 2.0
     return result

@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of simulated motions, IMU streams and feature tracks."""
 
+import re
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 from flight import FISHEYE, FORWARD
 from numpy.typing import NDArray
+from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from slam_graph.errors import ConfigError, DataError
@@ -19,14 +23,13 @@ from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 from slam_graph.simulation.imu_simulation import SimulatedImu
 from slam_graph.simulation.landmarks import on_walls
 from slam_graph.simulation.motion import GRAVITY, SplineMotion
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import SimulatedTracks
 from slam_graph.simulation.simulation_config import (
     SimulatedImuConfig,
     SimulationConfig,
     TrackConfig,
 )
-from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.simulator import euroc_rig, simulate
 from slam_graph.simulation.splines import continuous, fit, stamps_between, through_waypoints
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import box, three_rooms
@@ -373,8 +376,8 @@ def test_a_frame_ends_every_period() -> None:
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"real_imu": True}, ConfigError, "'figure8' is made up"),
-        ({"start_s": 3.0, "trajectory": "rooms"}, ConfigError, "'rooms' is made up"),
+        ({"real_imu": True}, ConfigError, "'figure8' is a generated one"),
+        ({"start_s": 3.0, "trajectory": "rooms"}, ConfigError, "'rooms' is a generated one"),
         ({"trajectory": "nowhere"}, DataError, "nowhere: no such trajectory"),
         ({"cameras": 3}, DataError, "asked for 3 cameras, the rig has 2"),
     ],
@@ -384,3 +387,47 @@ def test_what_cannot_be_simulated_is_said_in_one_line(
 ) -> None:
     with pytest.raises(error, match=message):
         tracks(**options)
+
+
+def test_settings_come_from_a_file_keywords_and_overrides_in_this_order(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text("trajectory: random\nseed: 3\ntracks:\n  loss: 0.01\n  features: 20\n")
+    config = simulate(str(file), ["tracks.loss=0.03"], seed=4, duration_s=2.0).config
+    assert (config.trajectory, config.seed, config.duration_s) == ("random", 4, 2.0)
+    assert (config.tracks.loss, config.tracks.features) == (0.03, 20)
+    again = simulate(config, tracks={"features": 30}).config
+    assert (again.tracks.loss, again.tracks.features) == (0.03, 30)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("trajektory=random", "unknown key 'trajektory'; did you mean 'trajectory'"),
+        ("tracks.descriptor_looks=9", "'tracks.descriptor_looks' is now tracks.distinct_desc"),
+        ("images.blur_samples=9", "'images.blur_samples' is a constant now: BLUR_SAMPLES"),
+        ("trajectory=figure9", "figure9: no such trajectory; did you mean 'figure8'"),
+    ],
+)
+def test_unknown_and_moved_settings_are_explained(override: str, message: str) -> None:
+    with pytest.raises((ConfigError, DataError), match=message):
+        simulate(overrides=[override])
+
+
+def test_a_trajectory_in_place_of_a_file_is_explained() -> None:
+    with pytest.raises(ConfigError, match="write trajectory='rooms'"):
+        simulate("rooms")
+
+
+def test_the_plain_settings_are_those_in_the_documents() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "simulation.md").read_text(encoding="utf-8")
+    table = page[page.index("| setting |") : page.index("All others")]
+    assert re.findall(r"^\| `([a-z_.]+)` \|", table, re.MULTILINE) == list(plain(SimulationConfig))
+
+
+def plain(settings: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Names of the settings that are not for experts."""
+    for name, info in settings.model_fields.items():
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
+            yield from plain(info.annotation, f"{prefix}{name}.")
+        elif not (isinstance(info.json_schema_extra, dict) and info.json_schema_extra["expert"]):
+            yield prefix + name

@@ -21,11 +21,9 @@ from slam_graph.pipeline.run import run
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import SimulationConfig
-from slam_graph.simulation.simulator import simulate
-from slam_graph.simulation.writers import write
+from slam_graph.simulation.simulator import euroc_rig, simulate
 
 IMAGES: dict[str, Any] = {"kind": "images", "images": {"texel_m": 0.02}}
 
@@ -78,7 +76,7 @@ def test_the_same_seed_writes_the_same_bytes(
 ) -> None:
     options = {"tracks": {"loss": 0.02, "outliers": 0.02}} if kind == "tracks" else small
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write(simulated(**options, seed=seed), tmp_path / name)
+        simulated(**options, seed=seed).save(tmp_path / name)
     first, second, other = (digest(tmp_path / name) for name in "abc")
     assert first == second
     assert first.keys() == other.keys()
@@ -89,7 +87,7 @@ def test_the_same_seed_writes_the_same_bytes(
 
 def test_written_tracks_are_those_of_the_sequence(tmp_path: Path) -> None:
     sequence = simulated()
-    write(sequence, tmp_path / "tracks")
+    sequence.save(tmp_path / "tracks")
     recording = open_dataset(tmp_path / "tracks")
     assert [f for f in check_sequence(recording) if f.severity != "info"] == []
     for a, b in zip(sequence.packets(), recording.packets(), strict=True):
@@ -107,7 +105,7 @@ def test_a_written_euroc_folder_is_the_sequence_and_sound(
     small: dict[str, Any], tmp_path: Path
 ) -> None:
     sequence = simulated(**small)
-    write(sequence, tmp_path / "images")
+    sequence.save(tmp_path / "images")
     recording = open_dataset(tmp_path / "images")
     assert recording.info().format == "euroc"
     found = check_sequence(recording, read_images=True)
@@ -135,7 +133,7 @@ def test_an_interrupted_simulation_leaves_nothing_behind(
 
     for options in ({}, small):
         with pytest.raises(KeyboardInterrupt):
-            write(simulated(**options), tmp_path / "out", stop)
+            simulated(**options).save(tmp_path / "out", stop)
         assert list(tmp_path.iterdir()) == []
 
 
@@ -197,7 +195,7 @@ def test_the_command_writes_a_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--real-imu"], 2, "'figure8' is made up"),
+        (["--real-imu"], 2, "'figure8' is a generated one"),
         (["--trajectory", "nowhere"], 1, "nowhere: no such trajectory"),
         (["--loss", "2"], 2, "tracks.loss: input should be less than 1"),
         (["--set", "imu.noise=2"], 2, "unknown key 'imu.noise'"),

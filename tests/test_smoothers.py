@@ -11,16 +11,16 @@ import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
 from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.backend.backend_config import BackendConfig, GatingConfig
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.gtsam_smoothers.smoother_factors import (
     ProjectionFactors,
     joint_prior,
     pixel_noise,
 )
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS
-from slam_graph.backend.initialization.initializer import prior_of
-from slam_graph.backend.initialization.static_start import prior_covariance
+from slam_graph.backend.initialization.first_state import prior_covariance, prior_of
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import imu_state_keys
 from slam_graph.config import load_config
@@ -43,7 +43,7 @@ def test_native_projections_have_the_residuals_of_the_engine(camera: Camera) -> 
         values.insert(X(obs.frames[i]), gtsam.Pose3(gtsam.Rot3(rotation), position))
     for j, point in zip(obs.ids.tolist(), at.points, strict=True):
         values.insert(L(j), point)
-    noise = pixel_noise(2.0, GatingConfig(robust_loss="none"))
+    noise = pixel_noise(2.0, RobustLoss("none"))
     factors = ProjectionFactors(two, noise).of(obs)
     assert len(factors) == len(obs) > 100
     residuals, _ = RigProjection(two).residuals(obs, at)
@@ -62,7 +62,8 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
     mixed = np.eye(15) + 0.2 * rng.normal(size=(15, 15))
     covariance = mixed @ prior_covariance(BackendConfig().initialization.prior) @ mixed.T
     turned = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
-    given = NavState(0, turned, np.ones(3), np.full(3, 0.01), np.full(3, 0.1), covariance)
+    biases = {"accel_bias": np.full(3, 0.1), "gyro_bias": np.full(3, 0.01)}
+    given = NavState(0, turned, np.ones(3), **biases, covariance=covariance)
     values = gtsam.Values()
     values.insert(X(0), turned)
     values.insert(V(0), given.velocity)

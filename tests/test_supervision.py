@@ -134,7 +134,8 @@ def test_a_pause_gives_no_time() -> None:
 
 @pytest.mark.parametrize("part", ["gyro_bias", "accel_bias"])
 def test_a_bias_that_no_sensor_has_is_not_sane(part: str) -> None:
-    state = NavState(0, gtsam.Pose3(), np.zeros(3), np.zeros(3), np.zeros(3))
+    zeros = {name: np.zeros(3) for name in ("velocity", "accel_bias", "gyro_bias")}
+    state = NavState(0, gtsam.Pose3(), **zeros)
     check_sane(state, LIMITS)
     changed: dict[str, Any] = {part: np.array([0.0, -4.0, 0.0])}
     with pytest.raises(DivergenceError, match=r"bias of 4"):

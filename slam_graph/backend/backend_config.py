@@ -4,105 +4,143 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from slam_graph.settings.base import Settings
+from slam_graph.settings.base import Settings, expert
+
+__all__ = [
+    "AdaptiveNoiseConfig",
+    "BackendConfig",
+    "CalibrationConfig",
+    "GatingConfig",
+    "InitializationConfig",
+    "NoiseConfig",
+    "PriorConfig",
+    "TriangulationConfig",
+    "ZeroVelocityConfig",
+]
 
 
 class AdaptiveNoiseConfig(Settings):
-    """White noise of the IMU that follows what the images say of it."""
+    """White noise of the IMU that is estimated from how the images correct its predictions."""
 
     enabled: bool = True
-    """Whether densities are raised while the images correct the IMU more than they should."""
-    whiteness_s: float = Field(0.5, gt=0)
-    """Time over which corrections are averaged to see whether they keep their direction."""
-    size_s: float = Field(2.0, gt=0)
-    """Time over which their squares are averaged."""
-    response_s: float = Field(1.0, gt=0)
-    """Time in which a variance grows e-fold if squares are twice what they should be."""
-    max_factor: float = Field(30.0, ge=1)
-    """Largest factor on a density."""
+    """Raise the IMU's noise densities while the images correct its predictions by more than these
+    allow. Switch it off to use the densities of the calibration as they are, for example for an IMU
+    without vibration whose noise was measured."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        name: f"is a constant now: {constant} in slam_graph/backend/cost/adaptive_noise.py"
+        for name, constant in (
+            ("whiteness_s", "PERSISTENCE_TIME_S"),
+            ("size_s", "SIZE_TIME_S"),
+            ("response_s", "RESPONSE_TIME_S"),
+            ("max_factor", "MAX_FACTOR"),
+        )
+    }
 
 
 class NoiseConfig(Settings):
-    """Noise of the sensors, where the calibration does not say it."""
+    """Noise of the sensors."""
 
     pixel_sigma: float = Field(1.0, gt=0)
-    """Standard deviation of a feature observation, in pixels."""
+    """Standard deviation of a feature observation, in pixels. Raise it for blurred or
+    rolling-shutter images or an inaccurate calibration: images then count less, and the gate
+    rejects fewer features."""
     imu_scale: float = Field(1.0, gt=0)
-    """Factor on all IMU noise densities of the calibration."""
+    """Factor on all noise densities of the IMU. Raise it (2 to 10) if the calibration has those of
+    a data sheet, or if images contradict the state and runs diverge: the IMU then counts less."""
     adaptive: AdaptiveNoiseConfig = AdaptiveNoiseConfig()
-    """Noise of the IMU that follows what the images say of it."""
+    """White noise of the IMU that is estimated from how the images correct its predictions."""
     gravity: float = Field(9.81, gt=0)
-    """Magnitude of gravity in m/s²."""
-    max_imu_gap_s: float = Field(0.03, gt=0)
-    """Longest time without IMU samples that is bridged as if there were none missing."""
-    imu_gap_scale: float = Field(1000.0, ge=1)
-    """Factor on the IMU noise between two frames with a longer gap."""
+    """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
+    poles)."""
+    max_imu_gap_s: float = expert(0.03, gt=0)
+    """Time between two IMU samples above which some are taken to be missing; the IMU then counts
+    for little between the two frames around. Raise it for an IMU slower than 33 Hz."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "imu_gap_scale": (
+            "is a constant now: IMU_GAP_SCALE in slam_graph/backend/cost/adaptive_noise.py"
+        ),
+    }
 
 
 class TriangulationConfig(Settings):
-    """When a triangulated feature can be trusted."""
+    """Which triangulated features are accepted."""
 
-    iterations: int = Field(5, ge=1)
-    """Gauss-Newton steps that refine the linear solution."""
     min_depth_m: float = Field(0.1, gt=0)
-    """Nearest accepted depth in any camera."""
+    """Smallest accepted depth in any camera, in metres. Raise it to ignore parts of the vehicle
+    that the cameras see."""
     max_depth_m: float = Field(75.0, gt=0)
-    """Farthest accepted depth in the first camera."""
-    min_parallax_rad: float = Field(0.01, ge=0)
+    """Largest accepted depth in the first camera, in metres. Raise it for high flights or open
+    country, where otherwise few features are left."""
+    min_parallax_rad: float = expert(0.01, ge=0)
     """Smallest accepted angle between two rays to a feature."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "iterations": "is a constant now: STEPS in slam_graph/backend/cost/triangulation.py",
+    }
 
 
 class GatingConfig(Settings):
     """Outlier rejection inside the back end."""
 
     confidence: float = Field(0.95, gt=0, lt=1)
-    """Quantile of the χ² distribution beyond which a feature is rejected (Mahalanobis gate)."""
+    """Share of the correct features that the χ² gate (Mahalanobis distance) accepts. Lower it if
+    moving objects disturb the estimate; more correct features are then lost as well."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
-    """Loss that weighs down large reprojection residuals."""
-    robust_width: float = Field(2.45, gt=0)
-    """Width of the robust loss on the length of a whitened residual (2.45: the 95 % circle)."""
+    """Loss that reduces the weight of large reprojection residuals. `cauchy` lets that of outliers
+    vanish, but needs a better start; `none` is for data without outliers, such as simulations."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "robust_width": "is a constant now: WIDTH_2D in slam_graph/backend/cost/robust_loss.py",
+    }
 
 
 class ZeroVelocityConfig(Settings):
     """Zero-velocity updates while the platform stands still."""
 
     enabled: bool = True
-    """Whether standing still is detected and used."""
-    window_s: float = Field(1.0, gt=0)
-    """Length of the window over which nothing may have moved."""
-    max_gyro_std: float = Field(0.2, gt=0)
-    """Largest standard deviation of the angular rate, rad/s."""
-    max_accel_std: float = Field(2.5, gt=0)
-    """Largest standard deviation of the specific force, m/s²."""
+    """Detect standstill and use it. Switch it off for platforms that can move evenly before a scene
+    without features nearby: slow even motion may be taken for standstill."""
     max_disparity_px: float = Field(1.0, gt=0)
-    """Largest median motion of the features over the window, and between two frames; or three times
-    that of the third which moves least, as the others may be on something that moves."""
-    velocity_sigma: float = Field(0.01, gt=0)
-    """How still a still platform is: standard deviation of its velocity, m/s."""
-    position_sigma: float = Field(1e-3, gt=0)
-    """Standard deviation of its motion between two frames, m."""
-    rotation_sigma: float = Field(1e-3, gt=0)
-    """Standard deviation of its rotation between two frames, rad."""
+    """Largest median motion of the features at a standstill, in pixels, between two frames and over
+    the window. Raise it if features are noisy and standstill is not found, lower it if slow motion
+    is taken for standstill. Where many features are on something that moves, the limit is a third
+    of this, for the third of the features that moves least."""
+    window_s: float = expert(1.0, gt=0)
+    """Length of the window over which nothing may have moved."""
+    max_gyro_std: float = expert(0.2, gt=0)
+    """Largest standard deviation of the angular rate at a standstill, rad/s."""
+    max_accel_std: float = expert(2.5, gt=0)
+    """Largest standard deviation of the specific force at a standstill, m/s²."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        f"{name}_sigma": (
+            f"is a constant now: {name.upper()}_SIGMA in slam_graph/backend/cost/zero_velocity.py"
+        )
+        for name in ("velocity", "position", "rotation")
+    }
 
 
 class PriorConfig(Settings):
-    """How uncertain the first state is where nothing better is known (standard deviations)."""
+    """Standard deviations of the first state where the data do not determine it."""
 
-    attitude_rad: float = Field(0.05, gt=0)
+    attitude_rad: float = expert(0.05, gt=0)
     """Roll and pitch."""
-    yaw_rad: float = Field(1e-3, gt=0)
-    """Yaw, which is free to choose."""
-    position_m: float = Field(1e-3, gt=0)
-    """Position, which is free to choose."""
-    velocity: float = Field(0.05, gt=0)
+    yaw_rad: float = expert(1e-3, gt=0)
+    """Yaw, which defines the world frame."""
+    position_m: float = expert(1e-3, gt=0)
+    """Position, which defines the world frame."""
+    velocity: float = expert(0.05, gt=0)
     """Velocity, m/s."""
-    gyro_bias: float = Field(0.01, gt=0)
+    gyro_bias: float = expert(0.01, gt=0)
     """Gyroscope bias, rad/s."""
-    accel_bias: float = Field(0.1, gt=0)
+    accel_bias: float = expert(0.1, gt=0)
     """Accelerometer bias, m/s²."""
 
 
@@ -110,60 +148,66 @@ class InitializationConfig(Settings):
     """How the first state is found."""
 
     mode: Literal["auto", "static", "motion", "given", "groundtruth"] = "auto"
-    """auto: from the state that the data brings, else from standing still, else in motion."""
-    static_window_s: float = Field(1.0, gt=0)
-    """How long the platform must stand still for a static start."""
-    static_disparity_px: float = Field(1.5, gt=0)
-    """zero_velocity.max_disparity_px of a static start; running motors shake the picture."""
+    """auto: the state that comes with the data, or else a start from standstill or in motion,
+    whichever is possible first. static, motion: only that one. given: only the state that comes
+    with the data. groundtruth: the true state, to compare algorithms without their starts."""
     motion_window_s: float = Field(1.5, gt=0)
-    """Length of the visual-inertial alignment of a start in motion."""
-    frame_spacing_s: float = Field(0.15, gt=0)
-    """Time between the frames that the alignment uses."""
-    retry_s: float = Field(0.2, ge=0)
-    """Time between two attempts to start in motion."""
-    features: int = Field(150, ge=10)
-    """How many features the alignment uses at most (the longest tracks)."""
-    min_features: int = Field(10, ge=5)
-    """How many features must fit the solution of a start in motion."""
-    max_normalized_cost: float = Field(3.0, gt=0)
-    """Largest mean squared residual of a start in motion, in squared standard deviations."""
-    max_velocity_sigma: float = Field(0.1, gt=0)
-    """How well a start in motion must know the velocity, m/s."""
-    max_scale_sigma: float = Field(0.15, gt=0)
-    """How well a start in motion must know the scale, relative to it."""
+    """Length of the window from which a start in motion is computed, in seconds. Raise it for slow
+    or even motion, which determines scale and gravity only after a while: the start comes later,
+    but is more accurate."""
+    static_window_s: float = expert(1.0, gt=0)
+    """How long the platform must stand still for a static start."""
     prior: PriorConfig = PriorConfig()
     """Uncertainty of the first state of a static start."""
-    motion_prior: PriorConfig = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
-    """Uncertainty of the guess that a start in motion refines."""
-    fix_gauge: bool = True
-    """Take the position and yaw of the first state as the definition of the world frame."""
+    fix_gauge: bool = expert(True)
+    """Take the position and yaw of the first state as the definition of the world frame, so that
+    covariances do not contain their uncertainty."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        name: f"is a constant now: {constant} in slam_graph/backend/initialization/{file}.py"
+        for name, constant, file in (
+            ("static_disparity_px", "STATIC_DISPARITY_PX", "initializer"),
+            ("frame_spacing_s", "FRAME_SPACING_S", "initializer"),
+            ("retry_s", "RETRY_S", "initializer"),
+            ("features", "MAX_FEATURES", "dynamic_refinement"),
+            ("min_features", "MIN_FEATURES", "dynamic_start"),
+            ("max_normalized_cost", "MAX_NORMALIZED_COST", "dynamic_refinement"),
+            ("max_velocity_sigma", "MAX_VELOCITY_SIGMA", "dynamic_refinement"),
+            ("max_scale_sigma", "MAX_SCALE_SIGMA", "dynamic_refinement"),
+            ("motion_prior", "MOTION_PRIOR", "dynamic_refinement"),
+        )
+    }
 
 
 class CalibrationConfig(Settings):
     """Which parameters of the rig are estimated with the states, and how well they are known.
 
-    Sigmas are standard deviations of the calibration that the data brings, for each component.
+    Sigmas are standard deviations of the calibration that comes with the data, for each component.
     """
 
     extrinsics: bool = False
-    """Estimate where each camera is mounted on the body."""
+    """Estimate where each camera is mounted on the body. Use it if the mounting was measured by
+    hand or has changed since the calibration; it needs rotation about several axes."""
     time_offset: bool = False
-    """Estimate the offset from the clock of the cameras to that of the IMU, one for all cameras."""
+    """Estimate the offset from the clock of the cameras to that of the IMU, one for all cameras.
+    Use it for cameras without hardware synchronisation; it needs fast motion."""
     intrinsics: bool = False
-    """Estimate focal lengths and principal point of each camera."""
+    """Estimate focal lengths and principal point of each camera. Use it if lens or focus have
+    changed since the calibration."""
     distortion: bool = False
-    """Estimate the distortion coefficients of each camera."""
-    rotation_sigma_rad: float = Field(0.02, gt=0)
+    """Estimate the distortion coefficients of each camera. Use it with `intrinsics`, and if
+    features cover the whole image."""
+    rotation_sigma_rad: float = expert(0.02, gt=0)
     """Rotation of a camera."""
-    position_sigma_m: float = Field(0.02, gt=0)
+    position_sigma_m: float = expert(0.02, gt=0)
     """Position of a camera."""
-    time_offset_sigma_s: float = Field(0.01, gt=0)
+    time_offset_sigma_s: float = expert(0.01, gt=0)
     """Time offset."""
-    focal_length_sigma: float = Field(0.01, gt=0)
+    focal_length_sigma: float = expert(0.01, gt=0)
     """Focal lengths, as a share of them."""
-    principal_point_sigma_px: float = Field(5.0, gt=0)
+    principal_point_sigma_px: float = expert(5.0, gt=0)
     """Principal point."""
-    distortion_sigma: float = Field(0.01, gt=0)
+    distortion_sigma: float = expert(0.01, gt=0)
     """Distortion coefficients."""
 
     @property
@@ -178,11 +222,11 @@ class BackendConfig(Settings):
     noise: NoiseConfig = NoiseConfig()
     """Noise of the sensors."""
     triangulation: TriangulationConfig = TriangulationConfig()
-    """When a triangulated feature can be trusted."""
+    """Which triangulated features are accepted."""
     gating: GatingConfig = GatingConfig()
     """Outlier rejection."""
     zero_velocity: ZeroVelocityConfig = ZeroVelocityConfig()
-    """Standing still."""
+    """Zero-velocity updates."""
     initialization: InitializationConfig = InitializationConfig()
     """Start-up."""
     calibration: CalibrationConfig = CalibrationConfig()

@@ -1,34 +1,34 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator: one loop of cost construction, Gauss-Newton steps and marginalization.
+"""The estimator: IMU samples and feature frames in, states out, whichever engine solves for them.
 
-Every recursive algorithm is this loop under a policy (`policies.py`). See docs/engine.md.
+It checks the input, detects standstill and finds the first state. From then on every frame is one
+step of its engine: this package's own loop (`engine.py`) or one of GTSAM's smoothers
+(`gtsam_smoothers/`). See docs/engine.md.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
-from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
-from slam_graph.backend.cost.propagation import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
-from slam_graph.backend.initialization.initializer import Initializer, start_from
-from slam_graph.backend.marginalization.marginalize import marginalize_step
+from slam_graph.backend.engine import SquareRootEngine
+from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
+from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
+from slam_graph.backend.initialization.first_state import start_from
+from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.backend.solve.gauss_newton import Minimum, minimize
-from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -36,6 +36,8 @@ from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
+
+__all__ = ["Estimator"]
 
 IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
@@ -49,11 +51,7 @@ class Estimator:
     Feed it IMU samples and feature frames in the order of time; every frame gives the state then.
 
     Attributes:
-        window: variables, prior and tracks; None as long as there is no state.
-        timings: seconds that each module took in the last step.
-        costs: the cost before the first Gauss-Newton step of the last frame and after each.
-        columns: dimension of the state in the last step, with the features that are put aside.
-        innovations: how far the last frame was from what was predicted of it.
+        window: the variables and what is known of them; None as long as there is no state.
     """
 
     def __init__(
@@ -63,89 +61,40 @@ class Estimator:
         config: BackendConfig | None = None,
         diagnostics: Diagnostics | None = None,
     ) -> None:
-        self.rig = rig
-        self.algorithm = algorithm
-        self.config = _with_loss(config or BackendConfig(), algorithm)
-        self.diagnostics = diagnostics or Diagnostics()
-        self.window: Window | None = None
-        self.timings: dict[str, float] = {}
-        self.costs: tuple[float, ...] = ()
-        self.columns = 0
-        self.innovations = Innovations()
-        self._calibration = CalibrationVariables(rig, self.config.calibration)
-        projection = RigProjection(rig)
-        if self._calibration.keys:
-            projection = CalibratedProjection(self._calibration)
-        self._propagation = Propagation(rig.imu, self.config, self.diagnostics)
-        self._construction = CostConstruction(
-            algorithm.cost, projection, self.config, self.diagnostics
+        """Choose the engine and wait for input.
+
+        Args:
+            rig: calibrated sensors.
+            algorithm: its policies; `engine` says what solves the problem.
+            config: settings that do not depend on the algorithm.
+            diagnostics: counts warnings.
+
+        Raises:
+            ConfigError: if the engine cannot do what the settings ask for.
+        """
+        config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
+        calibration = CalibrationVariables(rig, config.calibration)
+        projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
+        propagation = Propagation(rig.imu, config, diagnostics)
+        context = EngineContext(
+            rig, algorithm, config, diagnostics, calibration, projection, propagation
         )
-        self._initializer = Initializer(
-            projection, self._propagation.noise.params(), algorithm, self.config, self._calibration
-        )
-        self._standstill = StandstillDetector(self.config.zero_velocity)
-        self._imu = ImuBuffer()
+        own = algorithm.engine == "square_root"
+        self._engine: Engine = SquareRootEngine(context) if own else SmootherEngine(context)
+        self._context = context
+        self._initializer = Initializer(context)
+        self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
-        self._posterior: SquareRootInformation | None = None
+        self._report = StepReport()
         # the matrices are small: waking threads for them costs many times what they save
         self._threads = ThreadpoolController()
+        self.rig = rig
+        self.algorithm = algorithm
+        self.config = config
+        self.diagnostics = diagnostics
+        self.window: Window | None = None
 
-    # --- the loop --------------------------------------------------------------------------------
-
-    def _step(self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool) -> NavState:
-        """One turn of the loop: the three modules, in order."""
-        with self._timed("propagation"):
-            self._propagation.append_frame(window, self._imu, stamp_ns, still)
-            self._add_tracks(window, frame)
-        with self._timed("cost"):
-            constructed = self._construction.construct(window, still)
-        with self._timed("gauss_newton"):
-            minimum = self._minimize(constructed)
-            self.costs = minimum.costs
-            self.columns = minimum.posterior.layout.size + window.archive.size
-            self._construction.reject_residuals(window, constructed)
-            self.innovations = constructed.innovations_under(minimum.posterior)
-        with self._timed("marginalization"):
-            policy = self.algorithm.marginalization
-            marginalize_step(window, constructed, minimum, policy)
-        self._posterior = minimum.posterior
-        state = window.current(minimum.posterior)
-        self._propagation.learn(state)
-        return state
-
-    def _minimize(self, constructed: ConstructedCost) -> Minimum:
-        """Take the steps; without the features if these leave something undetermined."""
-        policy = self.algorithm.gauss_newton
-        again = self._calibration.moved_far if self._calibration.keys else None
-        try:
-            return minimize(constructed.cost, policy, constructed.linear, again)
-        except np.linalg.LinAlgError:
-            self.diagnostics.warn("features_degenerate", "one frame goes without its features")
-            constructed.drop_features()
-            return minimize(constructed.cost, policy)
-
-    @contextmanager
-    def _timed(self, module: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.timings[module] = time.perf_counter() - start
-
-    # --- the outside -----------------------------------------------------------------------------
-
-    @property
-    def initialized(self) -> bool:
-        """Whether there is a state."""
-        return self.window is not None
-
-    @property
-    def imu_noise(self) -> tuple[float, float]:
-        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
-        return self._propagation.noise.factors
-
-    @property
-    def waiting_for(self) -> str:
-        """What a start still needs."""
-        return self._initializer.waiting_for
+    # --- input -----------------------------------------------------------------------------------
 
     def start(self, state: NavState) -> None:
         """Begin from a known state.
@@ -158,11 +107,11 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        self.window = start_from(state, self.config, self._calibration)
+        self.window = start_from(state, self.config, self._context.calibration)
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
-        left_out = self._imu.add(imu)
+        left_out = self._context.imu.add(imu)
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
             self.diagnostics.warn("imu_rejected", message)
@@ -174,57 +123,37 @@ class Estimator:
             The causal estimate with its covariance, stamped on the clock of the IMU. None as long
             as there is no state, and for a frame that does not follow those before.
         """
+        self._report = StepReport()
+        imu, calibration = self._context.imu, self._context.calibration
         state = self.window.state if self.window is not None else None
-        stamp_ns = self._calibration.stamp(frame.stamp_ns, state, self._imu)
-        self.timings, self.costs, self.innovations = {}, (), Innovations()
-        if not self._latest_ns < stamp_ns <= self._imu.newest_ns() + MAX_AHEAD_NS:
+        stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
+        if not self._latest_ns < stamp_ns <= imu.newest_ns() + MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = stamp_ns
-        self._imu.forget_before(stamp_ns - IMU_HISTORY_NS)
+        imu.forget_before(stamp_ns - IMU_HISTORY_NS)
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
-            still = self._standstill.is_still(self._imu, stamp_ns, frame)
-            frame = frame.without(self._standstill.movers)
+            still = self._standstill.is_still(imu, stamp_ns, frame)
+            frame = frame.without(self._standstill.dynamic)
             if self.window is None:
-                with self._timed("start"):
-                    self.window = self._initializer.try_to_start(self._imu, stamp_ns, frame)
-                if self.window is not None:
-                    self._standstill.know_movers(self._initializer.unfit)
+                self.window = self._try_to_start(stamp_ns, frame)
             elif stamp_ns > self.window.stamp_ns:
-                return self._step(self.window, stamp_ns, frame, still)
+                return self._engine.step(self.window, stamp_ns, frame, still, self._report)
             elif stamp_ns == self.window.stamp_ns:
-                self._add_tracks(self.window, frame)
+                self._context.add_observations(self.window, frame)
             if self.window is None or stamp_ns < self.window.stamp_ns:
                 return None
             return self.window.current(self.window.prior)
 
-    @property
-    def rejected(self) -> IntArray:
-        """Ids (N,) of the features that the gate rejected in the last step."""
-        return self._construction.rejected
-
-    @property
-    def calibration(self) -> CalibrationEstimate | None:
-        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
-        if self.window is None or not self._calibration.keys:
-            return None
-        information = self._posterior or self.window.prior
-        return self._calibration.estimate(self.window.stamp_ns, self.window.state, information)
-
-    def landmarks(self) -> tuple[IntArray, FloatArray]:
-        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
-        if self.window is None:
-            return np.zeros(0, np.int64), np.zeros((0, 3))
-        return self.window.points()
-
-    def _add_tracks(self, window: Window, frame: FeatureFrame) -> None:
-        """Add what the current frame has seen."""
-        window.tracks.add(window.frame, frame)
-        self._calibration.note_motion(
-            window.state, window.frame, window.stamp_ns, frame.stamp_ns, self._imu
-        )
+    def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
+        """The first window, if this frame makes a start possible."""
+        with self._report.timed("start"):
+            window = self._initializer.try_to_start(stamp_ns, frame)
+        if window is not None:
+            self._standstill.add_dynamic(self._initializer.outliers)
+        return window
 
     def _usable(self, frame: FeatureFrame) -> FeatureFrame:
         """The frame with all cameras of the rig, without observations that are not finite."""
@@ -242,11 +171,77 @@ class Estimator:
         cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
         return FeatureFrame(frame.stamp_ns, tuple(cameras))
 
+    # --- output ----------------------------------------------------------------------------------
 
-def _with_loss(config: BackendConfig, algorithm: AlgorithmConfig) -> BackendConfig:
-    """The settings with the robust loss of an algorithm, where it has one of its own."""
-    loss = algorithm.cost.robust_loss
-    if loss is None:
-        return config
-    gating = config.gating.model_copy(update={"robust_loss": loss})
-    return config.model_copy(update={"gating": gating})
+    @property
+    def initialized(self) -> bool:
+        """Whether there is a state."""
+        return self.window is not None
+
+    @property
+    def waiting_for(self) -> str:
+        """What a start still needs."""
+        return self._initializer.waiting_for
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Seconds that each module took for the last frame."""
+        return self._report.timings
+
+    @property
+    def costs(self) -> tuple[float, ...]:
+        """The cost before the first step of the last frame and after each; empty if not known."""
+        return self._report.costs
+
+    @property
+    def columns(self) -> int:
+        """Dimension of the state in the last step; 0 if there are no costs."""
+        return self._report.columns
+
+    @property
+    def innovations(self) -> Innovations:
+        """How far the last frame was from what was predicted of it."""
+        return self._report.innovations
+
+    @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
+        return self._report.rejected
+
+    @property
+    def imu_noise(self) -> tuple[float, float]:
+        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
+        return self._context.propagation.noise.factors
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
+        variables = self._context.calibration
+        if self.window is None or not variables.keys:
+            return None
+        information = self._engine.information(self.window)
+        return variables.estimate(self.window.stamp_ns, self.window.state, information)
+
+    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """The joint covariance (n, n) of variables after the last step.
+
+        Args:
+            keys: of past poses X(i), of the current state X(i), V(i), B(i), of features L(j) of the
+                state, or of the calibration; tangents are GTSAM's.
+
+        Raises:
+            EstimationError: if there is no state yet, or a key is not of a variable now.
+        """
+        if self.window is None:
+            raise EstimationError("there is no state yet")
+        information = self._engine.information(self.window)
+        missing = [gtsam.DefaultKeyFormatter(k) for k in keys if k not in information.layout]
+        if missing:
+            raise EstimationError(f"not variables of the last step: {', '.join(missing)}")
+        return information.covariance_of(keys)
+
+    def landmarks(self) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
+        if self.window is None:
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        return self._engine.landmarks(self.window)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the rig as variables of the state: which they are, and what is known at first.
+"""Online calibration: which parameters of the rig are variables of the state, and their prior.
 
-`E(c)` is the pose body_T_camera of camera c, `K(c)` its (fx, fy, cx, cy), `D(c)` the coefficients
-of its distortion, and `T(0)` the time offset t_imu - t_camera in seconds, one for the rig. They are
-in the state and in its prior from the start and never leave.
+`E(c)` is the pose body_T_camera of camera c, `K(c)` its (fx, fy, cx, cy), `distortion_key(c, n)`
+the n coefficients of its distortion, and `T(0)` the time offset t_imu - t_camera in seconds, one
+for the rig. They are in the state and in its prior from the start and are never marginalized.
 """
 
 from __future__ import annotations
@@ -14,21 +14,31 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import D, E, K, T
+from gtsam.symbol_shorthand import E, K, T
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import CalibrationConfig
-from slam_graph.backend.cost.imu_factor import ImuBuffer
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import FrameMotion, State, dim, dims_of
+from slam_graph.backend.solve.state import (
+    FrameMotion,
+    State,
+    dim,
+    dims_of,
+    distortion_key,
+    letter_and_index,
+)
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.rig import Rig, RigCamera
 
-MAX_HELD_NS = 50_000_000
-"""By how much the time of a frame may be taken too early, where the IMU has no samples yet."""
+__all__ = ["CalibrationVariables"]
 
-FAR = 0.3
-"""A step that moves the parameters by more standard deviations (root mean square) is repeated."""
+_MAX_EARLY_NS = 50_000_000
+"""A frame may be taken this much too early where the IMU has no samples yet."""
+
+_LARGE_STEP_SIGMAS = 0.3
+"""A step that moves the parameters by more standard deviations (root mean square) is repeated, with
+the residuals linearised at the new parameters."""
 
 
 class CalibrationVariables:
@@ -53,17 +63,21 @@ class CalibrationVariables:
             if self.config.intrinsics:
                 yield K(c)
             if self.config.distortion and mounted.camera.coefficients:
-                yield D(c)
+                yield distortion_key(c, len(mounted.camera.coefficients))
         if self.config.time_offset:
             yield T(0)
 
-    # --- the start -------------------------------------------------------------------------------
+    # --- prior ------------------------------------------------------------------------------------
 
     def enter(self, state: State, prior: SquareRootInformation) -> SquareRootInformation:
         """Add the parameters to a state, at their nominal values.
 
+        Args:
+            state: gets the parameters.
+            prior: on the variables that are in the state.
+
         Returns:
-            The prior on the state, extended by what is known of the parameters.
+            The prior on the state, extended by that on the parameters.
         """
         if not self.keys:
             return prior
@@ -78,7 +92,7 @@ class CalibrationVariables:
     def _nominal_values(self) -> gtsam.Values:
         values = gtsam.Values()
         for key in self.keys:
-            kind, c = _kind_and_camera(key)
+            kind, c = letter_and_index(key)
             mounted = self.nominal.cameras[c]
             if kind == "e":
                 values.insert(key, mounted.body_T_camera)
@@ -92,7 +106,7 @@ class CalibrationVariables:
 
     def _sigmas(self, key: int) -> FloatArray:
         """Prior standard deviations (dim,) of a variable, in its tangent."""
-        kind, c = _kind_and_camera(key)
+        kind, c = letter_and_index(key)
         config = self.config
         if kind == "e":
             return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
@@ -105,13 +119,13 @@ class CalibrationVariables:
     def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
         """Whether a step (n,) moved the parameters far, compared to their standard deviations.
 
-        Such a step is not linear: what it says of the parameters depends on where they were.
+        Over such a step the residuals are not linear in the parameters.
         """
         step = delta[posterior.layout.indices(self.keys)]
         covariance = posterior.covariance_of(self.keys)
-        return float(step @ np.linalg.solve(covariance, step)) > FAR**2 * len(step)
+        return float(step @ np.linalg.solve(covariance, step)) > _LARGE_STEP_SIGMAS**2 * len(step)
 
-    # --- the estimate ----------------------------------------------------------------------------
+    # --- estimate ---------------------------------------------------------------------------------
 
     def rig(self, values: gtsam.Values) -> Rig:
         """The rig with the parameters that are in `values`."""
@@ -123,7 +137,7 @@ class CalibrationVariables:
         return Rig(tuple(cameras), self.nominal.imu)
 
     def _shift_s(self, values: gtsam.Values) -> float:
-        """By how much the time offset differs from the nominal one."""
+        """Difference of the estimated time offset from the nominal one, in seconds."""
         if not self.estimates_offset:
             return 0.0
         return float(values.atVector(T(0))[0]) - self.nominal.cameras[0].time_offset_s
@@ -137,8 +151,9 @@ class CalibrationVariables:
         if K(c) in self.keys:
             fx, fy, cx, cy = values.atVector(K(c)).tolist()
             camera = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
-        if D(c) in self.keys:
-            camera = replace(camera, coefficients=tuple(values.atVector(D(c)).tolist()))
+        distortion = distortion_key(c, len(camera.coefficients))
+        if distortion in self.keys:
+            camera = replace(camera, coefficients=tuple(values.atVector(distortion).tolist()))
         return RigCamera(camera, body_T_camera, mounted.time_offset_s + shift_s, mounted.name)
 
     def estimate(
@@ -156,32 +171,34 @@ class CalibrationVariables:
         for key in self.keys:
             stop = start + dim(key)
             block = covariance[start:stop, start:stop]
-            if _kind_and_camera(key)[0] == "e":  # from the first estimate's tangent to this one's
+            letter, c = letter_and_index(key)
+            if letter == "e":  # from the first estimate's tangent to this one's
                 turn = gtsam.Pose3.ExpmapDerivative(state.offsets[key])
                 block = turn @ block @ turn.T
-            blocks[gtsam.Symbol(key).string()] = block
+            blocks[f"{letter}{c}"] = block
             start = stop
         return CalibrationEstimate(stamp_ns, self.nominal, self.rig(state.estimate), blocks)
 
-    # --- the time offset -------------------------------------------------------------------------
+    # --- time offset ------------------------------------------------------------------------------
 
     def stamp(self, frame_ns: int, state: State | None, imu: ImuBuffer) -> int:
-        """Time of a frame on the clock of the IMU, by the best time offset there is.
+        """Time of a frame on the clock of the IMU, by the current estimate of the time offset.
 
-        An estimated offset may lead beyond the samples that came with the frame. Then the time of
-        the last sample is taken, and the rest of the offset is bridged by the motion of the frame
-        (see `note_motion`): an extrapolated IMU would err in the dynamics, for good.
+        With it the frame may be later than the last IMU sample that came with it. Then the time of
+        the last sample is taken, and the projection bridges the rest of the offset by the velocity
+        of the body (see `note_motion`). Extrapolating the IMU instead would leave an error in the
+        dynamics that no later sample corrects.
         """
         if state is None or not self.estimates_offset:
             return frame_ns + round(self.nominal.cameras[0].time_offset_s * 1e9)
         stamp_ns = frame_ns + round(float(state.estimate.atVector(T(0))[0]) * 1e9)
         beyond_ns = stamp_ns - imu.newest_ns()
-        return stamp_ns - beyond_ns if 0 < beyond_ns <= MAX_HELD_NS else stamp_ns
+        return stamp_ns - beyond_ns if 0 < beyond_ns <= _MAX_EARLY_NS else stamp_ns
 
     def note_motion(
         self, state: State, frame: int, stamp_ns: int, frame_ns: int, imu: ImuBuffer
     ) -> None:
-        """Remember how the body moves when a frame is taken.
+        """Store the velocity of the body at a frame; it shifts the pose when the offset changes.
 
         Args:
             state: has the pose, velocity and bias of the frame.
@@ -198,8 +215,3 @@ class CalibrationVariables:
         state.motions[frame] = FrameMotion(
             np.concatenate([gyro, velocity]), (stamp_ns - frame_ns) * 1e-9
         )
-
-
-def _kind_and_camera(key: int) -> tuple[str, int]:
-    symbol = gtsam.Symbol(key)
-    return chr(symbol.chr()), int(symbol.index())

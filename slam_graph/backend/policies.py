@@ -3,32 +3,50 @@
 """The policy table: what makes one algorithm differ from another, module by module.
 
 An algorithm is a YAML file in `configs/algorithms/` with one section for each module of the loop.
-How poses are chosen is in `pose_choice.py`, how features are in `selection.py`.
+How poses are selected is in `cost/pose_selection.py`, what becomes of features in
+`cost/feature_policies.py`.
+
+Every combination of policies that is accepted counts each measurement exactly once. What one policy
+would make of no effect in another is refused when the file is loaded.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
+from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
+from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
+from slam_graph.plugins import Choice
 from slam_graph.settings.base import Settings
 
 
 class CostPolicy(Settings):
     """Module 1: which variables and residuals are in the cost."""
 
-    past_poses: Literal["most_recent", "evenly_spaced", "keyframes"] = "most_recent"
+    past_poses: Annotated[str, Choice(POSE_SELECTIONS)] = "most_recent"
     """Which past poses stay in the cost beside the current IMU state."""
     max_past_poses: int = Field(11, ge=1)
     """N_max: how many past poses at most (of `keyframes`: how many keyframes)."""
     recent_frames: int = Field(1, ge=1)
-    """How many of the last frames keep their velocity and bias; 1 is the current one only."""
-    features: Literal["once", "state", "window"] = "once"
-    """What becomes of a feature that is not held in the state. once: used when its track ends, with
-    all its observations, and marginalised at once. state: never used, only features of the state
-    count. window: in the cost of every step until a keyframe that saw it leaves; then it becomes
-    part of the prior, and starts anew if it is still tracked."""
+    """How many of the last frames keep their velocity and bias; 1 is the current one only. The IMU
+    factors between them are linearised anew in every step."""
+    features: Annotated[str, Choice(FEATURE_POLICIES)] = "once"
+    """What becomes of a feature that is not held in the state. once: used when its track ends, or
+    when a pose that saw it leaves, with all its observations, and marginalised at once. state: not
+    used, only features of the state count. every_step: in the cost of every step, linearised anew,
+    until a pose that saw it leaves; then it becomes part of the prior, and starts anew if it is
+    still tracked."""
     keep_lost_features: bool = False
     """Whether features of the state that are no longer tracked are kept for when they come back."""
     max_state_features: int | None = Field(40, ge=0)
@@ -39,18 +57,65 @@ class CostPolicy(Settings):
     """… and the standard deviation of its depth, relative to it, must be less than this."""
     max_features_per_step: int = Field(60, ge=1)
     """How many features outside the state are in the cost of one step (longest tracks first)."""
-    gate: Literal["prediction", "residual", "both"] = "prediction"
-    """How wrong features outside the state are found. prediction: before the steps, by the χ² test
-    of their whole tracks against the predicted covariance. residual: after the steps, by that of
-    the residual of each observation; one that fails is never used again. both: one after the
-    other."""
-    robust_loss: Literal["none", "huber", "cauchy"] | None = None
-    """Loss on reprojection residuals, instead of that of `backend.gating`: where nothing is tested
-    before the steps, the weight of what moves by itself must be able to vanish."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
     """A frame becomes a keyframe when the last one saw less than this share of its features."""
     keyframe_parallax_rad: float = Field(0.05, ge=0)
     """… or when it sees these from elsewhere: under a median angle of more than this."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "gate": "follows from 'features' now: each feature is tested when it enters the cost, and "
+        "under 'every_step' its observations after each step; remove the line",
+        "robust_loss": "is backend.gating.robust_loss now, the same for all algorithms",
+    }
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> CostPolicy:
+        """Refuse what another choice makes of no effect."""
+        holds_none = self.max_state_features == 0
+        if self.features == "state" and holds_none:
+            raise ValueError(
+                "features: state measures only features of the state, and max_state_features: 0 "
+                "allows none; raise it, or use features: once"
+            )
+        if holds_none:
+            self._refuse(
+                ("keep_lost_features", "state_feature_frames", "state_feature_depth_error"),
+                "max_state_features: 0 holds no features in the state",
+            )
+        if self.features == "state":
+            self._refuse(
+                ("max_features_per_step",), "features: state uses no features outside the state"
+            )
+        if self.past_poses in ("most_recent", "evenly_spaced"):
+            self._refuse(
+                ("keyframe_overlap", "keyframe_parallax_rad"),
+                f"past_poses: {self.past_poses} selects no keyframes",
+            )
+            if self.recent_frames > self.max_past_poses + 1:
+                raise ValueError(
+                    f"recent_frames: {self.recent_frames} are more than the poses that stay: "
+                    f"max_past_poses: {self.max_past_poses} and the current one"
+                )
+        if not holds_none and self.state_feature_frames > self._most_frames:
+            raise ValueError(
+                f"a feature waits over {self._most_frames} frames at most under max_past_poses: "
+                f"{self.max_past_poses}, so none would be seen in state_feature_frames: "
+                f"{self.state_feature_frames}; lower that, or set max_state_features: 0"
+            )
+        return self
+
+    @property
+    def _most_frames(self) -> int:
+        """The longest track, in frames: past poses, the one that is to leave, and the current."""
+        recent = self.recent_frames - 1 if self.past_poses == "keyframes" else 0
+        return self.max_past_poses + recent + 2
+
+    def _refuse(self, names: tuple[str, ...], reason: str) -> None:
+        """Refuse settings that are not at their defaults although they have no effect."""
+        for name in names:
+            value: Any = getattr(self, name)
+            if value != type(self).model_fields[name].default:
+                raise ValueError(f"{name}: {value} has no effect: {reason}; remove the line")
 
 
 class GaussNewtonPolicy(Settings):
@@ -70,9 +135,10 @@ class MarginalizationPolicy(Settings):
 
     first_estimates: bool = True
     """First-estimates Jacobians for the variables of the prior."""
-    absorb: Literal["all", "touching"] = "all"
-    """Which residuals become part of the prior: all of the step, as in a filter, or only those that
-    touch a variable that leaves; then the others are linearised anew in the next step."""
+
+    moved: ClassVar[Mapping[str, str]] = {
+        "absorb": "follows from the cost's 'features' and 'recent_frames' now; remove the line",
+    }
 
 
 class SmootherPolicy(Settings):
@@ -101,6 +167,28 @@ class SmootherPolicy(Settings):
     """Smallest angle between two rays to such a feature."""
 
 
+OWN_SECTIONS = ("cost", "gauss_newton", "marginalization")
+"""Sections that this package's own engine uses."""
+SMOOTHER_SECTIONS = ("smoother",)
+"""Sections that GTSAM's smoothers use."""
+UNUSED_KEYS = {
+    "isam2": {"max_iterations"},
+    "fixed_lag_isam2": {"max_iterations"},
+    "fixed_lag_batch": {"relinearize_threshold", "relinearize_skip"},
+}
+"""Keys of `smoother` that mean nothing to one of GTSAM's smoothers."""
+
+
+def _sections_of(engine: str) -> tuple[str, ...]:
+    """The sections of an algorithm's table that an engine uses."""
+    return OWN_SECTIONS if engine == "square_root" else SMOOTHER_SECTIONS
+
+
+def _unused_keys(engine: str, section: str) -> set[str]:
+    """Keys of a section that an engine does not use although it uses the section."""
+    return UNUSED_KEYS.get(engine, set()) if section in SMOOTHER_SECTIONS else set()
+
+
 class AlgorithmConfig(Settings):
     """One row of the table."""
 
@@ -117,3 +205,41 @@ class AlgorithmConfig(Settings):
     """Marginalization."""
     smoother: SmootherPolicy = SmootherPolicy()
     """GTSAM's smoothers."""
+
+    @property
+    def relinearizes(self) -> bool:
+        """Whether residuals stay in the cost after a step, to be linearised anew in the next."""
+        return FEATURE_POLICIES[self.cost.features].relinearized or self.cost.recent_frames > 1
+
+    @field_validator("cost", "gauss_newton", "marginalization", "smoother", mode="before")
+    @classmethod
+    def _used(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse a section, or a key of one, that the engine would ignore."""
+        engine, section = str(info.data.get("engine", "square_root")), str(info.field_name)
+        sections = _sections_of(engine)
+        if section not in sections:
+            others = "square_root" if section in OWN_SECTIONS else "one of GTSAM's smoothers"
+            reason = (
+                f"is not used by engine '{engine}', whose settings are in {', '.join(sections)}; "
+                f"remove it, or set algorithm.engine to {others}"
+            )
+            raise PydanticCustomError("unused", "{reason}", {"reason": reason})
+        given = value.model_fields_set if isinstance(value, Settings) else value
+        unused = sorted(_unused_keys(engine, section).intersection(given or ()))
+        if unused:
+            reason = f"has '{unused[0]}', which engine '{engine}' does not use; remove it"
+            raise PydanticCustomError("unused", "{reason}", {"reason": reason})
+        return value
+
+    @model_serializer(mode="wrap")
+    def _only_what_is_used(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """The table without what the engine does not use, so that it can be read back."""
+        table: dict[str, Any] = handler(self)
+        sections = _sections_of(self.engine)
+        for section in {*OWN_SECTIONS, *SMOOTHER_SECTIONS}.intersection(table):
+            if section not in sections:
+                del table[section]
+            elif isinstance(table[section], dict):
+                unused = _unused_keys(self.engine, section)
+                table[section] = {k: v for k, v in table[section].items() if k not in unused}
+        return table

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import TrackWindow, is_in
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
 from slam_graph.backend.marginalization.delayed_features import FeatureArchive
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
@@ -40,7 +40,6 @@ class Window:
         past: indices of the past frames whose poses are in the state, ascending.
         moving: those of the past frames whose velocity and bias are in the state too, ascending.
         keyframes: those of the past frames that are keyframes.
-        keyframes_before: the same before this step's choice of poses.
         factors: GTSAM's factors that are not part of the prior yet.
         features: ids (N,) of the features in the state, ascending.
         archive: the features that were in the state and are known although they are not seen.
@@ -54,11 +53,10 @@ class Window:
     stamp_ns: int
     state: State
     prior: SquareRootInformation
-    tracks: TrackWindow = field(default_factory=TrackWindow)
+    tracks: FeatureTracks = field(default_factory=FeatureTracks)
     past: list[int] = field(default_factory=list)
     moving: list[int] = field(default_factory=list)
     keyframes: set[int] = field(default_factory=set)
-    keyframes_before: set[int] = field(default_factory=set)
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
     features: IntArray = field(default_factory=_no_ids)
     archive: FeatureArchive = field(default_factory=FeatureArchive)

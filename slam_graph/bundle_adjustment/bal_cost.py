@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Module 1 of bundle adjustment: all cameras and all points, and no costs between poses.
+"""Module 1 of bundle adjustment, cost construction: all cameras, all points, no pose costs.
 
-Half the squared reprojection errors, under a robust loss if there is one.
+The cost is half the sum of the squared reprojection errors, or their robust loss.
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.feature_factors import robust_loss, robust_weights
 from slam_graph.bundle_adjustment.bal_policy import BalCostPolicy, Intrinsics
-from slam_graph.bundle_adjustment.bal_prior import prior_cost
 from slam_graph.bundle_adjustment.bal_problem import (
     CAMERA_DIM,
     POSE_DIM,
@@ -28,6 +26,8 @@ from slam_graph.bundle_adjustment.bal_problem import (
     project,
 )
 
+__all__ = ["BalCost", "construct", "initial_estimates", "reprojection_errors", "retract"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalCost:
@@ -36,7 +36,8 @@ class BalCost:
     Attributes:
         part: cameras, points and observations.
         policy: which intrinsics are variables, and the loss.
-        variables: (9 C, n) which tangents of the cameras each of n variables moves, entries 0 or 1.
+        variables: (9 C, n) entries 0 or 1: the components of the camera tangents that each of the n
+            variables stands for.
     """
 
     part: BalPart
@@ -44,21 +45,19 @@ class BalCost:
     variables: csr_array
 
     def __call__(self, estimates: BalEstimates) -> float:
-        """The cost; infinite where a point has no pixel."""
+        """The cost; infinite if a point has zero depth."""
         errors = reprojection_errors(self.part.problem, estimates)
         with np.errstate(all="ignore"):
-            cost = float(np.sum(robust_loss(errors, self.policy.loss)))
-            if self.part.problem.prior is not None:
-                cost += prior_cost(self.part.problem.prior, estimates)
+            cost = float(np.sum(self.policy.loss.value(errors)))
         return cost if np.isfinite(cost) else np.inf
 
     def linearized(self, estimates: BalEstimates) -> BalLinearization:
-        """Residuals and derivatives, weighted so that their squares stand for the loss."""
+        """Residuals and Jacobians, scaled by the root of the robust weights (IRLS)."""
         problem = self.part.problem
         linear = linearize(estimates, problem.camera, problem.point, problem.pixels)
         if self.policy.robust == "none":
             return linear
-        weights = robust_weights(np.linalg.norm(linear.r, axis=1), self.policy.loss)
+        weights = self.policy.loss.weights(np.linalg.norm(linear.r, axis=1))
         root = np.sqrt(weights)[:, None]
         return BalLinearization(
             linear.by_camera * root[:, :, None], linear.by_point * root[:, :, None], linear.r * root
@@ -70,8 +69,8 @@ def construct(part: BalPart, policy: BalCostPolicy) -> BalCost:
     return BalCost(part, policy, _variables(part.problem, policy.intrinsics))
 
 
-def first_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
-    """Those of the file; intrinsics that all cameras share begin with their median."""
+def initial_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
+    """Initial estimates: those of the file; shared intrinsics begin at their median."""
     start = part.problem.estimates
     if policy.intrinsics != "shared":
         return start
@@ -80,17 +79,17 @@ def first_estimates(part: BalPart, policy: BalCostPolicy) -> BalEstimates:
 
 
 def reprojection_errors(problem: BalProblem, estimates: BalEstimates) -> FloatArray:
-    """(N,) lengths of the residuals in pixels; not finite where a point has no pixel."""
+    """(N,) reprojection errors in pixels; not finite for points of zero depth."""
     pixels, _ = project(estimates, problem.camera, problem.point)
     with np.errstate(all="ignore"):
         return np.asarray(np.linalg.norm(pixels - problem.pixels, axis=1), dtype=np.float64)
 
 
-def moved(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) -> BalEstimates:
-    """Estimates after a step.
+def retract(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) -> BalEstimates:
+    """Estimates moved by an increment of their tangent.
 
     Args:
-        estimates: before it.
+        estimates: before the step.
         by_camera: (C, 9) increments δθ, δt, f, k1, k2.
         by_point: (P, 3).
     """
@@ -103,17 +102,15 @@ def moved(estimates: BalEstimates, by_camera: FloatArray, by_point: FloatArray) 
 
 
 def _variables(problem: BalProblem, intrinsics: Intrinsics) -> csr_array:
-    """(9 C, n): poses, and the intrinsics as they are estimated."""
-    cameras, lenses = problem.cameras, problem.lenses
+    """(9 C, n): all poses, and the intrinsics that are estimated."""
+    cameras = problem.cameras
     tangents = np.arange(CAMERA_DIM * cameras).reshape(cameras, CAMERA_DIM)
     columns = tangents
-    if intrinsics != "per_camera" or lenses is not None:
+    if intrinsics != "per_camera":
         columns = np.arange(POSE_DIM * cameras).reshape(cameras, POSE_DIM)
     if intrinsics == "shared":
-        lenses = np.zeros(cameras, np.int64)
-    if intrinsics != "fixed" and lenses is not None:
-        lens = POSE_DIM * cameras + 3 * lenses[:, None] + np.arange(3)
-        columns = np.hstack([columns, lens])
+        common = np.tile(POSE_DIM * cameras + np.arange(3), (cameras, 1))
+        columns = np.hstack([columns, common])
     rows = tangents[:, : columns.shape[1]]
     shape = (tangents.size, int(columns.max()) + 1)
     return csr_array((np.ones(rows.size), (rows.ravel(), columns.ravel())), shape=shape)

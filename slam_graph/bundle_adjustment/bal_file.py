@@ -3,8 +3,8 @@
 """Reading and writing bundle-adjustment problems in BAL's format, plain or compressed by bzip2.
 
 A header `cameras points observations`; `camera point x y` of each observation; then nine numbers of
-each camera (rotation vector, translation, f, k1, k2) and three of each point. White space separates
-numbers, whether it ends a line or not.
+each camera (rotation vector, translation, f, k1, k2) and three of each point, separated by any
+white space.
 """
 
 from __future__ import annotations
@@ -20,36 +20,39 @@ from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem
 from slam_graph.errors import DataError
 
-BZIP2_MAGIC = b"BZh"
-HEADER = 3
-OBSERVATION = 4
-LARGEST = 1e100
-"""Greatest magnitude of a number: squares must be finite."""
-LONGEST_HEADER = 200
-"""Bytes among which the first line ends, if the file is of this format."""
+__all__ = ["bal_lines", "is_bal", "read_bal"]
+
+_BZIP2_MAGIC = b"BZh"
+_HEADER = 3
+_OBSERVATION = 4
+"""Numbers of the header and of an observation."""
+_MAX_NUMBER = 1e100
+"""Largest magnitude of a number, so that squares are finite."""
+_MAX_HEADER_BYTES = 200
+"""The first line of a file of this format is shorter."""
 
 
 def is_bal(path: Path) -> bool:
-    """Whether a file begins as a BAL problem does: with a line of three whole numbers.
+    """Whether a file begins with a line of three whole numbers, as a BAL problem does.
 
     Raises:
         DataError: if it cannot be read.
     """
     try:
         with path.open("rb") as file:
-            compressed = file.read(len(BZIP2_MAGIC)) == BZIP2_MAGIC
+            compressed = file.read(len(_BZIP2_MAGIC)) == _BZIP2_MAGIC
         if compressed:
-            return True  # no other format here comes compressed
+            return True  # no other supported format is compressed
         with path.open("rb") as file:
-            start = file.read(LONGEST_HEADER).split(b"\n")
+            start = file.read(_MAX_HEADER_BYTES).split(b"\n")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     words = next((line.split() for line in start if line.strip()), [])
-    return len(words) == HEADER and all(word.lstrip(b"-").isdigit() for word in words)
+    return len(words) == _HEADER and all(word.lstrip(b"-").isdigit() for word in words)
 
 
-def problem_name(path: Path) -> str:
-    """The name of a file without `.txt` or `.txt.bz2`; it also names a folder of results."""
+def _problem_name(path: Path) -> str:
+    """The name of a file without `.txt` or `.txt.bz2`; the folder of results has it too."""
     return path.name.removesuffix(".bz2").removesuffix(".txt").strip(".") or "problem"
 
 
@@ -64,7 +67,7 @@ def read_bal(path: Path | str) -> BalProblem:
     text = _text(path)
     numbers = _numbers(path, text)
     cameras, points, observations = _header(path, text, numbers)
-    expected = HEADER + OBSERVATION * observations + CAMERA_DIM * cameras + 3 * points
+    expected = _HEADER + _OBSERVATION * observations + CAMERA_DIM * cameras + 3 * points
     if len(numbers) < expected:
         raise DataError(
             f"{_where(path, text, len(numbers) - 1)}: ends after {len(numbers)} of the {expected} "
@@ -75,25 +78,25 @@ def read_bal(path: Path | str) -> BalProblem:
             f"{_where(path, text, expected)}: {len(numbers) - expected} numbers more than the "
             "header promises"
         )
-    bad = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
+    bad = np.flatnonzero(~(np.abs(numbers) <= _MAX_NUMBER))
     if len(bad):
         raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite, or too large")
     seen, by_camera, by_point = np.split(
-        numbers[HEADER:], np.cumsum([OBSERVATION * observations, CAMERA_DIM * cameras])
+        numbers[_HEADER:], np.cumsum([_OBSERVATION * observations, CAMERA_DIM * cameras])
     )
-    table = seen.reshape(-1, OBSERVATION)
+    table = seen.reshape(-1, _OBSERVATION)
     for column, (what, count) in enumerate((("camera", cameras), ("point", points))):
         _check_indices(path, text, table[:, column], column, what, count)
     camera, point = table[:, :2].T.astype(np.int64)
     estimates = _estimates(by_camera.reshape(-1, CAMERA_DIM), by_point.reshape(-1, 3))
-    return BalProblem(estimates, camera, point, table[:, 2:].copy(), problem_name(path))
+    return BalProblem(estimates, camera, point, table[:, 2:].copy(), _problem_name(path))
 
 
 def _text(path: Path) -> str:
     """The content of a file, unpacked."""
     try:
         content = path.read_bytes()
-        if content.startswith(BZIP2_MAGIC):
+        if content.startswith(_BZIP2_MAGIC):
             content = bz2.decompress(content)
     except OSError as error:
         reason = error.strerror or "damaged bzip2 data"
@@ -122,9 +125,9 @@ def _numbers(path: Path, text: str) -> FloatArray:
 
 def _header(path: Path, text: str, numbers: FloatArray) -> tuple[int, int, int]:
     """Numbers of cameras, points and observations."""
-    counts, line = numbers[:HEADER], text.lstrip().split("\n", 1)[0]
+    counts, line = numbers[:_HEADER], text.lstrip().split("\n", 1)[0]
     whole = np.isfinite(counts) & (counts >= 0) & (counts == np.floor(counts)) & (counts < 2**53)
-    if len(line.split()) != HEADER or not whole.all():
+    if len(line.split()) != _HEADER or not whole.all():
         raise DataError(
             f"{_where(path, text, 0)}: expected three whole numbers: cameras points observations"
         )
@@ -140,10 +143,10 @@ def _header(path: Path, text: str, numbers: FloatArray) -> tuple[int, int, int]:
 def _check_indices(
     path: Path, text: str, indices: FloatArray, column: int, what: str, count: int
 ) -> None:
-    """Make sure that indices are whole numbers below a count."""
+    """Check that indices are whole numbers below a count."""
     bad = np.flatnonzero((indices < 0) | (indices >= count) | (indices != np.floor(indices)))
     if len(bad):
-        where = _where(path, text, HEADER + OBSERVATION * int(bad[0]) + column)
+        where = _where(path, text, _HEADER + _OBSERVATION * int(bad[0]) + column)
         raise DataError(
             f"{where}: {what} {indices[bad[0]]:.15g}, but they go from 0 to {count - 1}"
         )

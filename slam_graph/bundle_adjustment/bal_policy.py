@@ -1,53 +1,64 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The row of bundle adjustment in the table of policies, for problems in BAL's format.
+"""Settings of bundle adjustment (a row of the table of policies), and what a solution consists of.
 
-Cost construction: all poses and features, no pairwise pose costs. Gauss-Newton: until convergence.
+Cost construction: all poses and features, no pose costs. Gauss-Newton: until convergence.
 Marginalization: none.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field
-
-from slam_graph.backend.backend_config import GatingConfig
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
-from slam_graph.settings.base import Settings
+from slam_graph.settings.base import Settings, expert
+
+__all__ = [
+    "BalCostPolicy",
+    "BalMinimum",
+    "BalPolicy",
+    "BalSolution",
+    "BalStepsPolicy",
+    "Intrinsics",
+]
 
 Intrinsics = Literal["per_camera", "shared", "fixed"]
 Robust = Literal["none", "huber", "cauchy"]
 
 
 class BalCostPolicy(Settings):
-    """Module 1: all cameras, all points, and how a residual counts."""
+    """Module 1: all cameras, all points, and the loss of a residual."""
 
     intrinsics: Intrinsics = "per_camera"
-    """Focal length and distortion: estimated for each camera, once for all (from their median), or
-    left as they are."""
+    """Which intrinsics (focal length and distortion) are estimated: per_camera (photographs from
+    many cameras), shared (one camera took them all; begins at their median), or fixed."""
     robust: Robust = "none"
-    """Loss that weighs down large reprojection errors."""
-    robust_width_px: float = Field(2.45, gt=0)
-    """Width of the robust loss on the length of a reprojection error (2.45: the 95 % circle of
-    a noise of 1 px)."""
+    """Robust loss of the reprojection errors: huber or cauchy where observations contain outliers;
+    both take more steps, and cauchy needs a good start."""
+    robust_width_px: float = expert(2.45, gt=0)
+    """Reprojection error beyond which the robust loss grows more slowly than the square (2.45: the
+    95 % circle of a noise of 1 px)."""
 
     @property
-    def loss(self) -> GatingConfig:
+    def loss(self) -> RobustLoss:
         """The loss as the back end has it, for errors in pixels."""
-        return GatingConfig(robust_loss=self.robust, robust_width=self.robust_width_px)
+        return RobustLoss(self.robust, self.robust_width_px)
 
 
 class BalStepsPolicy(Settings):
     """Module 2: Levenberg-Marquardt steps."""
 
-    max_steps: int = Field(100, ge=1)
-    """Number of steps at most, rejected ones included."""
-    tolerance: float = Field(1e-6, gt=0)
-    """Steps end when the cost falls by less, relative to its value."""
-    initial_damping: float = Field(1e-4, gt=0)
-    """Damping of the first step, relative to the diagonal of the information."""
+    moved: ClassVar[Mapping[str, str]] = {
+        "initial_damping": "is a constant now: INITIAL_DAMPING in bundle_adjustment/bal_solve.py"
+    }
+
+    max_steps: int = expert(100, ge=1)
+    """Largest number of steps, rejected ones included."""
+    tolerance: float = expert(1e-6, gt=0)
+    """Steps end when the relative decrease of the cost is less."""
 
 
 class BalPolicy(Settings):
@@ -61,12 +72,12 @@ class BalPolicy(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalMinimum:
-    """Where steps have led to.
+    """Where the steps ended.
 
     Attributes:
         estimates: of the cameras and points in the cost.
-        start_cost: half the squared reprojection errors under the loss, at the start.
-        cost: the same in the end.
+        start_cost: half the sum of squared reprojection errors (or of their loss) at the start.
+        cost: the same at the end.
         steps: number of steps, rejected ones included.
         rejected: how many steps did not lower the cost.
         converged: whether the cost stopped falling before the number of steps was used up.
@@ -82,13 +93,13 @@ class BalMinimum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalSolution:
-    """What came of a bundle adjustment.
+    """The result of a bundle adjustment.
 
     Attributes:
         problem: the whole problem.
-        part: what of it was in the cost.
-        minimum: what the steps have led to.
-        estimates: of all cameras and points; those that were not in the cost are as they were.
+        part: the part of it that was in the cost.
+        minimum: where the steps ended.
+        estimates: of all cameras and points; those that were not in the cost are unchanged.
     """
 
     problem: BalProblem

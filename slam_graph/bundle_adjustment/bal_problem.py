@@ -1,17 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What of a bundle-adjustment problem can be estimated; all else is left out and counted.
-
-A bundle-adjustment problem as BAL has it: cameras, points, and where each was seen in which.
+"""Bundle-adjustment problems in the form of BAL: cameras, points, observations, the camera model.
 
 The camera of BAL (Agarwal, Snavely, Seitz & Szeliski 2010) looks along its negative z axis:
 
     P = R X + t,   p = -P_xy / P_z,   pixel = f (1 + k1 ‖p‖² + k2 ‖p‖⁴) p,
 
-with (R, t) = camera_T_world and pixels from the centre of the image, y up. Neither the unit of
-length nor the frame of the world means anything: every similarity of the world has the same pixels.
+with (R, t) = camera_T_world and pixels from the centre of the image, y up. The unit of length and
+the frame of the world are arbitrary: a similarity of the world changes no pixel.
 
-The camera of BAL: pixels of points, and their derivatives.
+`usable` selects what of a problem can be estimated; everything else is left out and counted.
 """
 
 from __future__ import annotations
@@ -27,21 +25,36 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 
+__all__ = [
+    "CAMERA_DIM",
+    "POSE_DIM",
+    "BalEstimates",
+    "BalLinearization",
+    "BalPart",
+    "BalProblem",
+    "linearize",
+    "project",
+    "usable",
+]
+
 POSE_DIM = 6
 CAMERA_DIM = 9
-"""Of a camera: rotation, translation, f k1 k2."""
+"""Tangent of a camera: rotation, translation, f k1 k2."""
+
+_FEWEST_VIEWS = 2
+"""A point must be observed by this many cameras to be determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalEstimates:
     """All variables.
 
-    Their tangent, by camera: δθ and δt in the camera's frame, R ← Exp(δθ) R and t ← t + δt, and
-    additions to f, k1, k2; and additions to the points.
+    Their tangent: for each camera δθ and δt in its frame, with R ← Exp(δθ) R and t ← t + δt, and
+    increments of f, k1, k2; for each point an increment in the world.
 
     Attributes:
         rotations: (C, 3, 3) camera_R_world.
-        translations: (C, 3) world's origin in the camera's frame.
+        translations: (C, 3) camera_t_world: the origin of the world in the frame of the camera.
         intrinsics: (C, 3) f in pixels, k1, k2.
         points: (P, 3) in the world.
     """
@@ -52,7 +65,7 @@ class BalEstimates:
     points: FloatArray
 
     def centres(self) -> FloatArray:
-        """(C, 3) centres of the cameras in the world."""
+        """(C, 3) optical centres of the cameras in the world."""
         return np.asarray(-np.einsum("cji,cj->ci", self.rotations, self.translations))
 
     def select(self, cameras: IntArray, points: IntArray) -> BalEstimates:
@@ -65,7 +78,7 @@ class BalEstimates:
         )
 
     def updated(self, cameras: IntArray, points: IntArray, new: BalEstimates) -> BalEstimates:
-        """With new values of some cameras and points."""
+        """A copy with new values of some cameras and points."""
         merged = BalEstimates(
             self.rotations.copy(),
             self.translations.copy(),
@@ -80,37 +93,6 @@ class BalEstimates:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BalPrior:
-    """What is known of poses and points beside the images, up to normal errors.
-
-    Attributes:
-        rotations: (C, 3, 3) camera_R_world.
-        centres: (C, 3) of the cameras in the world.
-        points: (P, 3) in the world.
-        rotation_sigma: standard deviation of the rotations about each axis, rad.
-        centre_sigma: of the centres along each axis, in the unit of length of the world.
-        point_sigmas: (P,) of the points.
-    """
-
-    rotations: FloatArray
-    centres: FloatArray
-    points: FloatArray
-    rotation_sigma: float
-    centre_sigma: float
-    point_sigmas: FloatArray
-
-    def select(self, cameras: IntArray, points: IntArray) -> BalPrior:
-        """Only some cameras and points."""
-        return replace(
-            self,
-            rotations=self.rotations[cameras],
-            centres=self.centres[cameras],
-            points=self.points[points],
-            point_sigmas=self.point_sigmas[points],
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class BalProblem:
     """Cameras, points and observations.
 
@@ -120,9 +102,6 @@ class BalProblem:
         point: (N,) index of its point.
         pixels: (N, 2) from the centre of the image, y up.
         name: of the problem.
-        prior: on poses and points; with one there is no gauge, the world is that of the prior.
-        lenses: (C,) numbers, from 0 on, of what has intrinsics of its own; if there are none, each
-            camera has.
     """
 
     estimates: BalEstimates
@@ -130,8 +109,6 @@ class BalProblem:
     point: IntArray
     pixels: FloatArray
     name: str = "problem"
-    prior: BalPrior | None = None
-    lenses: IntArray | None = None
 
     @property
     def cameras(self) -> int:
@@ -155,13 +132,14 @@ class BalProblem:
 
 @dataclass(frozen=True)
 class BalPart:
-    """What of a problem can be estimated, with variables renumbered.
+    """The part of a problem that can be estimated, with its variables renumbered.
 
     Attributes:
-        problem: observations by camera, then point; every camera and point has some.
+        problem: observations sorted by camera, then point; every camera and point has some.
         cameras: (C,) indices of its cameras in the whole problem.
         points: (P,) indices of its points there.
-        groups: (C,) for each camera the number of its group; two groups have no point in common.
+        groups: (C,) number of the connected group of each camera; no point is observed by cameras
+            of two groups.
     """
 
     problem: BalProblem
@@ -171,12 +149,8 @@ class BalPart:
 
     @cached_property
     def camera_starts(self) -> IntArray:
-        """(C + 1,) first observation of each camera, and the number of all."""
+        """(C + 1,) index of the first observation of each camera, and N."""
         return np.searchsorted(self.problem.camera, np.arange(self.problem.cameras + 1))
-
-
-NEWTON_STEPS = 10
-"""More than enough for the weak distortion that a calibration leaves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,7 +160,7 @@ class BalLinearization:
     Attributes:
         by_camera: (N, 2, 9) derivatives of the pixels by δθ, δt, f, k1, k2.
         by_point: (N, 2, 3) derivatives by the point.
-        r: (N, 2) predicted less measured pixels.
+        r: (N, 2) residuals: predicted minus measured pixels.
     """
 
     by_camera: FloatArray
@@ -197,7 +171,7 @@ class BalLinearization:
 def project(
     estimates: BalEstimates, camera: IntArray, point: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where points are seen.
+    """Project points into cameras.
 
     Args:
         estimates: cameras and points.
@@ -205,10 +179,10 @@ def project(
         point: (N,) indices of points.
 
     Returns:
-        pixels: (N, 2); not finite for a point in the plane of the camera.
+        pixels: (N, 2); not finite for a point with zero depth.
         depths: (N,) along the optical axis; negative behind the camera.
     """
-    P = _turned(estimates, camera, point) + estimates.translations[camera].T
+    P = _rotated(estimates, camera, point) + estimates.translations[camera].T
     f, k1, k2 = estimates.intrinsics[camera].T
     with np.errstate(all="ignore"):
         u, v = -P[:2] / P[2]
@@ -220,7 +194,9 @@ def project(
 def linearize(
     estimates: BalEstimates, camera: IntArray, point: IntArray, pixels: FloatArray
 ) -> BalLinearization:
-    """Residuals and derivatives of observations; arguments as of `project`, and (N, 2) measured.
+    """Residuals and Jacobians of observations.
+
+    The arguments are those of `project`, and the measured pixels (N, 2).
 
     With (u, v) = -P_xy / P_z and the distortion d(q), q = u² + v², the pixel depends on P by
 
@@ -228,7 +204,7 @@ def linearize(
 
     and P = R X + t on δθ by -[R X]ₓ.
     """
-    N, y = len(camera), _turned(estimates, camera, point)
+    N, y = len(camera), _rotated(estimates, camera, point)
     P = y + estimates.translations[camera].T
     f, k1, k2 = estimates.intrinsics[camera].T
     inverse = -1.0 / P[2]
@@ -253,49 +229,26 @@ def linearize(
     return BalLinearization(by_camera, by_point, (f * d * uv).T - pixels)
 
 
-def rays_of(pixels: FloatArray, intrinsics: FloatArray) -> FloatArray:
-    """Where pixels (N, 2) are on the plane at distance 1; (N, 3) intrinsics f, k1, k2.
-
-    The radius ρ of f (1 + k1 ρ² + k2 ρ⁴) ρ is found by Newton's method, from that without
-    distortion.
-    """
-    f, k1, k2 = intrinsics.T
-    plain = np.linalg.norm(pixels, axis=1) / f
-    radius = plain.copy()
-    for _ in range(NEWTON_STEPS):
-        q = radius**2
-        miss = radius * (1.0 + q * (k1 + q * k2)) - plain
-        radius -= miss / (1.0 + q * (3.0 * k1 + q * 5.0 * k2))
-    shrunk = np.divide(radius, plain, out=np.ones_like(plain), where=plain > 0)
-    return np.asarray(pixels * (shrunk / f)[:, None])
-
-
-def _turned(estimates: BalEstimates, camera: IntArray, point: IntArray) -> FloatArray:
+def _rotated(estimates: BalEstimates, camera: IntArray, point: IntArray) -> FloatArray:
     """(3, N) R X of each observation."""
     X = estimates.points[point].T
     R = estimates.rotations[camera].transpose(1, 2, 0)
     return np.asarray(R[:, 0] * X[0] + R[:, 1] * X[1] + R[:, 2] * X[2])
 
 
-FEWEST_VIEWS = 2
-"""Cameras in which a point must have been seen of which nothing else is known."""
-
-
 def usable(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
     """The part of a problem that can be estimated.
 
-    Left out and counted are second observations of a point in a camera, observations of points
-    that are not in front of their camera at the start, points that are then seen by fewer than two
-    cameras unless there is a prior, and cameras that see none of the others. They keep the
-    estimates that they have.
+    Left out and counted are repeated observations of a point by a camera, observations of points
+    that are not in front of their camera at the start, points that are then observed by fewer than
+    two cameras, and cameras without any remaining observation. They keep their estimates.
 
     Raises:
         DataError: if nothing is left.
     """
     kept = _first_of_pair(problem, diagnostics)
     kept = kept[_in_front(problem.keep(kept), diagnostics)]
-    if problem.prior is None:
-        kept = kept[_seen_twice(problem.keep(kept), diagnostics)]
+    kept = kept[_seen_twice(problem.keep(kept), diagnostics)]
     for camera in np.setdiff1d(np.arange(problem.cameras), problem.camera[kept]):
         diagnostics.warn(
             "bal_camera_without_observations",
@@ -335,12 +288,12 @@ def _in_front(problem: BalProblem, diagnostics: Diagnostics) -> BoolArray:
 def _seen_twice(problem: BalProblem, diagnostics: Diagnostics) -> BoolArray:
     """(N,) whether the point of each observation is seen by two cameras or more."""
     views = np.bincount(problem.point, minlength=problem.points)
-    for point in np.flatnonzero(views < FEWEST_VIEWS):
+    for point in np.flatnonzero(views < _FEWEST_VIEWS):
         diagnostics.warn(
             "bal_point_seen_once",
             f"{problem.name}: point {point} is seen by {views[point]} cameras; it stays as it is",
         )
-    good: BoolArray = views[problem.point] >= FEWEST_VIEWS
+    good: BoolArray = views[problem.point] >= _FEWEST_VIEWS
     return good
 
 
@@ -349,13 +302,9 @@ def _renumbered(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
     cameras, camera = np.unique(problem.camera, return_inverse=True)
     points, point = np.unique(problem.point, return_inverse=True)
     estimates = problem.estimates.select(cameras, points)
-    prior, lenses = problem.prior, problem.lenses
-    prior = None if prior is None else prior.select(cameras, points)
-    lenses = None if lenses is None else np.unique(lenses[cameras], return_inverse=True)[1]
-    part = BalProblem(estimates, camera, point, problem.pixels, problem.name, prior, lenses)
+    part = BalProblem(estimates, camera, point, problem.pixels, problem.name)
     groups = _groups(part)
-    apart = range(1, int(groups.max()) + 1) if prior is None else range(0)
-    for group in apart:
+    for group in range(1, int(groups.max()) + 1):
         diagnostics.warn(
             "bal_not_connected",
             f"{problem.name}: {np.count_nonzero(groups == group)} cameras have no point in common "

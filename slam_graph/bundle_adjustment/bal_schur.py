@@ -1,22 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The damped normal equations of a bundle adjustment, solved by eliminating the points.
+"""Damped normal equations of bundle adjustment, solved by eliminating the points.
 
-With J_c and J_p the derivatives of an observation, U = Σ J_cᵀ J_c of each camera, V = Σ J_pᵀ J_p =
-L Lᵀ of each point, damped, and B = L⁻¹ J_pᵀ J_c, the cameras are left with
+With J_c and J_p the Jacobians of an observation by its camera and its point, U = Σ J_cᵀ J_c of each
+camera, V = Σ J_pᵀ J_p = L Lᵀ of each point (damped) and B = L⁻¹ J_pᵀ J_c, the reduced camera system
+is the Schur complement
 
     S = U - Σ Bᵀ B over all pairs of observations of a point,
 
-a block for each two cameras that see a point in common. The products of two cameras are one matrix
-product over all such points.
+a block for every two cameras that observe a point in common, computed as one matrix product over
+all such points.
 
-The seven degrees of freedom that no image sees: where the world is, how it is turned, its scale.
-
-A similarity X ← s Q X + b of the world leaves all pixels as they are. Steps are therefore taken
-without any part along its seven directions (inner constraints; Triggs, McLauchlan, Hartley &
-Fitzgibbon 2000), and in the end the gauge of the start is restored: the first camera has its pose,
-and the median distance of the points from it is what it was. Groups of cameras that have no point
-in common have seven directions each.
+Gauge: a similarity X ← s Q X + b of the world changes no pixel, so that seven degrees of freedom
+are unobservable. Steps are taken without any part along these directions (inner constraints;
+Triggs, McLauchlan, Hartley & Fitzgibbon 2000), and in the end the gauge of the start is restored:
+the first camera has its pose, and the median distance of the points from it is what it was. Groups
+of cameras without a common point have seven directions each.
 """
 
 from __future__ import annotations
@@ -31,70 +30,41 @@ from scipy.sparse import csr_array
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.bundle_adjustment.bal_cost import BalCost
-from slam_graph.bundle_adjustment.bal_prior import linearized_prior
-from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, POSE_DIM, BalEstimates, BalPart
+from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalPart
 from slam_graph.errors import EstimationError
 
+__all__ = [
+    "GAUGE_DIM",
+    "BalStep",
+    "NormalEquations",
+    "Structure",
+    "damped_step",
+    "gauge_directions",
+    "normal_equations",
+    "restore_gauge",
+    "structure",
+]
+
 GAUGE_DIM = 7
-
-
-def gauge_directions(estimates: BalEstimates, groups: IntArray) -> FloatArray:
-    """(9 C, 7 G) how the tangents of the cameras change with a similarity of each group.
-
-    Of X ← (1 + σ)(I + [φ]ₓ) X + b it is δθ = -R φ and δt = σ t - R b.
-    """
-    C, G = len(groups), int(groups.max()) + 1
-    R, rows = estimates.rotations, np.arange(C)
-    directions = np.zeros((C, CAMERA_DIM, G, GAUGE_DIM))
-    directions[rows, 0:3, groups, 0:3] = -R
-    directions[rows, 3:6, groups, 3:6] = -R
-    directions[rows, 3:6, groups, 6] = estimates.translations
-    return directions.reshape(CAMERA_DIM * C, GAUGE_DIM * G)
-
-
-def restored(part: BalPart, end: BalEstimates) -> BalEstimates:
-    """Estimates of a part, moved by a similarity of each group into the gauge of its start."""
-    start, problem = part.problem.estimates, part.problem
-    group_of_point = np.zeros(problem.points, np.int64)
-    group_of_point[problem.point] = part.groups[problem.camera]
-    rotations, translations = end.rotations.copy(), end.translations.copy()
-    points = end.points.copy()
-    for group in range(int(part.groups.max()) + 1):
-        cameras = np.flatnonzero(part.groups == group)
-        rows, first = np.flatnonzero(group_of_point == group), cameras[0]
-        scale = _median_distance(start, first, rows) / _median_distance(end, first, rows)
-        R_0, t_0 = start.rotations[first], start.translations[first]
-        Q = R_0.T @ end.rotations[first]
-        b = R_0.T @ (scale * end.translations[first] - t_0)
-        points[rows] = scale * end.points[rows] @ Q.T + b
-        rotations[cameras] = end.rotations[cameras] @ Q.T
-        translations[cameras] = scale * end.translations[cameras] - rotations[cameras] @ b
-    return BalEstimates(rotations, translations, end.intrinsics, points)
-
-
-def _median_distance(estimates: BalEstimates, camera: int, points: IntArray) -> float:
-    """Of some points from a camera."""
-    away = estimates.points[points] - estimates.centres()[camera]
-    return float(np.median(np.linalg.norm(away, axis=1)))
-
+"""Unobservable directions: translation, rotation and scale of the world."""
 
 RowArray = NDArray[np.int32]
 
-MOST_CAMERAS = 1_800
-"""Beyond this the reduced system, which is dense, needs more than 2 GB, and to solve it 6 GB."""
-MOST_PAIRS = 100_000_000
-"""Beyond this the table of pairs of observations needs more than 1 GB."""
+_MAX_CAMERAS = 1_800
+"""The dense reduced system of more cameras needs over 2 GB, and 6 GB to be solved."""
+_MAX_PAIRS = 100_000_000
+"""The table of more pairs of observations needs over 1 GB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CommonPoints:
-    """The pairs of observations of the same point, in one camera and in those from it on.
+class _CommonPoints:
+    """Pairs of observations of the same point: one in a camera, one in it or a later camera.
 
     Attributes:
         first: (K,) observations in the camera.
-        second: (K,) observations of the same points, by camera.
-        others: (M,) the cameras of these.
-        starts: (M + 1,) where the pairs of each begin, and K.
+        second: (K,) observations of the same points, sorted by camera.
+        others: (M,) the cameras of the second observations.
+        starts: (M + 1,) first pair of each of these cameras, and K.
     """
 
     first: RowArray
@@ -105,15 +75,15 @@ class CommonPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
-    """What of the equations stays the same from step to step.
+    """The sparsity of the equations, which is the same at every step.
 
     Attributes:
-        sum_by_point: (P, N) adds up what belongs to observations of a point.
-        pairs: of each camera.
+        sum_by_point: (P, N) sums over the observations of each point.
+        pairs: the common points of each camera with itself and the later ones.
     """
 
     sum_by_point: csr_array
-    pairs: list[CommonPoints]
+    pairs: list[_CommonPoints]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,13 +91,13 @@ class NormalEquations:
     """A linearised cost.
 
     Attributes:
-        by_camera: (N, 2, 9) derivatives.
+        by_camera: (N, 2, 9) Jacobians.
         by_point: (N, 2, 3).
         U: (C, 9, 9) information of the cameras.
         g_c: (C, 9) gradient.
         V: (P, 3, 3) information of the points.
         g_p: (P, 3) gradient.
-        gauge: (9 C, 7 G) directions that the cost does not depend on.
+        gauge: (9 C, 7 G) unobservable directions.
     """
 
     by_camera: FloatArray
@@ -146,7 +116,7 @@ class BalStep:
     Attributes:
         by_camera: (C, 9) increments.
         by_point: (P, 3).
-        predicted: by how much the linearised cost falls.
+        predicted: decrease of the linearised cost.
     """
 
     by_camera: FloatArray
@@ -155,7 +125,7 @@ class BalStep:
 
 
 def structure(cost: BalCost) -> Structure:
-    """Prepare the elimination.
+    """Find the common points of all pairs of cameras.
 
     Raises:
         EstimationError: if the problem is too large for a dense reduced system.
@@ -163,10 +133,10 @@ def structure(cost: BalCost) -> Structure:
     problem = cost.part.problem
     views = np.bincount(problem.point)
     pairs = int(np.sum(views * (views + 1) // 2))
-    if problem.cameras > MOST_CAMERAS or pairs > MOST_PAIRS:
+    if problem.cameras > _MAX_CAMERAS or pairs > _MAX_PAIRS:
         raise EstimationError(
             f"{problem.name}: too large: {problem.cameras} cameras and {pairs} pairs of "
-            f"observations of the same point; the most are {MOST_CAMERAS} and {MOST_PAIRS}"
+            f"observations of the same point; the most are {_MAX_CAMERAS} and {_MAX_PAIRS}"
         )
     N = len(problem.point)
     where = (problem.point, np.arange(N))
@@ -174,8 +144,8 @@ def structure(cost: BalCost) -> Structure:
     return Structure(summed, list(_common_points(cost.part, views)))
 
 
-def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[CommonPoints]:
-    """The pairs of each camera."""
+def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[_CommonPoints]:
+    """The common points of each camera."""
     problem, starts = part.problem, part.camera_starts
     by_point = np.argsort(problem.point, kind="stable").astype(np.int32)
     place = np.empty_like(by_point)
@@ -191,7 +161,7 @@ def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[CommonPo
         first, second = first[order], second[order]
         others, begin = np.unique(problem.camera[second], return_index=True)
         bounds = np.append(begin, len(second)).astype(np.int32)
-        yield CommonPoints(first, second, others.astype(np.int32), bounds)
+        yield _CommonPoints(first, second, others.astype(np.int32), bounds)
 
 
 def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -> NormalEquations:
@@ -204,18 +174,9 @@ def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -
         block = rows[a:b].reshape(-1, CAMERA_DIM + 1)
         squares[camera] = block.T @ block
     gauge = gauge_directions(estimates, part.groups)
-    if part.problem.prior is not None:
-        gauge = gauge[:, :0]  # the world is that of the prior
-        by_pose, r = linearized_prior(part.problem.prior, estimates)
-        squares[:, :POSE_DIM, :POSE_DIM] += by_pose.transpose(0, 2, 1) @ by_pose
-        squares[:, :POSE_DIM, -1] += np.einsum("cij,ci->cj", by_pose, r)
     rows = np.concatenate([by_point, linear.r[:, :, None]], axis=2)
     products = np.einsum("nai,naj->nij", by_point, rows).reshape(len(rows), -1)
     of_points = (fixed.sum_by_point @ products).reshape(-1, 3, 4)
-    if part.problem.prior is not None:
-        information = part.problem.prior.point_sigmas[:, None] ** -2.0
-        of_points[:, :, :3] += information[:, :, None] * np.eye(3)
-        of_points[:, :, 3] += information * (estimates.points - part.problem.prior.points)
     return NormalEquations(
         by_camera,
         by_point,
@@ -230,7 +191,7 @@ def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -
 def damped_step(
     cost: BalCost, fixed: Structure, equations: NormalEquations, damping: float
 ) -> BalStep:
-    """The step that minimises the linearised cost with damping, relative to its own diagonal.
+    """The step that minimises the linearised cost, damped relative to its diagonal (Marquardt).
 
     Raises:
         LinAlgError: if the equations are not positive definite.
@@ -243,7 +204,7 @@ def damped_step(
     B = K @ equations.by_camera
     b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
 
-    S = _reduced(cost, fixed, equations, B)
+    S = _reduced_system(cost, fixed, equations, B)
     if E.shape[1] < len(S):
         S = E.T @ S @ E
     g = (
@@ -263,10 +224,10 @@ def damped_step(
     return BalStep(by_camera, by_point, 0.5 * float(held - slope))
 
 
-def _reduced(
+def _reduced_system(
     cost: BalCost, fixed: Structure, equations: NormalEquations, B: FloatArray
 ) -> FloatArray:
-    """(9 C, 9 C) S, both triangles of it."""
+    """(9 C, 9 C) the reduced camera system S, both triangles."""
     C = cost.part.problem.cameras
     S = np.zeros((C, CAMERA_DIM, C, CAMERA_DIM))
     for i, pairs in enumerate(fixed.pairs):
@@ -289,10 +250,10 @@ def _reduced(
 def _solved(
     S: FloatArray, g: FloatArray, D: FloatArray, gauge: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
-    """The increment of the variables of the cameras, and the cost of its part along the gauge.
+    """Increment of the camera variables, and the cost of its part along the gauge.
 
-    Solved in variables of unit information. The gauge's directions, made orthonormal, get an
-    information of 1 where they had none. `S` is overwritten.
+    Variables are scaled to unit information. The gauge directions, made orthonormal, get an
+    information of 1, where they had none. `S` is overwritten.
     """
     scale = 1.0 / np.sqrt(D)
     N, _ = np.linalg.qr(gauge / scale[:, None])
@@ -311,5 +272,45 @@ def _per_camera(cost: BalCost, values: FloatArray) -> FloatArray:
 
 
 def _positive(diagonal: FloatArray) -> FloatArray:
-    """A diagonal to scale by: 1 where nothing is known."""
+    """A diagonal to scale by: 1 where there is no information."""
     return np.where(diagonal > 0, diagonal, 1.0)
+
+
+def gauge_directions(estimates: BalEstimates, groups: IntArray) -> FloatArray:
+    """(9 C, 7 G) derivatives of the camera tangents by a similarity of each group.
+
+    X ← (1 + σ)(I + [φ]ₓ) X + b gives δθ = -R φ and δt = σ t - R b.
+    """
+    C, G = len(groups), int(groups.max()) + 1
+    R, rows = estimates.rotations, np.arange(C)
+    directions = np.zeros((C, CAMERA_DIM, G, GAUGE_DIM))
+    directions[rows, 0:3, groups, 0:3] = -R
+    directions[rows, 3:6, groups, 3:6] = -R
+    directions[rows, 3:6, groups, 6] = estimates.translations
+    return directions.reshape(CAMERA_DIM * C, GAUGE_DIM * G)
+
+
+def restore_gauge(part: BalPart, end: BalEstimates) -> BalEstimates:
+    """Estimates moved by a similarity of each group into the gauge of the start."""
+    start, problem = part.problem.estimates, part.problem
+    group_of_point = np.zeros(problem.points, np.int64)
+    group_of_point[problem.point] = part.groups[problem.camera]
+    rotations, translations = end.rotations.copy(), end.translations.copy()
+    points = end.points.copy()
+    for group in range(int(part.groups.max()) + 1):
+        cameras = np.flatnonzero(part.groups == group)
+        rows, first = np.flatnonzero(group_of_point == group), cameras[0]
+        scale = _median_distance(start, first, rows) / _median_distance(end, first, rows)
+        R_0, t_0 = start.rotations[first], start.translations[first]
+        Q = R_0.T @ end.rotations[first]
+        b = R_0.T @ (scale * end.translations[first] - t_0)
+        points[rows] = scale * end.points[rows] @ Q.T + b
+        rotations[cameras] = end.rotations[cameras] @ Q.T
+        translations[cameras] = scale * end.translations[cameras] - rotations[cameras] @ b
+    return BalEstimates(rotations, translations, end.intrinsics, points)
+
+
+def _median_distance(estimates: BalEstimates, camera: int, points: IntArray) -> float:
+    """Median distance of some points from a camera."""
+    away = estimates.points[points] - estimates.centres()[camera]
+    return float(np.median(np.linalg.norm(away, axis=1)))

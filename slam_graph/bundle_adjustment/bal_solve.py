@@ -2,19 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of BAL problems: the loop of every algorithm here, with the policies of BA.
 
-Cost construction takes all poses and features and no costs between poses, Gauss-Newton goes on
-until convergence, and nothing is marginalised, so that one pass of the loop is all there is.
-
-Module 2 of bundle adjustment: Levenberg-Marquardt steps until the cost no longer falls.
-
-The damping follows how well the linearised cost predicts the true one (Nielsen 1999).
+Cost construction takes all poses and features and no pose costs, Levenberg-Marquardt steps go on
+until convergence, and nothing is marginalised, so that one pass of the loop is the whole algorithm.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, first_estimates, moved
+from slam_graph.backend.solve.damped_steps import (
+    Attempt,
+    GainRatioDamping,
+    StepSettings,
+    levenberg_marquardt,
+)
+from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, initial_estimates, retract
 from slam_graph.bundle_adjustment.bal_policy import (
     BalMinimum,
     BalPolicy,
@@ -22,7 +24,6 @@ from slam_graph.bundle_adjustment.bal_policy import (
     BalStepsPolicy,
 )
 from slam_graph.bundle_adjustment.bal_problem import (
-    POSE_DIM,
     BalEstimates,
     BalPart,
     BalProblem,
@@ -33,82 +34,23 @@ from slam_graph.bundle_adjustment.bal_schur import (
     GAUGE_DIM,
     BalStep,
     NormalEquations,
-    Structure,
     damped_step,
     normal_equations,
-    restored,
+    restore_gauge,
     structure,
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 
-NOTHING_PER_OBSERVATION = 1e-14
+__all__ = ["adjust_bundle"]
+
+INITIAL_DAMPING = 1e-4
+"""Of the first step, relative to the diagonal of the information."""
+NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each observation is rounding: all pixels agree."""
-
-LEAST_DAMPING = 1e-10
-MOST_DAMPING = 1e12
-
-FREE_DAMPING = 0.1
-"""With more damping than this, small steps may be the damping's doing: no sign of convergence."""
-
-
-def minimize(
-    cost: BalCost, start: BalEstimates, policy: BalStepsPolicy, diagnostics: Diagnostics
-) -> BalMinimum:
-    """Take steps on a cost until it no longer falls.
-
-    Raises:
-        EstimationError: if the cost is not finite at the start, or the problem too large.
-    """
-    fixed, estimates, value = structure(cost), start, cost(start)
-    if not np.isfinite(value):
-        raise EstimationError(f"{cost.part.problem.name}: the cost at the start is not finite")
-    start_cost, nothing = value, NOTHING_PER_OBSERVATION * len(cost.part.problem.pixels)
-    damping, growth, rejected, converged, step = policy.initial_damping, 2.0, 0, False, 0
-    equations = None
-    while step < policy.max_steps and damping < MOST_DAMPING and not converged:
-        step += 1
-        equations = equations or normal_equations(cost, estimates, fixed)
-        tried, lower, predicted = _tried(cost, fixed, equations, estimates, damping)
-        enough = policy.tolerance * value
-        free = damping <= FREE_DAMPING
-        if lower < value:
-            converged = lower <= nothing or (free and value - lower <= enough)
-            gain = (value - lower) / predicted
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            damping, growth = max(damping, LEAST_DAMPING), 2.0
-            estimates, value, equations = tried, lower, None
-        else:
-            rejected += 1
-            converged = value <= nothing or (free and predicted <= enough)
-            damping, growth = damping * growth, 2.0 * growth
-    if not converged:
-        still = "no step lowers the cost" if damping >= MOST_DAMPING else "the cost still falls"
-        diagnostics.warn(
-            "bal_not_converged", f"{cost.part.problem.name}: {still} after {step} steps"
-        )
-    return BalMinimum(estimates, start_cost, value, step, rejected, converged)
-
-
-def _tried(
-    cost: BalCost,
-    fixed: Structure,
-    equations: NormalEquations,
-    estimates: BalEstimates,
-    damping: float,
-) -> tuple[BalEstimates, float, float]:
-    """Where a step leads, what that costs, and by how much the cost was to fall.
-
-    The cost is infinite if the equations have no solution.
-    """
-    try:
-        step: BalStep = damped_step(cost, fixed, equations, damping)
-    except np.linalg.LinAlgError:
-        return estimates, np.inf, np.inf
-    if not np.isfinite(step.predicted):
-        return estimates, np.inf, np.inf
-    tried = moved(estimates, step.by_camera, step.by_point)
-    return tried, cost(tried), step.predicted
+CONVERGENCE_DAMPING = 0.1
+"""A small decrease is a sign of convergence only up to this damping: beyond it, steps are small
+because they are damped."""
 
 
 def adjust_bundle(
@@ -120,7 +62,7 @@ def adjust_bundle(
 
     Args:
         problem: cameras, points and observations.
-        policy: how; the defaults if not said.
+        policy: settings; the defaults if not given.
         diagnostics: counts what is left out, and what did not go as asked.
 
     Raises:
@@ -129,37 +71,105 @@ def adjust_bundle(
     """
     policy, diagnostics = policy or BalPolicy(), diagnostics or Diagnostics()
     part = usable(problem, diagnostics)
-    start = first_estimates(part, policy.cost)
+    start = initial_estimates(part, policy.cost)
 
-    # 1. Cost construction: all poses and features, no costs between poses.
+    # 1. Cost construction: all poses and features, no pose costs.
     cost = construct(part, policy.cost)
     _check_determined(cost, diagnostics)
     # 2. Gauss-Newton steps until convergence.
     with np.errstate(all="ignore"):  # a step to where nothing is finite is not taken
-        minimum = minimize(cost, start, policy.gauss_newton, diagnostics)
+        minimum = _minimize(cost, start, policy.gauss_newton, diagnostics)
     # 3. Marginalization: none, every pose and feature stays.
 
-    held = part.problem.prior is not None  # then there is no gauge to restore
-    estimates = minimum.estimates if held else restored(part, minimum.estimates)
+    estimates = restore_gauge(part, minimum.estimates)
     _check_depths(part, estimates, diagnostics)
     everything = problem.estimates.updated(part.cameras, part.points, estimates)
     return BalSolution(problem, part, minimum, everything)
+
+
+def _minimize(
+    cost: BalCost, start: BalEstimates, policy: BalStepsPolicy, diagnostics: Diagnostics
+) -> BalMinimum:
+    """Take steps on a cost until it no longer falls.
+
+    Raises:
+        EstimationError: if the cost is not finite at the start, or the problem too large.
+    """
+    problem, damping = _DampedBundle(cost, start), GainRatioDamping(INITIAL_DAMPING)
+    if not np.isfinite(problem.value()):
+        raise EstimationError(f"{cost.part.problem.name}: the cost at the start is not finite")
+    negligible = NEGLIGIBLE_COST * len(cost.part.problem.pixels)
+
+    def converged(attempt: Attempt) -> bool:
+        if attempt.accepted:
+            value, decrease = attempt.after, attempt.before - attempt.after
+        else:
+            value, decrease = attempt.before, attempt.predicted
+        if value <= negligible:
+            return True
+        return (
+            attempt.damping <= CONVERGENCE_DAMPING and decrease <= policy.tolerance * attempt.before
+        )
+
+    steps = levenberg_marquardt(problem, StepSettings(policy.max_steps, converged), damping)
+    count = steps.accepted + steps.rejected
+    if not steps.converged:
+        still = "no step lowers the cost" if damping.exhausted else "the cost still falls"
+        diagnostics.warn(
+            "bal_not_converged", f"{cost.part.problem.name}: {still} after {count} steps"
+        )
+    return BalMinimum(
+        problem.estimates, steps.costs[0], steps.costs[-1], count, steps.rejected, steps.converged
+    )
+
+
+class _DampedBundle:
+    """A bundle-adjustment cost as `levenberg_marquardt` takes it (see `DampedProblem`)."""
+
+    def __init__(self, cost: BalCost, start: BalEstimates) -> None:
+        self._cost, self._structure = cost, structure(cost)
+        self.estimates = self._before = start
+        self._equations: NormalEquations | None = None
+        self._step: BalStep | None = None
+        self._value: float | None = None
+
+    def value(self) -> float:
+        if self._value is None:
+            self._value = self._cost(self.estimates)
+        return self._value
+
+    def linearize(self) -> None:
+        self._equations = normal_equations(self._cost, self.estimates, self._structure)
+
+    def solve(self, damping: float) -> float:
+        assert self._equations is not None
+        try:
+            self._step = damped_step(self._cost, self._structure, self._equations, damping)
+        except np.linalg.LinAlgError:
+            return np.inf
+        return self._step.predicted
+
+    def apply(self) -> None:
+        assert self._step is not None
+        self._before = self.estimates
+        self.estimates = retract(self.estimates, self._step.by_camera, self._step.by_point)
+        self._value = None
+
+    def undo(self) -> None:
+        self.estimates, self._value = self._before, None
 
 
 def _check_determined(cost: BalCost, diagnostics: Diagnostics) -> None:
     """Count a cost that has fewer residuals than unknowns."""
     part = cost.part
     unknowns = cost.variables.shape[1] + 3 * part.problem.points
+    unknowns -= GAUGE_DIM * (int(part.groups.max()) + 1)
     residuals = 2 * len(part.problem.camera)
-    if part.problem.prior is None:
-        unknowns -= GAUGE_DIM * (int(part.groups.max()) + 1)
-    else:
-        residuals += POSE_DIM * part.problem.cameras
     if residuals < unknowns:
         diagnostics.warn(
             "bal_underdetermined",
-            f"{part.problem.name}: {residuals} coordinates of pixels for {unknowns} unknowns: what "
-            "comes out is one of many solutions",
+            f"{part.problem.name}: {residuals} residuals for {unknowns} unknowns: the result is "
+            "one of many solutions",
         )
 
 
@@ -171,5 +181,5 @@ def _check_depths(part: BalPart, estimates: BalEstimates, diagnostics: Diagnosti
         diagnostics.warn(
             "bal_point_ended_behind_camera",
             f"{problem.name}: point {part.points[problem.point[row]]} ended behind camera "
-            f"{part.cameras[problem.camera[row]]}, which saw it",
+            f"{part.cameras[problem.camera[row]]}, which observes it",
         )

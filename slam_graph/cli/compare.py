@@ -13,8 +13,7 @@ from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.experiment.comparison import Comparison
-    from slam_graph.experiment.executors import Executor
+    from slam_graph.experiment.comparison_plan import Comparison
     from slam_graph.experiment.tasks import Task
 
 __all__ = ["compare"]
@@ -82,39 +81,41 @@ def compare(
 
     Given the same OUTPUT again, only what has not been done yet is done.
     """
-    from slam_graph.config import load_config
     from slam_graph.experiment.comparison import compare as run_comparison
-    from slam_graph.experiment.comparison import load_configs, with_variants
-    from slam_graph.experiment.comparison_report import write_report
-    from slam_graph.experiment.sources import find_sources
 
-    said = {"duration_s": duration, "cameras": cameras}
-    names = [name for name in algorithms.split(",") if name]
-    configs = load_configs(
-        names, lambda name: load_config(config, set_ or (), algorithm=name, **said)
-    )
-    if without_fej:
-        configs = with_variants(configs)
-    sources = find_sources(data, duration, sim_set or (), _truths(groundtruth or []))
-    executor = _executor(workers, scheduler)
     try:
         comparison = run_comparison(
-            sources, configs, seeds, output, executor, _tell if progress else _ignore
+            data,
+            algorithms,
+            seeds=seeds,
+            output=output,
+            config=config,
+            overrides=set_ or (),
+            simulation=sim_set or (),
+            groundtruth=_truths(groundtruth or []),
+            without_fej=without_fej,
+            workers=workers,
+            scheduler=scheduler,
+            progress=_print_task if progress else None,
+            duration_s=duration,
+            cameras=cameras,
         )
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; what is done is kept in {output}: say the same again", err=True)
+        typer.echo(
+            f"interrupted; finished tasks are kept in {output}: give the same command to go on",
+            err=True,
+        )
         raise typer.Exit(INTERRUPTED) from None
-    rows, files = write_report(comparison)
     if as_json:
-        names_of_files = [str(file) for file in files]
-        echo_json({"rows": rows, "failures": comparison.failures, "files": names_of_files})
+        files = [str(file) for file in comparison.files]
+        echo_json({"rows": comparison.rows, "failures": comparison.failures, "files": files})
     else:
-        _echo(comparison, rows, files)
-    _leave(comparison)
+        _echo(comparison)
+    _raise_failures(comparison)
 
 
 def _truths(texts: list[str]) -> dict[str, str]:
-    """The paths of true trajectories, by the data that they belong to."""
+    """The paths of ground truth, by the data that they belong to."""
     pairs = [text.rpartition("=") for text in texts]
     for text, (name, _, path) in zip(texts, pairs, strict=True):
         if not name or not path:
@@ -122,40 +123,26 @@ def _truths(texts: list[str]) -> dict[str, str]:
     return {name: path for name, _, path in pairs}
 
 
-def _executor(workers: int | None, scheduler: str | None) -> Executor:
-    from slam_graph.experiment.executors import DaskCluster, LocalProcesses
-
-    if scheduler is None:
-        return LocalProcesses(workers)
-    if workers is not None:
-        raise typer.BadParameter("--workers is for this machine; a cluster has its own")
-    return DaskCluster(scheduler)
-
-
-def _tell(task: Task, failure: str | None, count: int, total: int) -> None:
-    """Say on stderr that a task has ended."""
+def _print_task(task: Task, failure: str | None, count: int, total: int) -> None:
+    """Print on stderr that a task has ended."""
     ending = "" if failure is None else f": failed: {failure}"
     typer.echo(f"{count}/{total} {task.name}{ending}", err=True)
 
 
-def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
-    """Say nothing."""
-
-
-def _echo(comparison: Comparison, rows: list[dict[str, object]], files: list[Path]) -> None:
-    """Print the table, and where the files are."""
+def _echo(comparison: Comparison) -> None:
+    """Print the table and the names of the files."""
     from slam_graph.experiment.comparison_report import COLUMNS, cells
 
-    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in rows)]
-    echo_table(_telling(table))
+    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in comparison.rows)]
+    echo_table(_informative(table))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
-    typer.echo("  " + " ".join(file.name for file in files))
+    typer.echo("  " + " ".join(file.name for file in comparison.files))
 
 
-def _telling(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """A table without the columns in which nothing is known, and with one data set without it."""
+def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """A table without empty columns, and without the column `data` if there is only one."""
     columns = [
         values
         for values in zip(*table, strict=True)
@@ -164,8 +151,8 @@ def _telling(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
     return list(zip(*columns, strict=True))
 
 
-def _leave(comparison: Comparison) -> None:
-    """Exit code 1 if something could not be done; a run that diverged is a result."""
+def _raise_failures(comparison: Comparison) -> None:
+    """Exit with code 1 if a task failed; a run that diverged is a result."""
     from slam_graph.errors import DataError
 
     if comparison.failures:

@@ -94,8 +94,7 @@ def convert(
 ) -> None:
     """Write a recording of images as an EuRoC folder, whole or not at all."""
     from slam_graph.cli.progress import ProgressBar
-    from slam_graph.datasets.convert import convert_to_euroc
-    from slam_graph.datasets.formats.euroc_writer import refuse_existing
+    from slam_graph.datasets.formats.euroc_writer import convert_to_euroc, refuse_existing
 
     refuse_existing(output, force)
     sequence = open_recording(data, format_, calibration, groundtruth, sources)

@@ -126,8 +126,11 @@ def compare(
 
     options = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
-    for name, changes in parse_frontends(n for n in frontends.split(",") if n).items():
-        settings = load_config(config, [*(set_ or ()), *changes], **options)
+    runs = {  # all at once, so that a wrong name is found before the first run
+        name: load_config(config, [*(set_ or ()), *changes], **options)
+        for name, changes in parse_frontends(n for n in frontends.split(",") if n).items()
+    }
+    for name, settings in runs.items():
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
@@ -149,7 +152,7 @@ def _watch(
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
     """A function that draws each frame, and records it if asked for."""
-    from slam_graph.datasets.formats.track_recording import TrackRecorder
+    from slam_graph.datasets.formats.track_recorder import TrackRecorder
     from slam_graph.sensors.measurements import CameraFrame
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph optimize`: a pose graph, a bundle-adjustment problem or a map in, its optimum out."""
+"""`slam-graph optimize`: a pose graph or a bundle-adjustment problem in, its optimum out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zipfile import is_zipfile
 
 import typer
 
-from slam_graph.cli.optimize_bal import optimize_bal, optimize_map
+from slam_graph.cli.optimize_bal import optimize_bal
 from slam_graph.cli.optimize_common import read_policy
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
 from slam_graph.cli.options import (
@@ -25,7 +25,7 @@ __all__ = ["optimize"]
 
 _Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
 _Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
-_Format = Literal["auto", "pose_graph", "bal", "map"]
+_Format = Literal["auto", "pose_graph", "bal"]
 _Intrinsics = Literal["per_camera", "shared", "fixed"]
 _Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
@@ -35,8 +35,7 @@ def optimize(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Pose graph (g2o or TORO, 2D or 3D), bundle adjustment (BAL, also as .bz2), map, "
-            "or the folder of a run with a map.",
+            help="Pose graph (g2o or TORO, 2D or 3D), or bundle adjustment (BAL, also as .bz2).",
         ),
     ],
     kind: Annotated[
@@ -82,12 +81,11 @@ def optimize(
     ] = Path("results"),
     as_json: Json = False,
 ) -> None:
-    """Optimise a pose graph, a bundle-adjustment problem or a map, and write the results.
+    """Optimise a pose graph or a bundle-adjustment problem, and write the results.
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
-    from slam_graph.maps.map_config import MapBalPolicy
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
@@ -109,21 +107,24 @@ def optimize(
     flags = {"--certify": certify or None, "--covariances": covariances or None}
     others = {"--method": method, "--init": initialization, "--information": information}
     _refuse({**others, **flags}, "pose graphs", file)
-    options = {**loss, **of_bundles}
-    if kind == "map":
-        map_policy = read_policy(MapBalPolicy, config, set_ or [], options)
-        optimize_map(file, map_policy, save, output, as_json)
-    else:
-        bundle_policy = read_policy(BalPolicy, config, set_ or [], options)
-        optimize_bal(file, bundle_policy, save, output, as_json)
+    bundle_policy = read_policy(BalPolicy, config, set_ or [], {**loss, **of_bundles})
+    optimize_bal(file, bundle_policy, save, output, as_json)
 
 
 def _seen_format(file: Path) -> _Format:
-    """The kind of a file, from its content; a folder is that of a run with a map."""
+    """The kind of a file, from its content.
+
+    Raises:
+        DataError: if it is a map.
+    """
     from slam_graph.bundle_adjustment.bal_file import is_bal
 
     if file.is_dir() or is_zipfile(file):
-        return "map"
+        raise DataError(
+            f"{file}: maps are not optimised: their poses come from the bundle adjustment of the "
+            "whole recording; for a better map run the recording again with --loop-closure "
+            "--save-map"
+        )
     return "bal" if is_bal(file) else "pose_graph"
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph simulate`: a sequence that never happened, with its exact truth."""
+"""`slam-graph simulate`: a simulated recording with exact ground truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from slam_graph.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
     from slam_graph.simulation.simulated_sequence import SimulatedSequence
-    from slam_graph.simulation.simulation_config import SimulationConfig
 
 __all__ = ["simulate"]
 
@@ -77,7 +76,6 @@ def simulate(
     """
     from slam_graph.datasets.formats.euroc_writer import refuse_existing
     from slam_graph.simulation.simulator import simulate as make
-    from slam_graph.simulation.writers import write
 
     tracks = {
         "features": features,
@@ -85,12 +83,12 @@ def simulate(
         "outliers": outliers,
         "loss": loss,
     }
-    said = {
+    given: dict[str, Any] = {
         "kind": kind,
         "trajectory": trajectory,
         "real_imu": real_imu,
         "cameras": cameras,
-        "calibration": None if calibration is None else str(calibration),
+        "calibration": calibration,
         "start_s": start,
         "duration_s": duration,
         "rate_hz": rate,
@@ -98,26 +96,11 @@ def simulate(
         "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
     }
     refuse_existing(output)
-    sequence = make(_settings(config, set_ or [], said))
+    sequence = make(config, set_ or (), **given)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
-        write(sequence, output, None if bar is None else lambda t: bar.advance(t, True))
+        sequence.save(output, None if bar is None else lambda t: bar.advance(t, True))
     _report(sequence, output, as_json)
-
-
-def _settings(file: Path | None, overrides: list[str], options: dict[str, Any]) -> SimulationConfig:
-    """The settings: file under options under overrides."""
-    from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
-    from slam_graph.simulation.simulation_config import SimulationConfig
-
-    tree = ConfigTree()
-    if file is not None:
-        tree.merge(read_tree(file))
-    said = {name: value for name, value in options.items() if value is not None}
-    tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
-    for text in overrides:
-        tree.merge(override(text))
-    return validate(SimulationConfig, tree)
 
 
 def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:

@@ -102,8 +102,8 @@ def _located(table: _Table) -> str:
         return f"never, in {table['queries']} comparisons with the map"
     return (
         f"{table['located']} frames, {table['located_share']:.1%} of all, from "
-        f"{table['first_s']:.2f} s on; {table['believed']} sightings accepted of "
-        f"{table['sightings']} in {table['queries']} comparisons, "
+        f"{table['first_s']:.2f} s on; {table['accepted']} of {table['matches']} "
+        f"matches accepted in {table['queries']} comparisons, "
         f"{table['ms_per_frame']:.1f} ms a frame"
     )
 

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded sequences: one file per format behind one protocol, and a registry that guesses."""
+"""Recordings: one protocol (`sequence`), a reader per format, and `open_dataset`."""

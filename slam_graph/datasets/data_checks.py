@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Is a recording fit to run on? Findings about its IMU, frames, ground truth and calibration.
+"""Checks of a recording: findings about its IMU, frames, ground truth and calibration.
 
-What an IMU stream tells about itself: its rate, and its noise and gravity while it is still.
+Of the IMU the rate is compared with the calibration, and noise and gravity in the calmest second,
+if the platform was at rest then.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.datasets.streams.image_sequence import GroupedSequence
 from slam_graph.diagnostics import Diagnostics
@@ -22,25 +23,27 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig
 
+__all__ = ["Finding", "check_sequence"]
+
 WINDOW_NS = 1_000_000_000
-"""Length of the windows among which the calmest is looked for."""
+"""Length of the windows of which the calmest is used."""
 
 STILL_GYRO = 0.03
-"""rad/s: a window whose rates scatter more than this (largest axis, 1σ) is not still."""
+"""rad/s: largest standard deviation of the rates (any axis) of a window at rest."""
 
 STILL_ACCEL = 0.3
 """m/s²: the same for the specific force."""
 
 GRAVITY = 9.81
 GRAVITY_TOLERANCE = 0.5
-"""m/s²: biases are a few tenths; more hints at wrong units or scale."""
+"""m/s²: biases are a few tenths; a larger difference is a sign of wrong units or scale."""
 
 RATE_TOLERANCE = 0.1
 """Largest relative difference of the measured rate from the calibrated one."""
 
 NOISE_RATIO = 30.0
-"""Measured noise this many times above the calibrated one deserves a warning; the vibration of a
-hovering multicopter makes a factor of ten."""
+"""Measured noise this many times the calibrated one gives a warning; the vibration of a hovering
+multicopter makes a factor of ten."""
 
 Found = tuple[Literal["info", "warning", "error"], str]
 
@@ -56,12 +59,12 @@ class _Window:
 
 
 @dataclass
-class ImuSurvey:
-    """Collects statistics over a stream, in constant memory but for one number a second.
+class _ImuSurvey:
+    """Collects statistics of a stream, in constant memory except for one number per second.
 
     Attributes:
         samples: so far.
-        calmest: the window with the least scatter so far.
+        calmest: the window with the smallest standard deviations so far.
     """
 
     samples: int = 0
@@ -80,7 +83,7 @@ class ImuSurvey:
             self._pending = self._pending[cut:]
 
     def findings(self, noise: ImuNoise) -> list[Found]:
-        """What the stream tells, compared with the calibration."""
+        """What was found, compared with the calibration."""
         if self.samples == 0:
             return [("error", "no IMU samples")]
         if not self._periods:
@@ -121,7 +124,9 @@ class ImuSurvey:
             ("info", f"still at {calm.start_ns}: specific force {calm.gravity:.3f} m/s²")
         ]
         if abs(calm.gravity - GRAVITY) > GRAVITY_TOLERANCE:
-            what = f"specific force {calm.gravity:.2f} m/s² at rest instead of {GRAVITY}; m/s²?"
+            what = (
+                f"specific force {calm.gravity:.2f} m/s² at rest, expected {GRAVITY}; wrong unit?"
+            )
             found.append(("error", what))
         root = np.sqrt(noise.rate_hz)
         for name, std, density in (
@@ -146,10 +151,10 @@ def _scatter(window: _Window) -> float:
 Severity = Literal["info", "warning", "error"]
 
 LONG_PAUSE_PERIODS = 3.0
-"""A pause between frames longer than this many median periods is worth a word."""
+"""A pause between frames longer than this many median periods gives a warning."""
 
 FARTHEST_CAMERA_M = 5.0
-"""A camera farther from the IMU than this is more likely a mistake of units than a platform."""
+"""A camera farther from the IMU than this is probably a mistake of units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +162,9 @@ class Finding:
     """One thing that was found.
 
     Attributes:
-        severity: ``info`` for a fact, ``warning`` for what a run survives, ``error`` for what makes
-            its result worthless.
-        what: in one line.
+        severity: ``info`` for a fact, ``warning`` for a fault that a run survives, ``error`` for
+            one that makes its result worthless.
+        what: the finding, in one line.
         where: file, sensor or time.
     """
 
@@ -183,14 +188,14 @@ class _Collector(Diagnostics):
 
 
 def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Finding]:
-    """Go through a whole recording once and tell what is remarkable.
+    """Read a whole recording once and report what is remarkable.
 
     Args:
         sequence: any recording.
-        read_images: decode every image; otherwise only their files are looked for.
+        read_images: decode every image; otherwise only check that the files exist.
 
     Returns:
-        findings, the errors first.
+        The findings, errors first.
     """
     if isinstance(sequence, GroupedSequence) and not read_images:
         sequence = sequence.without_images()
@@ -217,18 +222,18 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
 
 @contextmanager
 def _collecting(sequence: Sequence) -> Iterator[_Collector]:
-    """Have a sequence report its faults to a collector for a while."""
-    usual, collector = sequence.diagnostics, _Collector()
+    """Let a sequence report its faults to a collector inside the block."""
+    previous, collector = sequence.diagnostics, _Collector()
     sequence.diagnostics = collector
     try:
         yield collector
     finally:
-        sequence.diagnostics = usual
+        sequence.diagnostics = previous
 
 
-def _go_through(sequence: Sequence) -> tuple[ImuSurvey, NDArray[np.int64]]:
-    """The IMU and the times of the frames; the IMU alone where there are no frames."""
-    survey = ImuSurvey()
+def _go_through(sequence: Sequence) -> tuple[_ImuSurvey, IntArray]:
+    """Statistics of the IMU, and the times (N,) of the frames."""
+    survey = _ImuSurvey()
     stamps: list[int] = []
     for packet in sequence.packets():
         stamps.append(packet.frame.stamp_ns)
@@ -239,7 +244,7 @@ def _go_through(sequence: Sequence) -> tuple[ImuSurvey, NDArray[np.int64]]:
     return survey, np.array(stamps, np.int64)
 
 
-def _check_frames(stamps: NDArray[np.int64], name: str) -> list[Finding]:
+def _check_frames(stamps: IntArray, name: str) -> list[Finding]:
     if len(stamps) < 2:
         return [Finding("warning", f"{len(stamps)} frames: nothing to run on", name)]
     steps = np.diff(stamps)
@@ -258,7 +263,7 @@ def _check_frames(stamps: NDArray[np.int64], name: str) -> list[Finding]:
     return findings
 
 
-def _check_groundtruth(truth: Trajectory | None, stamps: NDArray[np.int64]) -> list[Finding]:
+def _check_groundtruth(truth: Trajectory | None, stamps: IntArray) -> list[Finding]:
     if truth is None:
         return [Finding("info", "no ground truth", "ground truth")]
     first, last = int(truth.stamps_ns[0]), int(truth.stamps_ns[-1])
@@ -287,7 +292,9 @@ def _check_calibration(rig: Rig) -> list[Finding]:
             findings.append(Finding("error", what, name))
         distance = float(np.linalg.norm(mounted.body_T_camera.translation()))
         if distance > FARTHEST_CAMERA_M:
-            findings.append(Finding("warning", f"{distance:.1f} m from the IMU; metres?", name))
+            findings.append(
+                Finding("warning", f"{distance:.1f} m from the IMU; is it in metres?", name)
+            )
     noise = rig.imu
     values = (
         noise.gyro_noise_density,

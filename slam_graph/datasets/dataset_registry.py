@@ -1,14 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The known formats, and which one a path is of."""
+"""The known formats of recordings, and `open_dataset`, which finds the format of a path."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from slam_graph.datasets.formats.eqvio import EqvioTracks, is_eqvio_file, wheel_tracks
 from slam_graph.datasets.formats.euroc import EurocSequence
@@ -22,27 +20,15 @@ from slam_graph.datasets.formats.tum_vi import TumViSequence, is_tum_vi
 from slam_graph.datasets.formats.video import VideoSequence, is_video
 from slam_graph.datasets.rosbag.bag import is_bag
 from slam_graph.datasets.rosbag.ros_sequence import RosBagSequence
-from slam_graph.datasets.sequence import RecordedSequence
+from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.plugins import Registry
+
+__all__ = ["DATASETS", "DEMO", "Format", "open_dataset"]
 
 DEMO = "demo"
-"""The name that stands for the recording that comes with GTSAM."""
-
-
-class Opener(Protocol):
-    """How every format is opened: the arguments that their classes share."""
-
-    def __call__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> RecordedSequence:
-        """Open the recording at `path`."""
-        ...
+"""The name of the recording that comes with GTSAM."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +36,18 @@ class Format:
     """A format of recordings.
 
     Attributes:
-        open: makes a sequence of a path.
+        open: opens the recording at a path: a subclass of `RecordedSequence`, or a function.
         recognises: whether a path looks like this format.
         looks_like: what `recognises` looks for, for messages.
-        with_sources: makes an opener that is told where each sensor is; None for formats in which
-            that is known.
+        takes_sources: whether `ReaderOptions.sources` has a meaning.
+        fallback: whether a path of which another format is recognised too is of the other one.
     """
 
-    open: Opener
+    open: Callable[[Path, ReaderOptions], RecordedSequence]
     recognises: Callable[[Path], bool]
     looks_like: str
-    with_sources: Callable[[Mapping[str, str]], Opener] | None = None
+    takes_sources: bool = False
+    fallback: bool = False
 
 
 def _is_euroc(path: Path) -> bool:
@@ -71,7 +58,13 @@ def _is_openvins_sim(path: Path) -> bool:
     return (path / "tracks.csv").is_file() and (path / "calib.yaml").is_file()
 
 
-DATASETS: dict[str, Format] = {
+DATASETS: Registry[Format] = Registry(
+    "slam_graph.datasets", "data set format", accepts=lambda part: isinstance(part, Format)
+)
+"""Formats by name. A path is of the first one that recognises it; those of plugins come last, but
+before `fallback`."""
+
+for _name, _format in {
     "tum_vi": Format(TumViSequence, is_tum_vi, "a folder with mav0 and dso/camchain.yaml"),
     "euroc": Format(EurocSequence, _is_euroc, "a folder with mav0/imu0 and mav0/cam0"),
     "kitti_raw": Format(KittiRawSequence, is_kitti_raw, "a folder with image_00 and oxts"),
@@ -83,10 +76,10 @@ DATASETS: dict[str, Format] = {
         RosBagSequence,
         is_bag,
         "a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag",
-        lambda sources: partial(RosBagSequence, sources=sources),
+        takes_sources=True,
     ),
     "recording": Format(
-        TrackRecordingSequence, is_recording, "a folder with meta.yaml, as our recorder writes it"
+        TrackRecordingSequence, is_recording, "a folder with meta.yaml, written by TrackRecorder"
     ),
     "openvins_sim": Format(
         OpenvinsSimulation, _is_openvins_sim, "a folder with calib.yaml, tracks.csv and imu.csv"
@@ -95,27 +88,25 @@ DATASETS: dict[str, Format] = {
         EqvioTracks, is_eqvio_file, f"a CSV file that begins with 'row_type,' (or '{DEMO}')"
     ),
     "video": Format(
-        VideoSequence,
-        is_video,
-        "a video (.mp4, .avi, .mov, .mkv, …)",
-        lambda sources: partial(VideoSequence, sources=sources),
+        VideoSequence, is_video, "a video (.mp4, .avi, .mov, .mkv, …)", takes_sources=True
     ),
     "images": Format(
         ImageFolderSequence,
         is_image_folder,
         "a folder of images",
-        lambda sources: partial(ImageFolderSequence, sources=sources),
+        takes_sources=True,
+        fallback=True,
     ),
-}
-"""Every format by its name; a path is of the first one that recognises it."""
+}.items():
+    DATASETS.register(_name)(_format)
 
 
 def open_dataset(
     path: str | Path,
     format: str | None = None,
     cameras: int | None = None,
-    calibration: Path | None = None,
-    groundtruth: Path | None = None,
+    calibration: str | Path | None = None,
+    groundtruth: str | Path | None = None,
     diagnostics: Diagnostics | None = None,
     sources: Mapping[str, str] | None = None,
 ) -> RecordedSequence:
@@ -123,7 +114,7 @@ def open_dataset(
 
     Args:
         path: file or folder; the word ``demo`` stands for the tracks in GTSAM's wheel.
-        format: name in `DATASETS`; None to guess it from the path.
+        format: name in `DATASETS`; None to find it by the path.
         cameras: use only the first so many; None for all.
         calibration: Kalibr camera chain to use instead of the recording's calibration.
         groundtruth: EuRoC CSV, TUM file or EuRoC folder to use instead of the recording's own.
@@ -133,39 +124,38 @@ def open_dataset(
 
     Raises:
         DataError: if the path is not there, of no known format, or cannot be read.
+        ConfigError: if there is no format with the name, or its plugin cannot be loaded.
     """
     path = Path(path)
     if str(path) == DEMO and not path.exists():
         path = wheel_tracks()
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    return _opener(path, format, sources or {})(
-        path,
-        cameras=cameras,
-        calibration=calibration,
-        groundtruth=groundtruth,
-        diagnostics=diagnostics,
-    )
-
-
-def _opener(path: Path, name: str | None, sources: Mapping[str, str]) -> Opener:
-    """How to open a path, given where its sensors are."""
-    name = _guess(path) if name is None else name
-    if name not in DATASETS:
-        raise DataError(f"unknown data set format '{name}'; known: {', '.join(DATASETS)}")
+    name = _guess(path) if format is None else format
     chosen = DATASETS[name]
-    if not sources:
-        return chosen.open
-    if chosen.with_sources is None:
+    if sources and not chosen.takes_sources:
         given = ", ".join(f"{sensor}={place}" for sensor, place in sources.items())
-        raise DataError(f"{path}: format '{name}' knows its sensors; '{given}' has no meaning here")
-    return chosen.with_sources(sources)
+        raise DataError(f"{path}: format '{name}' knows its sensors; remove '{given}'")
+    options = ReaderOptions(
+        cameras,
+        None if calibration is None else Path(calibration),
+        None if groundtruth is None else Path(groundtruth),
+        sources or {},
+        diagnostics if diagnostics is not None else Diagnostics(),
+    )
+    return chosen.open(path, options)
 
 
 def _guess(path: Path) -> str:
-    """The first format that recognises a path."""
-    for name, known in DATASETS.items():
+    """The first format that recognises a path; plugins are loaded only if they are reached."""
+    fallback = None
+    for name, known in DATASETS.working():
         if known.recognises(path):
-            return name
-    looked = "; ".join(f"{key}: {known.looks_like}" for key, known in DATASETS.items())
-    raise DataError(f"{path}: not a recording of a known format; looked for {looked}")
+            if not known.fallback:
+                return name
+            fallback = fallback or name
+    if fallback is not None:
+        return fallback
+    looked = "; ".join(f"{name}: {known.looks_like}" for name, known in DATASETS.working())
+    failed = "".join(f"; {fault}" for fault in DATASETS.faults())
+    raise DataError(f"{path}: not a recording of a known format; looked for {looked}{failed}")

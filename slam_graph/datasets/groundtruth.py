@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth from EuRoC's CSV, a TUM file, or an EuRoC folder."""
+"""Ground truth: read from EuRoC's CSV, a TUM file, or an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
@@ -23,14 +24,16 @@ from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.euroc_calibration import read_body_T_sensor
 
+__all__ = ["check_groundtruth", "find_groundtruth", "read_groundtruth", "resolve_groundtruth"]
+
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
-"""Where EuRoC and its kin keep poses, in the order of preference."""
+"""Folders of poses in EuRoC and similar recordings, in the order of preference."""
 
 EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
 """Values after the time stamp of an EuRoC ground truth: p, q (w x y z), v, gyro and accel bias."""
 
 SMALLEST_QUATERNION = 0.5
-"""A quaternion shorter than this is not a rounded unit quaternion but a missing value."""
+"""A quaternion shorter than this is a missing value, not a rounded unit quaternion."""
 
 
 def find_groundtruth(mav0: Path) -> Path | None:
@@ -42,7 +45,7 @@ def find_groundtruth(mav0: Path) -> Path | None:
 
 
 def resolve_groundtruth(path: Path) -> Path:
-    """The ground truth file that a file, an EuRoC folder or its parent stands for."""
+    """The ground truth file of a path: itself, or the one in an EuRoC folder or its parent."""
     if path.is_file():
         return path
     for folder in (path / "mav0", path):
@@ -56,14 +59,14 @@ def resolve_groundtruth(path: Path) -> Path:
 
 
 def check_groundtruth(path: Path) -> None:
-    """Fail early: refuse a file without data rows or with an unknown number of columns."""
+    """Refuse a file without data rows or with an unknown number of columns."""
     for rows in read_rows(path, 1):
         _layout(rows)
         return
     raise DataError(f"{path}: no ground truth rows in this file")
 
 
-def read_groundtruth(path: Path, diagnostics: Diagnostics | None = None) -> Trajectory:
+def read_groundtruth(path: str | Path, diagnostics: Diagnostics | None = None) -> Trajectory:
     """Read poses of the body (IMU) in the world.
 
     A comma-separated file is read as EuRoC's (time in ns, p, q as w x y z, and then nothing, the
@@ -79,7 +82,7 @@ def read_groundtruth(path: Path, diagnostics: Diagnostics | None = None) -> Traj
     Raises:
         DataError: if the file is missing, empty, or a row cannot be read.
     """
-    path = resolve_groundtruth(path)
+    path = resolve_groundtruth(Path(path))
     check_groundtruth(path)
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
     blocks = []
@@ -114,7 +117,7 @@ def _layout(rows: Rows) -> tuple[str | None, int]:
     return None, 7
 
 
-def _parse_block(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) and values (N, 7, 10 or 16) with the quaternion as x y z w."""
     delimiter, count = _layout(rows)
     columns = tuple(range(count + 1))
@@ -131,12 +134,12 @@ def _parse_block(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 def _usable(
     rows: Rows,
-    stamps: NDArray[np.int64],
-    values: NDArray[np.float64],
+    stamps: IntArray,
+    values: FloatArray,
     latest_ns: int,
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
-    """Indices of the rows that are finite, have a rotation, and follow the rows before them."""
+    """Indices of the rows that are finite, have a rotation, and are later than those before."""
     whole = np.isfinite(values).all(axis=1)
     whole &= np.linalg.norm(values[:, 3:7], axis=1) > SMALLEST_QUATERNION
     for k in np.flatnonzero(~whole):
@@ -151,7 +154,7 @@ def _usable(
     return np.array(kept, np.intp)
 
 
-def _trajectory(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> Trajectory:
+def _trajectory(stamps: IntArray, values: FloatArray) -> Trajectory:
     quaternions = values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True)
     full = values.shape[1] == 16
     return Trajectory(
@@ -159,16 +162,16 @@ def _trajectory(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> Traje
         values[:, :3].copy(),
         quaternions,
         values[:, 7:10].copy() if values.shape[1] >= 10 else None,
-        values[:, 10:13].copy() if full else None,
-        values[:, 13:16].copy() if full else None,
+        accel_biases=values[:, 13:16].copy() if full else None,
+        gyro_biases=values[:, 10:13].copy() if full else None,
     )
 
 
 def _to_body(trajectory: Trajectory, path: Path) -> Trajectory:
-    """Poses of the IMU, where calibration files say how the tracked frame sits on the platform.
+    """Poses of the IMU, where ``sensor.yaml`` files give the pose of the tracked frame.
 
-    The velocities and biases of another frame are dropped; EuRoC's files that have them all track
-    the body itself.
+    The velocities and biases of another frame are dropped; EuRoC's files that have them track the
+    body itself.
     """
     sensor, imu = path.parent / "sensor.yaml", path.parent.parent / "imu0" / "sensor.yaml"
     if path.name != "data.csv" or not sensor.is_file():

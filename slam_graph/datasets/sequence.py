@@ -1,25 +1,24 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all recorded formats share: they give frames and IMU blocks, this makes the sequence.
+"""Sequences: the protocol of all recordings, and the base class of their readers.
 
-Frames and IMU samples brought together: the packets that a sequence delivers.
-
-The protocol that every recorded sequence fulfils.
+A reader gives frames and blocks of IMU samples; `RecordedSequence` joins them to packets, each a
+frame with the samples that lead up to it.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.datasets.groundtruth import (
     check_groundtruth,
     read_groundtruth,
@@ -30,13 +29,23 @@ from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 
+__all__ = [
+    "Extent",
+    "FrameStream",
+    "ReaderOptions",
+    "RecordedSequence",
+    "Sequence",
+    "SequenceInfo",
+    "within",
+]
+
 HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""
 
 FrameStream = Generator[CameraFrame | FeatureFrame, None, None]
 
 
-class ImuFeed:
+class _ImuFeed:
     """Hands out a stream of IMU blocks in pieces that end at given times.
 
     Attributes:
@@ -66,7 +75,7 @@ class ImuFeed:
         return data[:end]
 
 
-def packetize(
+def _packetize(
     frames: FrameStream,
     blocks: Iterator[ImuData],
     diagnostics: Diagnostics,
@@ -85,7 +94,7 @@ def packetize(
         history_ns: how much of the IMU before the first frame its packet carries; None for all.
         ahead_ns: how far the clock of the IMU is ahead of that of the frames.
     """
-    feed = ImuFeed(blocks)
+    feed = _ImuFeed(blocks)
     previous_ns: int | None = None
     with closing(frames):
         for frame in frames:
@@ -104,8 +113,8 @@ def packetize(
             yield Packet(imu, frame)
 
 
-def packetize_alone(frames: FrameStream) -> Iterator[Packet]:
-    """Packets of a recording without an IMU; the frames are closed at the end."""
+def _packetize_alone(frames: FrameStream) -> Iterator[Packet]:
+    """Packets of a recording without an IMU; `frames` is closed at the end."""
     with closing(frames):
         for frame in frames:
             yield Packet(ImuData.empty(), frame)
@@ -113,13 +122,13 @@ def packetize_alone(frames: FrameStream) -> Iterator[Packet]:
 
 @dataclass(frozen=True)
 class SequenceInfo:
-    """What a sequence holds, without reading it whole.
+    """What a sequence holds.
 
     Attributes:
         name: short name, used for the folder of results (e.g. ``MH_01_easy_17s``).
-        format: name of the data set class in the registry.
+        format: name of the format in `DATASETS`.
         content: whether frames carry images or feature tracks.
-        cameras: number of cameras.
+        cameras: number of cameras in use.
         frames: number of frames (a stereo pair is one frame).
         start_ns, end_ns: times of the first and the last frame.
         imu_samples: number of IMU samples.
@@ -190,16 +199,54 @@ class Extent:
     imu_samples: int
 
 
-class RecordedSequence(ABC):
-    """A recording in files: the part of the `Sequence` protocol that does not depend on the format.
+@dataclass(frozen=True)
+class ReaderOptions:
+    """What a reader is asked for besides the path of the recording.
 
     Attributes:
+        cameras: use only the first so many; None for all.
+        calibration: Kalibr camera chain to use instead of the recording's own calibration.
+        groundtruth: file or folder to use instead of the recording's own ground truth.
+        sources: where each sensor is, in formats that leave it open.
+        diagnostics: where faults are counted.
+    """
+
+    cameras: int | None = None
+    calibration: Path | None = None
+    groundtruth: Path | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
+    diagnostics: Diagnostics = field(default_factory=Diagnostics)
+
+    def select(self, rig: Rig) -> Rig:
+        """The rig with the cameras that are to be used.
+
+        Raises:
+            DataError: if it has fewer.
+        """
+        return rig if self.cameras is None else rig.select(self.cameras)
+
+
+class RecordedSequence(ABC):
+    """Base class of readers: the part of the `Sequence` protocol that is the same in all formats.
+
+    A reader is a subclass whose constructor takes a path and `ReaderOptions`.
+
+    Args:
+        name: of the recording.
+        rig: its calibrated sensors, with the cameras that are used.
+        options: what was asked for; `groundtruth` and `diagnostics` are used here.
+        own_groundtruth: the recording's own ground truth: a file, or a function that gives it.
+
+    Raises:
+        DataError: if there is no ground truth where one was named.
+
+    Attributes:
+        format: name of the format in `DATASETS`.
+        content: whether frames carry images or feature tracks.
         name: of the recording.
         rig: its calibrated sensors.
         has_imu: whether it has gyroscope and accelerometer; without them packets hold frames only.
-        groundtruth_path: file or folder with the ground truth, or None.
-        own_groundtruth: gives the one of formats that keep it among their data, where there is no
-            file with it; None for all others.
+        groundtruth_path: the file that ground truth is read from; None where there is none.
         diagnostics: where faults are counted.
     """
 
@@ -213,20 +260,21 @@ class RecordedSequence(ABC):
         self,
         name: str,
         rig: Rig,
-        groundtruth_path: Path | None,
-        diagnostics: Diagnostics | None,
+        options: ReaderOptions,
+        own_groundtruth: Path | Callable[[], Trajectory] | None = None,
     ) -> None:
         self.name = name
         self.rig = rig
         self.groundtruth_path: Path | None = None
-        self.own_groundtruth: Callable[[], Trajectory] | None = None
-        self.diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+        self.diagnostics = options.diagnostics
         rolling = [mounted.name for mounted in rig.cameras if mounted.rolling_shutter]
         if rolling:
             what = f"{name}: {', '.join(rolling)}: rows are taken as exposed at one time"
             self.diagnostics.warn("rolling_shutter", f"{what}; expect errors in fast motion")
-        if groundtruth_path is not None:
-            self.groundtruth_path = resolve_groundtruth(groundtruth_path)
+        source = options.groundtruth or own_groundtruth
+        self._truth = None if source is None or isinstance(source, Path) else source
+        if isinstance(source, Path):
+            self.groundtruth_path = resolve_groundtruth(source)
             check_groundtruth(self.groundtruth_path)
 
     @abstractmethod
@@ -248,7 +296,7 @@ class RecordedSequence(ABC):
     @property
     def has_groundtruth(self) -> bool:
         """Whether `groundtruth()` gives one."""
-        return self.groundtruth_path is not None or self.own_groundtruth is not None
+        return self.groundtruth_path is not None or self._truth is not None
 
     def info(self) -> SequenceInfo:
         """What the sequence holds; without any frames the times are those of the IMU."""
@@ -277,9 +325,9 @@ class RecordedSequence(ABC):
             end_ns: last frame time to deliver.
         """
         if not self.has_imu:
-            return packetize_alone(self.frames(start_ns, end_ns))
+            return _packetize_alone(self.frames(start_ns, end_ns))
         after_ns = None if start_ns is None else start_ns - HISTORY_NS
-        return packetize(
+        return _packetize(
             self.frames(start_ns, end_ns),
             self.imu_blocks(after_ns),
             self.diagnostics,
@@ -295,16 +343,14 @@ class RecordedSequence(ABC):
         """The true trajectory of the body, where the recording has one."""
         if self.groundtruth_path is not None:
             return read_groundtruth(self.groundtruth_path, self.diagnostics)
-        return None if self.own_groundtruth is None else self.own_groundtruth()
+        return None if self._truth is None else self._truth()
 
     def initial_state(self) -> NavState | None:
         """The state at the start that comes with the data; None unless a format has one."""
         return None
 
 
-def within(
-    stamps_ns: NDArray[np.int64], start_ns: int | None, end_ns: int | None
-) -> NDArray[np.bool_]:
+def within(stamps_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:
     """Which times (N,) lie in a range with optional ends, both included."""
     inside = np.ones(len(stamps_ns), bool)
     if start_ns is not None:

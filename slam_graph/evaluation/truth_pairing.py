@@ -70,7 +70,7 @@ def select(trajectory: Trajectory, indices: IntArray) -> Trajectory:
     """The rows of a trajectory at `indices`."""
     optional = {
         name: None if values is None else values[indices]
-        for name in ("velocities", "gyro_biases", "accel_biases")
+        for name in ("velocities", "accel_biases", "gyro_biases")
         for values in (getattr(trajectory, name),)
     }
     return replace(

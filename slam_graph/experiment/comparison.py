@@ -1,162 +1,112 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A comparison: record every source under every seed, run every algorithm on that, report."""
+"""`compare`: several algorithms on the same feature tracks, over seeds, with a report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from slam_graph.config import RunConfig
+from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
-from slam_graph.experiment.executors import Executor
-from slam_graph.experiment.sources import Source
-from slam_graph.experiment.tasks import RecordTask, RunTask, Task
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.experiment.comparison_plan import (
+    WITHOUT_FEJ,
+    Comparison,
+    Progress,
+    load_configs,
+    run_tasks,
+    with_variants,
+)
+from slam_graph.experiment.comparison_report import write_report
+from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesses
+from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import Task
 
-WITHOUT_FEJ = "_no_fej"
-"""What the name of an algorithm without first-estimates Jacobians ends in."""
+__all__ = [
+    "DEFAULT_ALGORITHMS",
+    "WITHOUT_FEJ",
+    "Comparison",
+    "compare",
+    "load_configs",
+    "with_variants",
+]
 
-Told = Callable[[Task, str | None, int, int], None]
-"""Is told of each task that has ended, why it failed if it did, and how many of how many have."""
-
-
-@dataclass
-class Comparison:
-    """All tasks of a comparison, and what became of them.
-
-    Attributes:
-        folder: of all files.
-        runs: of all algorithms, on all data, for all seeds, in the order of the tables.
-        failures: why a task could not be done, by its name; a run that diverged is not one.
-        skipped: how many tasks had been done before.
-    """
-
-    folder: Path
-    runs: list[RunTask]
-    failures: dict[str, str] = field(default_factory=dict)
-    skipped: int = 0
-
-
-def load_configs(
-    algorithms: Sequence[str], load: Callable[[str], RunConfig]
-) -> dict[str, RunConfig]:
-    """The settings under each algorithm, by the name that the algorithm gives itself.
-
-    Args:
-        algorithms: names, or paths of YAML files.
-        load: gives the settings for one of these.
-
-    Raises:
-        ConfigError: if two have the same name, or there are none.
-    """
-    configs: dict[str, RunConfig] = {}
-    for algorithm in algorithms:
-        config = load(algorithm)
-        name = config.algorithm.name
-        if name in configs:
-            raise ConfigError(f"--algorithms: '{name}' is there twice; give one another name")
-        configs[name] = config
-    if not configs:
-        raise ConfigError("--algorithms: none is named")
-    return configs
-
-
-def with_variants(configs: Mapping[str, RunConfig]) -> dict[str, RunConfig]:
-    """The settings, each followed by the same without first-estimates Jacobians.
-
-    GTSAM's smoothers have no such Jacobians, and so no variant.
-    """
-    both: dict[str, RunConfig] = {}
-    for name, config in configs.items():
-        both[name] = config
-        algorithm = config.algorithm
-        if algorithm.engine == "square_root" and algorithm.marginalization.first_estimates:
-            policy = algorithm.marginalization.model_copy(update={"first_estimates": False})
-            changed = {"name": f"{name}{WITHOUT_FEJ}", "marginalization": policy}
-            variant = config.model_copy(update={"algorithm": algorithm.model_copy(update=changed)})
-            both[variant.algorithm.name] = variant
-    return both
+DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 
 
 def compare(
-    sources: Sequence[Source],
-    configs: Mapping[str, RunConfig],
-    seeds: int,
-    folder: Path,
-    executor: Executor,
-    told: Told,
+    data: str | Path | Sequence[str | Path],
+    algorithms: str | Sequence[str | Path] = DEFAULT_ALGORITHMS,
+    *,
+    seeds: int | Sequence[int] = 1,
+    output: str | Path = "results/comparison",
+    config: str | Path | None = None,
+    overrides: Iterable[str] = (),
+    simulation: Iterable[str] = (),
+    groundtruth: Mapping[str, str | Path] | None = None,
+    without_fej: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
 ) -> Comparison:
-    """Do what has not been done yet. An interruption loses only the tasks that are under way.
+    """Run several algorithms on the same feature tracks, and write a report.
+
+        comparison = compare("sim:figure8", "msckf,swf", seeds=5, duration_s=30)
+        for row in comparison.rows:
+            print(row["algorithm"], row["ate_m"]["se3"], row["nees"]["pose"])
+
+    Tasks that were done by an earlier call with the same settings and `output` are not repeated.
 
     Args:
-        sources: what to run on.
-        configs: settings under each algorithm, which differ in nothing else.
-        seeds: how many; 0, 1, … are taken. Where a seed changes nothing there is only one.
-        folder: of tracks and results.
-        executor: does the tasks.
-        told: is told of the progress.
+        data: one or more of: path of a recording, `demo`, `sim:figure8`, `sim:rooms`, `sim:random`,
+            or `sim:PATH` of a recorded flight with its IMU.
+        algorithms: names or paths of YAML files; a text may hold several with commas between.
+        seeds: their number, for 0, 1, …, or the seeds themselves.
+        output: folder of tracks, results and report.
+        config: YAML file of settings for all runs.
+        overrides: `a.b=value` for all runs, as `--set` takes them.
+        simulation: `a.b=value` for all simulations.
+        groundtruth: paths of ground truth, by the path of the recording as in `data`.
+        without_fej: whether to run each algorithm also without first-estimates Jacobians, under the
+            name NAME_no_fej.
+        workers: processes at a time; the number of cores if None.
+        scheduler: address of a Dask scheduler to run the tasks on instead of this machine.
+        progress: called after each task.
+        settings: top-level settings of all runs, such as `duration_s` and `cameras`.
+
+    Returns:
+        The tasks with their outcome, the rows of the table and the files of the report. A task that
+        could not be done is in `failures`; a run that diverged is a result.
+
+    Raises:
+        ConfigError: if a setting or a name is unknown, or a name is given twice.
+        DataError: if a recording cannot be opened.
     """
-    folder = folder.resolve()
-    recordings, runs = plan(sources, configs, seeds, folder)
-    comparison = Comparison(folder, runs)
-    _do(comparison, recordings, executor, told)
-    _do(comparison, [task for task in runs if task.tracks.is_dir()], executor, told)
+    names = algorithms.split(",") if isinstance(algorithms, str) else map(str, algorithms)
+    changes = list(overrides)
+    configs = load_configs(
+        [name for name in names if name],
+        lambda name: load_config(config, changes, algorithm=name, **settings),
+    )
+    if without_fej:
+        configs = with_variants(configs)
+    inputs = [data] if isinstance(data, (str, Path)) else data
+    sources = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth)
+    executor = _executor(workers, scheduler)
+    comparison = run_tasks(sources, configs, seeds, output, executor, progress or _ignore)
+    write_report(comparison)
     return comparison
 
 
-def plan(
-    sources: Sequence[Source], configs: Mapping[str, RunConfig], seeds: int, folder: Path
-) -> tuple[list[RecordTask], list[RunTask]]:
-    """All tasks: one recording for each source and seed, and on it a run of every algorithm."""
-    recordings: list[RecordTask] = []
-    runs: list[RunTask] = []
-    common = next(iter(configs.values()))
-    replay = {"start_s": 0.0, "duration_s": None, "cameras": None}  # the recording is cut already
-    alike = FinalBaConfig(enabled=False)  # it would end all of them in much the same
-    for source in sources:
-        for seed in range(seeds if source.random else 1):
-            record = RecordTask(source=source, seed=seed, config=common, root=folder / "tracks")
-            recordings.append(record)
-            runs += [
-                RunTask(
-                    data=source.name,
-                    algorithm=name,
-                    seed=seed,
-                    config=_adapted(config, source).model_copy(
-                        update={**replay, "seed": seed, "final_ba": alike}
-                    ),
-                    tracks=record.folder,
-                    result=folder / "runs" / f"{source.name}_seed{seed}" / f"{name}.json",
-                )
-                for name, config in configs.items()
-            ]
-    return recordings, runs
+def _executor(workers: int | None, scheduler: str | None) -> Executor:
+    if scheduler is None:
+        return LocalProcesses(workers)
+    if workers is not None:
+        raise ConfigError("workers is for this machine; a Dask cluster has its own: give only one")
+    return DaskCluster(scheduler)
 
 
-def _adapted(config: RunConfig, source: Source) -> RunConfig:
-    """The settings for a source: a start with an error of its covariance keeps that covariance.
-
-    To take its position and yaw as the definition of the world would call the part of its error in
-    these zero, and every NEES would be too large by it.
-    """
-    if source.simulation is None or not source.simulation.known_start.error:
-        return config
-    start = config.backend.initialization.model_copy(update={"fix_gauge": False})
-    backend = config.backend.model_copy(update={"initialization": start})
-    return config.model_copy(update={"backend": backend})
-
-
-def _do(comparison: Comparison, tasks: Sequence[Task], executor: Executor, told: Told) -> None:
-    """Do those tasks that are not done."""
-    missing = [task for task in tasks if not task.is_done()]
-    comparison.skipped += len(tasks) - len(missing)
-    if not missing:
-        return
-    with closing(executor.do(missing)) as outcomes:
-        for count, (task, failure) in enumerate(outcomes, start=1):
-            if failure is not None:
-                comparison.failures[task.name] = failure
-            told(task, failure, count, len(missing))
+def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
+    """No progress is shown."""

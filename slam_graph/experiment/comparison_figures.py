@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of an experiment: errors, NEES and cost of all algorithms, over time and distance."""
+"""The figures of a comparison: errors, NEES and work of all algorithms, over time and distance."""
 
 from __future__ import annotations
 
@@ -12,15 +12,22 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.consistency import mean_bounds
-from slam_graph.experiment.comparison import Comparison
-from slam_graph.experiment.comparison_results import ALIGNMENTS, Series, read_result, read_series
-from slam_graph.experiment.comparison_summary import STAGE
+from slam_graph.experiment.comparison_plan import Comparison
+from slam_graph.experiment.comparison_results import (
+    ALIGNMENTS,
+    STAGE,
+    Series,
+    read_result,
+    read_series,
+)
 from slam_graph.experiment.tasks import RunTask
 from slam_graph.results.result_files import appearing
 from slam_graph.visualization.comparison_plots import Curve, Panel, plot_panels
 
+__all__ = ["NEES_DOF", "Figure", "draw"]
+
 BINS = 200
-"""Series are averaged over so many equal parts of the time or distance, and over the seeds."""
+"""Number of equal bins of time or distance in which series are averaged, also over the seeds."""
 
 TIME = ("time_s", "time [s]")
 DISTANCE = ("distance_m", "distance [m]")
@@ -38,10 +45,10 @@ class Figure:
 
 
 def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
-    """Draw all that there is to draw of one data.
+    """Draw all figures of one data set.
 
     Args:
-        comparison: its tasks.
+        comparison: with its tasks done.
         data: name of the source.
     """
     tasks = [task for task in comparison.runs if task.data == data and task.is_done()]
@@ -57,21 +64,23 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
             for x, xlabel in (TIME, DISTANCE)
         ]
         file = folder / f"{data}_errors_{mode}.png"
-        yield from _drawn(file, f"{data}: errors, alignment {mode}{mean}", panels)
+        yield from _draw_panels(file, f"{data}: errors, alignment {mode}{mean}", panels)
     panels = _consistency_panels(runs, max(seeds, 1))
-    yield from _drawn(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
+    yield from _draw_panels(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
-        Panel(TIME[1], "ms a frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(TIME[1], "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
         Panel(TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
-        Panel(TIME[1], "steps a frame", _curves(runs, "step_time_s", "steps")),
+        Panel(TIME[1], "steps per frame", _curves(runs, "step_time_s", "steps")),
         Panel(TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
         Panel(TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
     ]
-    yield from _drawn(folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels)
+    yield from _draw_panels(
+        folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels
+    )
 
 
 def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel]:
-    """NEES with the bounds of a mean over the seeds, and NIS."""
+    """NEES with the χ² bounds of a mean over the seeds, and NIS."""
     panels = [
         Panel(
             TIME[1],
@@ -82,7 +91,7 @@ def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel
         )
         for part, dof in NEES_DOF.items()
     ]
-    label = "NIS over what is expected of it"
+    label = "NIS / expected"
     return [*panels, Panel(TIME[1], label, _curves(runs, "nis_time_s", "nis_ratio"))]
 
 
@@ -103,7 +112,7 @@ def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:
 
 
 def _series(tasks: list[RunTask], algorithm: str) -> list[Series]:
-    """The series of all runs of an algorithm that did not break off."""
+    """The series of all runs of an algorithm that reached the end."""
     mine = (task for task in tasks if task.algorithm == algorithm)
     return [read_series(task.result) for task in mine if _is_whole(task)]
 
@@ -138,8 +147,8 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
     return curves
 
 
-def _drawn(file: Path, title: str, panels: Iterable[Panel]) -> Iterator[Figure]:
-    """Draw those panels that show something."""
+def _draw_panels(file: Path, title: str, panels: Iterable[Panel]) -> Iterator[Figure]:
+    """Draw the panels that have curves, if any."""
     shown = [panel for panel in panels if panel.curves]
     if shown:
         with appearing(file) as partial:

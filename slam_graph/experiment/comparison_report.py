@@ -1,20 +1,35 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The report of an experiment: Markdown, HTML with its pictures in it, and the table as JSON."""
+"""The report of a comparison: a table with a row for each algorithm on each data set, and figures.
+
+It is written as Markdown, as one HTML file with the figures in it, and the table as JSON.
+"""
 
 from __future__ import annotations
 
 import base64
 import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from html import escape
-from pathlib import Path
+from typing import Any
 
-from slam_graph.experiment.comparison import Comparison
+import numpy as np
+
 from slam_graph.experiment.comparison_figures import Figure, draw
-from slam_graph.experiment.comparison_results import ALIGNMENTS, Table
-from slam_graph.experiment.comparison_summary import summarize
+from slam_graph.experiment.comparison_plan import Comparison
+from slam_graph.experiment.comparison_results import (
+    ALIGNMENTS,
+    STAGE,
+    Table,
+    read_result,
+    read_series,
+)
+from slam_graph.experiment.tasks import RunTask
 from slam_graph.results.metrics import finite, versions
 from slam_graph.results.result_files import write_text
+
+__all__ = ["COLUMNS", "cells", "write_report"]
 
 COLUMNS = (
     "algorithm",
@@ -33,16 +48,15 @@ COLUMNS = (
 )
 
 EXPLANATION = (
-    "All algorithms were given the same recorded feature tracks and IMU samples. "
-    "ATE is the root mean square of the position error of the causal estimate after no alignment, "
-    "after alignment of yaw and position, and of the whole pose; orientation is after alignment "
-    "of yaw and position. A NEES should be 3, that of the whole pose 6. NIS / expected, of the "
-    "innovations of the images that passed the gate, should be 1; gated is the share that did not. "
-    "Numbers are means over the seeds whose runs ended "
-    "well; peak memory is the largest. Steps are those of Gauss-Newton a frame, without those that "
-    "damping took back. Milliseconds are those of the back end, and the arrow goes "
-    "from the median of the first third of the frames to that of the last: a growing cost shows "
-    "there."
+    "All algorithms were given the same recorded feature tracks and IMU samples. ATE is the root "
+    "mean square position error of the causal estimate: without alignment, after alignment of "
+    "yaw and position, and after SE(3) alignment. Orientation is after alignment of yaw and "
+    "position. The ideal NEES is 3, for the pose 6. The ideal NIS / expected, over the "
+    "innovations that passed the gate, is 1; gated is the share that did not pass. Steps are "
+    "accepted Gauss-Newton steps per frame. Milliseconds are those of the back end per frame; "
+    "the column after gives their median in the first and last third of the frames, between "
+    "which a growing cost shows. Numbers are means over the seeds whose runs have status ok; "
+    "peak memory is the maximum."
 )
 
 STYLE = (
@@ -53,13 +67,9 @@ STYLE = (
 )
 
 
-def write_report(comparison: Comparison) -> tuple[list[Table], list[Path]]:
-    """Write the report of what has been done so far.
-
-    Returns:
-        The rows of the table, and the files.
-    """
-    rows = finite(summarize(comparison))
+def write_report(comparison: Comparison) -> None:
+    """Write the report of the tasks done so far, and fill `rows` and `files` of the comparison."""
+    rows = finite(_summarize(comparison))
     names = dict.fromkeys(task.data for task in comparison.runs)
     figures = {name: list(draw(comparison, name)) for name in names}
     folder = comparison.folder
@@ -68,7 +78,7 @@ def write_report(comparison: Comparison) -> tuple[list[Table], list[Path]]:
     write_text(files[1], [_html(comparison, rows, figures)])
     table = {"rows": rows, "failures": comparison.failures, "versions": versions()}
     write_text(files[2], [json.dumps(table, indent=1, allow_nan=False), "\n"])
-    return rows, files
+    comparison.rows, comparison.files = rows, files
 
 
 def cells(row: Table) -> tuple[str, ...]:
@@ -92,6 +102,85 @@ def cells(row: Table) -> tuple[str, ...]:
     )
 
 
+def _summarize(comparison: Comparison) -> list[Table]:
+    """A row for each algorithm and data set, in the order of the plan.
+
+    Errors, NEES and times are means over the runs with status `ok`; peak memory is the largest.
+    """
+    groups: dict[tuple[str, str], list[RunTask]] = {}
+    for task in comparison.runs:
+        groups.setdefault((task.data, task.algorithm), []).append(task)
+    return [_row(data, algorithm, tasks) for (data, algorithm), tasks in groups.items()]
+
+
+def _row(data: str, algorithm: str, tasks: list[RunTask]) -> Table:
+    found = [(task, read_result(task.result)) for task in tasks if task.is_done()]
+    results = [result for _, result in found if result is not None]
+    statuses = Counter(result["metrics"]["status"] for result in results)
+    statuses["not_done"] = len(tasks) - len(results)
+    good = [result["metrics"] for result in results if result["metrics"]["status"] == "ok"]
+    ends = [_cost_at_ends(task) for task, result in found if result is not None]
+    return {
+        "data": data,
+        "algorithm": algorithm,
+        "seeds": len(tasks),
+        "status": dict(+statuses),
+        "ate_m": {mode: _mean(good, _ate(mode, "translation_m")) for mode in ALIGNMENTS},
+        "orientation_deg": {mode: _mean(good, _ate(mode, "rotation_deg")) for mode in ALIGNMENTS},
+        "nees": {
+            part: _mean(good, lambda m, part=part: m["nees"][part]["mean"])  # type: ignore[misc]
+            for part in ("orientation", "position", "pose")
+        },
+        "nis": {
+            part: _mean(good, lambda m, part=part: m["nis"][part])  # type: ignore[misc]
+            for part in ("mean", "expected_mean", "mean_before_gate", "inside_bounds", "rejected")
+        },
+        "steps": _average(r["mean_steps"] for r in results if r["mean_steps"] is not None),
+        "ms_per_frame": _mean(good, lambda m: m["timing"]["stages"][STAGE]["mean_ms"]),
+        "ms_first_third": _average(first for first, _ in ends),
+        "ms_last_third": _average(last for _, last in ends),
+        "peak_memory_mb": max(
+            (r["metrics"]["peak_memory_mb"] or 0.0 for r in results), default=None
+        ),
+    }
+
+
+def _cost_at_ends(task: RunTask) -> tuple[float, float]:
+    """Median milliseconds per frame of the first and of the last third of the estimated frames."""
+    series = read_series(task.result)
+    values = series.get(f"ms_{STAGE}", np.zeros(0))
+    values = values[np.isfinite(series.get("ms_backend.gauss_newton", values))]
+    third = len(values) // 3
+    if third == 0:
+        return np.nan, np.nan
+    return float(np.median(values[:third])), float(np.median(values[-third:]))
+
+
+def _ate(mode: str, part: str) -> Callable[[Table], Any]:
+    return lambda metrics: metrics["accuracy"][mode]["ate"][part]["rmse"]
+
+
+def _mean(metrics: list[Table], get: Callable[[Table], Any]) -> float | None:
+    """Mean over the runs that have the number."""
+    return _average(_numbers(metrics, get))
+
+
+def _numbers(metrics: list[Table], get: Callable[[Table], Any]) -> Iterator[float]:
+    for table in metrics:
+        try:
+            value = get(table)
+        except (KeyError, TypeError):
+            continue  # no ground truth, no covariance, or nothing to align
+        if value is not None:
+            yield value
+
+
+def _average(values: Iterable[float]) -> float | None:
+    """Mean of the finite values, or None."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else None
+
+
 def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list[Figure]]) -> str:
     lines = ["# Comparison of algorithms", "", EXPLANATION, ""]
     for name, drawn in figures.items():
@@ -102,7 +191,7 @@ def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list
         for figure in drawn:
             lines += [f"![{figure.title}]({figure.file.relative_to(comparison.folder)})", ""]
     if comparison.failures:
-        lines += ["## What could not be done", ""]
+        lines += ["## Failed tasks", ""]
         lines += [f"- {name}: {reason}" for name, reason in comparison.failures.items()]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -127,7 +216,7 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
             text = escape(figure.title, quote=True)
             parts.append(f'<p><img alt="{text}" src="data:image/png;base64,{data}"></p>')
     if comparison.failures:
-        parts.append("<h2>What could not be done</h2><ul>")
+        parts.append("<h2>Failed tasks</h2><ul>")
         failures = comparison.failures.items()
         parts += [f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in failures]
         parts.append("</ul>")

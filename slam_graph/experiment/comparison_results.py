@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is kept of a run in an experiment: a JSON file of numbers and an NPZ file of series.
+"""Results of one run of a comparison: a JSON file with metrics and an NPZ file with series.
 
-Series of the NPZ file, all of them over the N frames that have a true pose, the K that have a
-covariance too, or all F that were read:
+Series of the NPZ file, over the N frames that have a true pose, the K of them that also have a
+covariance, or all F frames:
 
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
 - `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
 - `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
-- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (S,): Gauss-Newton steps of the S
-  frames that took some, and the dimension of the state in them;
-- `nis_time_s`, `nis_ratio`, and `nis_COLUMN` (I,): innovations of the I frames of which something
-  was predicted (`slam_graph.backend.cost.gating.Innovations`), and NIS over what is expected of it;
+- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (S,): for the S frames with
+  Gauss-Newton steps, their number, the dimension of the state and the cost;
+- `nis_time_s`, `nis_ratio`, and `nis_COLUMN` (I,): for the I frames with innovations, these
+  (`slam_graph.backend.cost.gating.Innovations`), and NIS over its expected value;
 - `frame_time_s`, `ms_STAGE` (F,): milliseconds of each stage; NaN where it did not run.
 """
 
@@ -34,26 +34,42 @@ from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.results.result_files import appearing, write_text
 from slam_graph.results.run_result import RunResult
 
+__all__ = [
+    "ALIGNMENTS",
+    "STAGE",
+    "Series",
+    "Table",
+    "read_result",
+    "read_series",
+    "write_result",
+]
+
 SCHEMA_VERSION = 2
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3")
 
+STAGE = "backend"
+"""The stage of the pipeline in which algorithms differ."""
+
 Series = dict[str, NDArray[Any]]
+"""Arrays by the names above."""
+
 Table = dict[str, Any]
+"""A JSON object."""
 
 
 def write_result(path: Path, result: RunResult, about: Table) -> None:
-    """Write a run; the JSON file comes last, so that it is there only with its series.
+    """Write the results of a run, the JSON file last: if it exists, so do the series.
 
     Args:
         path: of the JSON file.
         result: the run.
-        about: names the run.
+        about: data, algorithm, seed and hash of the settings.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     with appearing(path.with_suffix(".npz")) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **series_of(result))  # type: ignore[arg-type]  # its last keyword
+        np.savez_compressed(file, **_series_of(result))  # type: ignore[arg-type]  # its last keyword
     table = {
         "schema_version": SCHEMA_VERSION,
         **about,
@@ -65,7 +81,7 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
 
 
 def read_result(path: Path) -> Table | None:
-    """The JSON file of a run, or None if it is not there or not of this version."""
+    """The JSON file of a run, or None if it is missing or of another schema version."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, json.JSONDecodeError):
@@ -80,8 +96,8 @@ def read_series(path: Path) -> Series:
         return {name: file[name] for name in file.files}
 
 
-def series_of(result: RunResult) -> Series:
-    """All series of a run; those that the ground truth does not allow are left out."""
+def _series_of(result: RunResult) -> Series:
+    """All series of a run; errors and NEES only if there is ground truth."""
     series: Series = {
         f"ms_{stage}": result.logs.timing.column(stage) for stage in result.logs.timing.stages()
     }
@@ -112,7 +128,7 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         try:
             translation = ape(true, estimate, "trans_part", mode)
         except DataError:
-            continue  # what never moves cannot be aligned
+            continue  # without motion the alignment is undetermined
         series[f"translation_m_{mode}"] = translation.values
         series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
     return series

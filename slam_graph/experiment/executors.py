@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where tasks are done: processes of this machine, or a Dask cluster."""
+"""Executors of tasks: processes on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -16,29 +16,33 @@ from typing import Protocol
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.tasks import Task
 
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Tasks share the cores among them; BLAS reads these when it is loaded."""
+__all__ = ["DaskCluster", "Executor", "LocalProcesses"]
 
-PATIENCE_S = 10.0
-CONNECT_S = 10.0
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment of a task: tasks run in parallel, so BLAS uses one thread in each."""
+
+STOP_TIMEOUT_S = 10.0
+"""Time for a task to end after SIGINT before it is killed."""
+
+CONNECT_TIMEOUT_S = 10.0
 
 Outcome = tuple[Task, str | None]
-"""A task that has ended, and why it failed if it did."""
+"""A task that has ended, and why it failed or None."""
 
 
 class Executor(Protocol):
     """Does tasks."""
 
     def do(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-        """Do all tasks, and give each when it has ended. Closing the iterator stops the others."""
+        """Do all tasks; yields each when it has ended. Closing the generator stops the others."""
         ...
 
 
 class LocalProcesses:
-    """Each task in a fresh process of this machine.
+    """Runs each task in a new process on this machine.
 
     Args:
-        workers: how many at a time; as many as there are cores if None.
+        workers: processes at a time; the number of cores if None.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -57,24 +61,24 @@ class LocalProcesses:
                 self._stopped = True
                 pool.shutdown(wait=False, cancel_futures=True)
                 for process in list(self._running):
-                    stop(process)
+                    _stop(process)
                 raise
 
     def _do(self, task: str) -> str | None:
         if self._stopped:
             return "stopped"
-        process = start(task)
+        process = _start(task)
         self._running.add(process)
         try:
-            return outcome(process)
+            return _wait(process)
         finally:
             self._running.discard(process)
 
 
 class DaskCluster:
-    """Each task in a fresh process that a worker of a Dask cluster starts.
+    """Runs each task in a new process, started by a worker of a Dask cluster.
 
-    The workers need this package and the folders of data and results under the same paths.
+    Workers need this package, and data and results under the same paths.
 
     Args:
         address: of the scheduler, e.g. ``tcp://127.0.0.1:8786``.
@@ -101,33 +105,33 @@ class DaskCluster:
         from distributed import Client, as_completed
 
         try:
-            client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
+            client = Client(self.address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise DataError(f"no Dask scheduler answers at '{self.address}'") from error
         with client:
             texts = [task.model_dump_json() for task in tasks]
-            futures = client.map(do_in_process, texts, pure=False, retries=0)
+            futures = client.map(_do_in_process, texts, pure=False, retries=0)
             named = {future.key: task for future, task in zip(futures, tasks, strict=True)}
             try:
                 for future in as_completed(futures, loop=client.loop):
                     lost = future.exception()
-                    said = future.result() if lost is None else f"{type(lost).__name__}: {lost}"
-                    yield named[future.key], said
+                    failure = future.result() if lost is None else f"{type(lost).__name__}: {lost}"
+                    yield named[future.key], failure
             except BaseException:
                 client.cancel(futures)
                 raise
 
 
-def do_in_process(task: str) -> str | None:
-    """Do a task in a process of its own.
+def _do_in_process(task: str) -> str | None:
+    """Do a task in a new process.
 
     Returns:
-        Why it failed, or None if it did not.
+        Why it failed, or None.
     """
-    return outcome(start(task))
+    return _wait(_start(task))
 
 
-def start(task: str) -> subprocess.Popen[str]:
+def _start(task: str) -> subprocess.Popen[str]:
     """Start the process of a task; Ctrl-C in the terminal does not reach it."""
     return subprocess.Popen(
         [sys.executable, "-m", "slam_graph.experiment.tasks", task],
@@ -140,24 +144,24 @@ def start(task: str) -> subprocess.Popen[str]:
     )
 
 
-def stop(process: subprocess.Popen[str]) -> None:
-    """End the process of a task: by an interruption, which leaves nothing half done."""
+def _stop(process: subprocess.Popen[str]) -> None:
+    """End the process of a task with SIGINT, upon which it leaves no incomplete files."""
     with suppress(ProcessLookupError):
         process.send_signal(signal.SIGINT)
     try:
-        process.wait(PATIENCE_S)
+        process.wait(STOP_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
 
 
-def outcome(process: subprocess.Popen[str]) -> str | None:
-    """Wait for the process of a task; why it failed, or None."""
-    _, said = process.communicate()
+def _wait(process: subprocess.Popen[str]) -> str | None:
+    """Wait for the process of a task. Returns why it failed, or None."""
+    _, errors = process.communicate()
     if process.returncode == 0:
         return None
     if process.returncode < 0:
         return f"ended by signal {-process.returncode}"
-    lines = said.strip().splitlines()
+    lines = errors.strip().splitlines()
     kind, _, message = lines[-1].partition(": ") if lines else ("", "", "")
-    # an error that was raised on purpose says all in its message
+    # the message of an error of this package is complete without its type
     return message if kind.startswith("slam_graph.errors.") else f"{kind}: {message}"

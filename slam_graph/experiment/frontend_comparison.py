@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Front ends on one recording: what their tracks are like, and what an algorithm makes of them."""
+"""Front ends compared on one recording: track quality, and accuracy of an algorithm on them."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ import numpy as np
 
 from slam_graph.config import RunConfig
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import DataError
 from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
-from slam_graph.frontend.build_frontend import FRONTENDS, build_frontend
+from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.pipeline.run import run
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking
 from slam_graph.results.run_logs import TimingLog
 
+__all__ = ["FrontendReport", "parse_frontends", "track", "track_and_estimate"]
+
 
 @dataclass(frozen=True)
 class FrontendReport:
-    """What a front end made of a recording.
+    """Results of a front end on a recording.
 
     Attributes:
         name: of the front end.
         tracks: the quality of its tracks.
         inliers: share of the associated features that pass outlier rejection.
-        counts: mean counts a frame.
-        ms: mean milliseconds a frame of each stage; `total` is all of the front end.
-        ate_m: position error of an algorithm on these tracks after alignment; None without one, or
-            without ground truth.
-        status: how the run of the algorithm ended; empty without one.
+        counts: mean counts per frame.
+        ms: mean milliseconds per frame of each stage; `total` is the whole front end.
+        ate_m: ATE of an algorithm on these tracks after SE(3) alignment; None without an algorithm
+            or ground truth.
+        status: status of the run of the algorithm; empty without one.
     """
 
     name: str
@@ -63,7 +65,7 @@ def track(
         sequence: of images.
         config: `frontend`, `seed`, `start_s` and `duration_s` matter.
         name: for the report.
-        watch: is shown every packet.
+        watch: called with every tracked packet.
 
     Raises:
         DataError: if the recording holds no images.
@@ -72,7 +74,13 @@ def track(
     if info.content != "images" or info.frames == 0:
         raise DataError(f"{info.name}: holds no images; there is nothing to track")
     quality = TrackQuality(sequence.rig, sequence.groundtruth())
-    frontend = build_frontend(sequence.rig, config.frontend, config.seed, sequence.diagnostics)
+    frontend = build_frontend(
+        sequence.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        gravity=config.backend.noise.gravity,
+    )
     start_ns = info.start_ns + round(config.start_s * 1e9)
     end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
     packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
@@ -88,7 +96,7 @@ def track(
 
 
 def track_and_estimate(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
-    """Run the whole pipeline, whose back end tells the front end what it knows.
+    """Run the whole pipeline, with feedback of the back end to the front end.
 
     Args:
         sequence: of images.
@@ -130,19 +138,14 @@ def _report(
 
 
 def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
-    """The settings of front ends that are given as METHOD or METHOD/DETECTOR.
+    """The settings of front ends given as METHOD or METHOD/DETECTOR.
 
     Returns:
-        by name, overrides for `load_config`.
-
-    Raises:
-        ConfigError: if there is no such method.
+        by name, overrides for `load_config`, which refuses unknown ones.
     """
     settings = {}
     for name in names:
         method, _, detector = name.partition("/")
-        if method not in FRONTENDS:
-            raise ConfigError(f"unknown front end '{method}'; known: {', '.join(FRONTENDS)}")
         settings[name] = [f"frontend.method={method}"]
         settings[name] += [f"frontend.detector={detector}"] if detector else []
     return settings

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment runs on: recordings by their path, simulated set-ups as `sim:NAME`."""
+"""The data of a comparison: recordings by path, simulations as `sim:NAME`."""
 
 from __future__ import annotations
 
@@ -10,75 +10,80 @@ from pathlib import Path
 
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.settings.base import Settings
 from slam_graph.settings.tree import ConfigTree, override, validate
-from slam_graph.simulation.simulation_config import SHAPES, SimulationConfig, StartConfig
+from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig, StartConfig
 from slam_graph.simulation.simulator import simulate
+
+__all__ = ["Source", "find_sources"]
 
 PREFIX = "sim:"
 
 
 class Source(Settings):
-    """A recording or a simulated set-up; each task of an experiment opens it anew."""
+    """A recording or a simulation; each task of a comparison opens it anew."""
 
     name: str
     """Short name, for files and tables."""
     recording: str | None = None
     """Path of a recording."""
     groundtruth: str | None = None
-    """True trajectory to use instead of that of the recording."""
+    """Ground truth to use instead of that of the recording."""
     simulation: SimulationConfig | None = None
     """Settings of a simulation, whose seed is replaced."""
     random: bool = True
     """Whether a seed changes anything."""
     extent: tuple[int, int, int] | None = None
-    """Frames, first and last time of a recording, by which a changed one is noticed."""
+    """Number of frames, first and last time of a recording; they reveal that it has changed."""
 
     def open(self, seed: int, cameras: int | None) -> Sequence:
-        """The sequence; a seed changes what is simulated.
+        """The sequence; of a simulation, that with the given seed.
 
         Raises:
             DataError: if it cannot be read.
         """
         if self.simulation is not None:
-            return simulate(self.simulation.model_copy(update={"seed": seed, "cameras": cameras}))
+            return simulate(self.simulation, seed=seed, cameras=cameras)
         assert self.recording is not None
         truth = None if self.groundtruth is None else Path(self.groundtruth)
         return open_dataset(self.recording, cameras=cameras, groundtruth=truth)
 
 
 def find_sources(
-    names: Iterable[str],
+    names: Iterable[str | Path],
     duration_s: float | None,
     overrides: Iterable[str] = (),
-    groundtruths: Mapping[str, str] | None = None,
+    groundtruths: Mapping[str, str | Path] | None = None,
 ) -> list[Source]:
-    """The sources that a user names.
+    """The sources with the names that a user gives.
 
     Args:
         names: paths of recordings, `demo`, `sim:figure8`, `sim:rooms`, `sim:random`, or
             `sim:PATH` of a recorded ground truth with its IMU.
-        duration_s: length of what is simulated.
-        overrides: `key=value` of `SimulationConfig`, for all that is simulated.
-        groundtruths: for a recording, by its path as in `names`, the path of its true trajectory.
+        duration_s: length of the simulations.
+        overrides: `key=value` of `SimulationConfig`, for all simulations.
+        groundtruths: paths of ground truth, by the path of the recording as in `names`.
 
     Raises:
         DataError: if a recording cannot be opened.
         ConfigError: if an override does not fit, or a source is named twice.
     """
-    changes, truths = list(overrides), dict(groundtruths or {})
+    changes = list(overrides)
+    truths = {name: str(path) for name, path in (groundtruths or {}).items()}
     sources: dict[str, Source] = {}
-    for name in names:
+    for name in map(str, names):
         if name.startswith(PREFIX):
             source = _simulated(name.removeprefix(PREFIX), duration_s, changes)
         else:
             source = _recorded(name, truths.pop(name, None))
         if source.name in sources:
-            raise ConfigError(f"{name}: another source is called '{source.name}' too; rename one")
+            raise ConfigError(f"{name}: another source is also called '{source.name}'; rename one")
         sources[source.name] = source
     if truths:
-        raise ConfigError(f"--groundtruth: no recording in DATA is called '{next(iter(truths))}'")
+        raise ConfigError(
+            f"groundtruth: no recording called '{next(iter(truths))}' is in the comparison"
+        )
     return list(sources.values())
 
 
@@ -95,16 +100,18 @@ def _recorded(path: str, groundtruth: str | None) -> Source:
     )
 
 
-def _simulated(what: str, duration_s: float | None, overrides: list[str]) -> Source:
-    tree = ConfigTree({"trajectory": what, "duration_s": duration_s})
-    if what in SHAPES:
-        # drawn from its covariance, so that a NEES over seeds means something
+def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) -> Source:
+    tree = ConfigTree({"trajectory": trajectory, "duration_s": duration_s})
+    if trajectory in TRAJECTORIES:
+        # the error of the start is drawn from its covariance: without it the NEES is too small
         tree.merge(ConfigTree({"start": StartConfig(error=True).model_dump()}))
-        name = what
+        name = trajectory
     else:
-        path = Path(what).resolve()
+        path = Path(trajectory).resolve()
         if not path.exists():
-            raise DataError(f"{what}: no such file or folder, and not one of {', '.join(SHAPES)}")
+            raise DataError(
+                f"{PREFIX}{trajectory}: no such file or folder; {closest(trajectory, TRAJECTORIES)}"
+            )
         tree.merge(ConfigTree({"trajectory": str(path), "real_imu": True}))
         name = path.name
     for text in overrides:
@@ -113,5 +120,5 @@ def _simulated(what: str, duration_s: float | None, overrides: list[str]) -> Sou
 
 
 def _plain(name: str) -> str:
-    """The name with nothing in it that a file name should not have."""
+    """The name with characters that file names should not have replaced."""
     return re.sub(r"[^\w.-]+", "_", name)

@@ -1,68 +1,67 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Data association: the same points in another image. The protocol of both families of methods."""
+"""Data association, the protocol: the same points in the next image, by tracking or matching."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.arrays import BoolArray, IntArray
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction
-from slam_graph.frontend.tracked_features import Image, Tracks
+
+__all__ = ["Association", "Associator", "Candidates", "inside"]
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
-    """What became of features in the next image.
+class Association:
+    """Where features are in the next image.
 
     Attributes:
         points: (N, 2) float32 pixels there.
         good: (N,) whether a feature was found.
-        fates: (N,) which of the others were lost, by cause.
+        lost: for each cause, which features (N,) were lost by it.
     """
 
-    points: Points
-    good: Mask
-    fates: dict[str, Mask]
+    points: Pixels
+    good: BoolArray
+    lost: dict[str, BoolArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Births:
-    """Features that could be new.
+class Candidates:
+    """Points that may become new features.
 
     Attributes:
         points: (M, 2) float32 pixels in the new image.
-        origins: (M, 2) float32 pixels in the image before, or None if they were not looked for.
-        share: their epipolar distance must be below this share of what is allowed to others.
+        origins: (M, 2) float32 pixels in the image before; None if they were not looked for there.
+        tolerance_scale: their largest epipolar distance, relative to that of tracked features.
     """
 
-    points: Points
-    origins: Points | None
-    share: float = 1.0
+    points: Pixels
+    origins: Pixels | None
+    tolerance_scale: float = 1.0
 
 
 class Associator(Protocol):
     """Finds the features of one camera in its next image, and new ones there.
 
-    For each image `follow`, `recover`, `births` and `adopt` are called in this order.
+    For each image `follow`, `recover`, `propose` and `accept` are called in this order.
     """
 
-    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
         """Find features in the next image.
 
         Args:
-            before: of the image before.
+            before: features of the image before.
             image: the next one.
             guess: where to look first.
         """
         ...
 
-    def recover(self, before: Tracks, after: Tracks) -> tuple[NDArray[np.int64], Points]:
-        """Features that were lost and are seen again, or were missed at first.
+    def recover(self, before: Tracks, after: Tracks) -> tuple[IntArray, Pixels]:
+        """Features that were lost in an earlier image, or were missed in this one, and are found.
 
         Args:
             before: features of the image before.
@@ -74,30 +73,35 @@ class Associator(Protocol):
         """
         ...
 
-    def births(self, before: Tracks, after: Tracks, verify: bool) -> Births:
-        """Candidates for new features where there are few, found in the image before too.
+    def propose(self, before: Tracks, after: Tracks, verify: bool) -> Candidates:
+        """Candidates for new features where there are few.
 
         Args:
             before: features of the image before.
             after: all features of the new image so far.
-            verify: whether to look for them in the image before.
+            verify: whether candidates must be found in the image before too.
         """
         ...
 
-    def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
-        """The last births (M,) that were `chosen` have become features with these ids (K,)."""
+    def accept(self, ids: IntArray, chosen: BoolArray) -> None:
+        """Some candidates have become features.
+
+        Args:
+            ids: (K,) of the new features.
+            chosen: (M,) which of the candidates proposed last they are.
+        """
         ...
 
-    def forget(self, ids: NDArray[np.int64]) -> None:
-        """Do not look for some features any more."""
+    def forget(self, ids: IntArray) -> None:
+        """Do not look for these features any more."""
         ...
 
 
-def inside(points: Points, shape: tuple[int, ...], border_px: int) -> Mask:
+def inside(points: Pixels, shape: tuple[int, ...], border_px: int) -> BoolArray:
     """Which points (N, 2) lie in an image of `shape` (height, width), `border_px` from its edge."""
     u, v = points[:, 0], points[:, 1]
     height, width = shape[:2]
-    result: Mask = (
+    result: BoolArray = (
         (u >= border_px)
         & (v >= border_px)
         & (u <= width - 1 - border_px)

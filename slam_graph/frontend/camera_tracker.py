@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The features of one camera from image to image: predicted, associated, tested, replenished."""
+"""The features of one camera from image to image: predict, associate, test, replenish."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import Associator
-from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.outliers import (
     MIN_POINTS,
     coherent_groups,
@@ -22,27 +22,31 @@ from slam_graph.frontend.outliers import (
     map_inliers,
 )
 from slam_graph.frontend.prediction import PointPredictor
-from slam_graph.frontend.tracked_features import Image, Mask, Tracks
 from slam_graph.sensors.rig import RigCamera
+
+__all__ = ["CameraTracker"]
+
+MERGE_DISTANCE_PX = 3.0
+"""Of two features closer than this the younger one is dropped: they track the same corner."""
 
 
 class CameraTracker:
-    """Follows the features of one camera.
+    """Tracks the features of one camera.
 
     Args:
         mounted: the camera.
         extractor: knows its mask.
         associator: tracks or matches.
         predictor: says where to look.
-        config: options.
-        stats: gets counts and times.
-        rng: decides what RANSAC tries first.
+        config: settings.
+        stats: receives counts and times.
+        rng: draws the samples of RANSAC.
     """
 
     def __init__(
         self,
         mounted: RigCamera,
-        extractor: CornerExtractor,
+        extractor: FeatureExtractor,
         associator: Associator,
         predictor: PointPredictor,
         config: FrontendConfig,
@@ -57,7 +61,7 @@ class CameraTracker:
         self._config = config
         self._stats = stats
         self._rng = rng
-        self._groups: list[IntArray] = []
+        self._motion_ids: list[IntArray] = []  # of the features of each rigid motion
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
         """The features of the image before in the next one.
@@ -71,67 +75,67 @@ class CameraTracker:
         with self._stats.timed("temporal_ms"):
             self._predictor.advance(before.stamp_ns, stamp_ns)
             guess = self._predictor.predict(before, stamp_ns, feedback)
-            match = self._associator.follow(before, image, guess)
-            keep = match.good.copy()
-            keep[keep] = self._extractor.allows(match.points[keep])
-            self._stats.count(**match.fates, lost_mask=match.good & ~keep)
+            found = self._associator.follow(before, image, guess)
+            keep = found.good.copy()
+            keep[keep] = self._extractor.allows(found.points[keep])
+            self._stats.count(**found.lost, lost_mask=found.good & ~keep)
         with self._stats.timed("ransac_ms"):
-            normalized = self._camera.undistort(match.points[keep].astype(np.float64))
-            after = Tracks.of(image, stamp_ns, before.ids[keep], match.points[keep], normalized)
-            groups = self._rigid(before.normalized[keep], normalized)
-            self._groups = [after.ids[rows] for rows in groups]
+            normalized = self._camera.undistort(found.points[keep].astype(np.float64))
+            after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
+            motions = self._rigid_motions(before.normalized[keep], normalized)
+            self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = np.zeros(len(after), np.bool_)
-            inlier[np.concatenate(groups)] = True
+            inlier[np.concatenate(motions)] = True
             in_map = np.ones(len(after), np.bool_)
-            in_map[inlier] = self._on_the_map(after.select(inlier), stamp_ns, feedback)
+            in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
             self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
             after = after.select(inlier & in_map)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
-        alone = _apart(after.pixels, self._config.merge_distance_px)
+        alone = _apart(after.pixels, MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
-        return self._with_drift(before, after.select(alone))
+        return self._with_residual_flow(before, after.select(alone))
 
     def replenish(self, before: Tracks, after: Tracks, next_id: int) -> Tracks:
-        """The features of an image, and new ones where it has few.
+        """Add new features where an image has few.
 
         Args:
             before: features of the image before.
-            after: features of this image that were followed.
+            after: features of this image that were found again.
             next_id: id of the first new feature.
         """
         here, there = after.common(before)
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
-            births = self._associator.births(before, after, verify)
-            points = births.points
+            candidates = self._associator.propose(before, after, verify)
+            points = candidates.points
             normalized = self._camera.undistort(points.astype(np.float64))
             good = np.ones(len(points), np.bool_)
-            drift = np.full((len(points), 2), np.nan)
-            if births.origins is not None:
-                origins = self._camera.undistort(births.origins.astype(np.float64))
+            flow = np.full((len(points), 2), np.nan)
+            if candidates.origins is not None:
+                origins = self._camera.undistort(candidates.origins.astype(np.float64))
                 motions = self._motions(before.select(there), after.select(here))
-                good = self._born(origins, normalized, births.share, motions)
+                good = self._fits_motion(origins, normalized, candidates.tolerance_scale, motions)
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-                drift = self._predictor.drift(origins, normalized, seconds)
+                flow = self._predictor.residual_flow(origins, normalized, seconds)
             self._stats.count(rejected_new=~good, new=good)
             ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
-            self._associator.adopt(ids, good)
+            self._associator.accept(ids, good)
         new = Tracks.of(after.image, after.stamp_ns, ids, points[good], normalized[good])
-        new.drift[:] = drift[good]
+        new.residual_flow[:] = flow[good]
         return after.joined(new)
 
-    def forget(self, ids: NDArray[np.int64]) -> None:
-        """Do not look for some features any more."""
+    def forget(self, ids: IntArray) -> None:
+        """Do not look for these features any more."""
         self._associator.forget(ids)
 
-    def _rigid(self, before: FloatArray, after: FloatArray) -> list[IntArray]:
-        """Rows of the matches (N, 2) that fit a rigid motion, for each that is there."""
+    def _rigid_motions(self, before: FloatArray, after: FloatArray) -> list[IntArray]:
+        """The rows of the matches (N, 2) that fit each rigid motion, the largest group first."""
         everything = np.arange(len(before))
         if self._config.outliers == "none":
             return [everything]
 
-        def inliers(rows: IntArray) -> Mask:
+        def inliers(rows: IntArray) -> BoolArray:
             return self._inliers(before[rows], after[rows])
 
         largest = inliers(everything)
@@ -140,42 +144,42 @@ class CameraTracker:
             *coherent_groups(inliers, everything[~largest], len(before)),
         ]
 
-    def _inliers(self, before: FloatArray, after: FloatArray, share: float = 1.0) -> Mask:
-        """Which matches (N, 2) fit the motion of most of them, within a share of the threshold."""
+    def _inliers(self, before: FloatArray, after: FloatArray, scale: float = 1.0) -> BoolArray:
+        """Which matches (N, 2) fit the motion of most of them, with the tolerance scaled."""
         config, focal_px = self._config, self._camera.fx
         if config.outliers == "gyroscope" and self._predictor.rotation_known:
             R = self._predictor.camera_R
-            return direction_inliers(before, after, R, focal_px, config, self._rng, share)
+            return direction_inliers(before, after, R, focal_px, config, self._rng, scale)
         order = self._rng.permutation(len(before))
         inlier = np.empty(len(before), np.bool_)
-        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, config, share)
+        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, config, scale)
         return inlier
 
-    def _born(
-        self, origins: FloatArray, points: FloatArray, share: float, motions: list[FloatArray]
-    ) -> Mask:
-        """Which candidates (M, 2) for new features move as others do, or as one of their own."""
-        limit_px = share * self._config.epipolar_px
+    def _fits_motion(
+        self, origins: FloatArray, points: FloatArray, scale: float, motions: list[FloatArray]
+    ) -> BoolArray:
+        """Which candidates (M, 2) for new features fit a motion of the features, or a new one."""
+        limit_px = scale * self._config.epipolar_px
         distances = [epipolar_distance(F, origins, points) for F in motions]
-        good: Mask = np.min(distances, axis=0) * self._camera.fx < limit_px
+        good: BoolArray = np.min(distances, axis=0) * self._camera.fx < limit_px
 
-        def inliers(rows: IntArray) -> Mask:
-            return self._inliers(origins[rows], points[rows], share)
+        def inliers(rows: IntArray) -> BoolArray:
+            return self._inliers(origins[rows], points[rows], scale)
 
         for group in coherent_groups(inliers, np.flatnonzero(~good), len(good)):
             good[group] = True
         return good
 
     def _motions(self, before: Tracks, after: Tracks) -> list[FloatArray]:
-        """The epipolar matrix (3, 3) of each motion that features common to two images have."""
-        others = [np.isin(after.ids, ids) for ids in self._groups[1:]]
+        """The fundamental matrix (3, 3) of each rigid motion of the features in both images."""
+        others = [np.isin(after.ids, ids) for ids in self._motion_ids[1:]]
         groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
         matches = ((before.normalized[rows], after.normalized[rows]) for rows in groups)
         motions = [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
         return motions or [eight_point(before.normalized, after.normalized)]
 
-    def _on_the_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> Mask:
-        """Which features (N,) fit the map of the back end; those that are not in it do."""
+    def _fits_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> BoolArray:
+        """Which features (N,) fit the map of the back end, or are not in it."""
         fits = np.ones(len(tracks), np.bool_)
         if self._config.map_check_px is None:
             return fits
@@ -191,7 +195,7 @@ class CameraTracker:
         return fits
 
     def _recovered(self, before: Tracks, after: Tracks) -> Tracks:
-        """The features, and those that were lost and are seen again."""
+        """The features, and those that were lost and are found again."""
         ids, points = self._associator.recover(before, after)
         if len(ids) == 0:
             return after
@@ -201,19 +205,19 @@ class CameraTracker:
         normalized = self._camera.undistort(points.astype(np.float64))
         return after.joined(Tracks.of(after.image, after.stamp_ns, ids, points, normalized))
 
-    def _with_drift(self, before: Tracks, after: Tracks) -> Tracks:
-        """The same features with their velocities."""
+    def _with_residual_flow(self, before: Tracks, after: Tracks) -> Tracks:
+        """The same features with their residual flow since the image before."""
         here, there = after.common(before)
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-        after.drift[here] = self._predictor.drift(
+        after.residual_flow[here] = self._predictor.residual_flow(
             before.normalized[there], after.normalized[here], seconds
         )
         return after
 
 
-def _apart(pixels: NDArray[np.float32], distance_px: float) -> Mask:
+def _apart(pixels: Pixels, distance_px: float) -> BoolArray:
     """Which points (N, 2) are not within a distance of an earlier one."""
     u, v = pixels.T
     close = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2 < distance_px**2
-    result: Mask = ~np.any(np.tril(close, -1), axis=1)
+    result: BoolArray = ~np.any(np.tril(close, -1), axis=1)
     return result

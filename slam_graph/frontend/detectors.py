@@ -1,28 +1,77 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors: what in an image is worth following.
+"""Detectors: which points of an image are worth tracking.
 
-Corner scores are local, so those detectors look only at the cells of the grid that need features.
-The others build a pyramid, and look at the image as a whole.
-
-Libraries that only some methods need: imported when asked for, with advice where absent.
+The score of a corner is local, so corner detectors look only at those cells of the grid that need
+features. The others build a pyramid and need the whole image.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
+from slam_graph.arrays import IntArray
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.keypoints import Indices, Keypoints, Points
-from slam_graph.frontend.tracked_features import Image
+from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
+from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
+
+__all__ = [
+    "BRISK_OCTAVES",
+    "DETECTORS",
+    "ORB_EDGE_PX",
+    "ORB_LEVELS",
+    "Detector",
+    "refine",
+    "require",
+]
 
 INSTALL = "pip install 'slam-graph[descriptors]'"
+
+CORNER_WINDOW_PX = 7
+"""Side of the window over which gradients are summed for the scores of Shi-Tomasi and Harris."""
+
+RELATIVE_SCORE = 0.05
+"""A corner of a cell has at least this share of the eigenvalue of the cell's best one: low, because
+`min_corner_score` already rules out noise, and weak corners keep the coverage even."""
+
+HARRIS_K = 0.04
+"""Weight of the trace in Harris' score det - k trace² (Harris and Stephens 1988)."""
+
+SUBPIXEL_RADIUS_PX = 3
+SUBPIXEL_LIMIT_PX = 1.5
+"""A corner that refinement moves further than this has been drawn to another one."""
+
+ORB_LEVELS = 4
+ORB_EDGE_PX = 20
+BRISK_OCTAVES = 2
+
+
+class Detector(Protocol):
+    """Finds keypoints.
+
+    Attributes:
+        local: whether a part of an image is enough to judge a keypoint in it. Then `detect` is
+            given the cells of the grid that need features, otherwise the whole image.
+    """
+
+    local: bool
+
+    def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
+        """The strongest keypoints, best first.
+
+        Args:
+            image: (height, width), or a part of it.
+            allowed: of the same size, zero where none are wanted.
+            count: how many are wanted. More may be returned, and they may lie too close together:
+                the caller applies non-maximum suppression.
+            distance_px: least distance of two keypoints after that suppression, for detectors that
+                can save work by it.
+        """
+        ...
 
 
 def require(module: str, purpose: str) -> Any:
@@ -42,38 +91,7 @@ def require(module: str, purpose: str) -> Any:
         raise ConfigError(f"{purpose}: needs {library}, install it: {INSTALL}") from error
 
 
-HARRIS_K = 0.04
-"""Weight of the trace in Harris' score det - k trace² (Harris and Stephens 1988)."""
-
-FAST_SIZE_PX = 7.0
-"""Diameter of FAST's circle."""
-
-SUBPIXEL_RADIUS_PX = 3
-SUBPIXEL_LIMIT_PX = 1.5
-"""A corner that refinement moves further has been drawn to another one."""
-
-
-class Detector(Protocol):
-    """Finds keypoints.
-
-    Attributes:
-        local: whether a part of an image is enough to judge a keypoint in it.
-    """
-
-    local: bool
-
-    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
-        """The strongest keypoints, best first.
-
-        Args:
-            image: (height, width), or a part of it.
-            allowed: of the same size, zero where none are wanted.
-            count: how many are wanted; there may be more, and too close together.
-        """
-        ...
-
-
-class GradientCorners:
+class _GradientCorners:
     """Corners by the covariance of the gradient: Shi and Tomasi 1994, or Harris and Stephens 1988.
 
     Both scores are functions of its eigenvalues λ₁ ≤ λ₂: λ₁, and λ₁ λ₂ - k (λ₁ + λ₂)².
@@ -82,24 +100,22 @@ class GradientCorners:
     local = True
 
     def __init__(self, config: FrontendConfig, harris: bool) -> None:
-        self._config = config
         self._harris = harris
         # Harris' score of a corner with two eigenvalues that are just large enough
         self._smallest = config.min_corner_score
         if harris:
             self._smallest = (1.0 - 4.0 * HARRIS_K) * config.min_corner_score**2
 
-    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+    def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest corners."""
-        config = self._config
         corners, scores = cv2.goodFeaturesToTrackWithQuality(
             image,
             count,
             # the share is one of eigenvalues, of which Harris' score is the square
-            config.relative_corner_score ** (2 if self._harris else 1),
-            config.min_distance_px,
+            RELATIVE_SCORE ** (2 if self._harris else 1),
+            distance_px,
             allowed,
-            blockSize=config.corner_window_px,
+            blockSize=CORNER_WINDOW_PX,
             useHarrisDetector=self._harris,
             k=HARRIS_K,
         )
@@ -108,13 +124,24 @@ class GradientCorners:
         found = Keypoints.of(
             np.asarray(corners, np.float32),
             np.ravel(scores).astype(np.float32),
-            float(config.corner_window_px),
+            float(CORNER_WINDOW_PX),
         )
         return found.select(found.scores >= self._smallest)
 
 
-class FastCorners:
-    """FAST (Rosten and Drummond 2006): a circle of which a long arc is brighter or darker."""
+@DETECTORS.register("shi_tomasi")
+def _shi_tomasi(config: FrontendConfig) -> Detector:
+    return _GradientCorners(config, harris=False)
+
+
+@DETECTORS.register("harris")
+def _harris(config: FrontendConfig) -> Detector:
+    return _GradientCorners(config, harris=True)
+
+
+@DETECTORS.register("fast")
+class _FastCorners:
+    """FAST (Rosten and Drummond 2006): a long arc of a circle is brighter or darker."""
 
     local = True
 
@@ -125,7 +152,7 @@ class FastCorners:
             for divisor in (1, 2)
         ]
 
-    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+    def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The corners with the largest threshold at which they would still be found."""
         for detector in self._detectors:
             found = detector.detect(image, allowed)
@@ -135,12 +162,12 @@ class FastCorners:
         return keypoints.select(_strongest_first(keypoints))
 
 
-class WholeImage:
-    """A detector of OpenCV that looks at several scales.
+class _MultiScale:
+    """A detector of OpenCV that searches an image at several scales.
 
     Args:
         detector: does the work.
-        shrink: by what factor the image is reduced before it is looked at.
+        shrink: factor by which the image is reduced first.
     """
 
     local = False
@@ -149,7 +176,7 @@ class WholeImage:
         self._detector = detector
         self._shrink = shrink
 
-    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+    def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest keypoints of all scales."""
         shrink = self._shrink
         if shrink > 1:
@@ -165,7 +192,37 @@ class WholeImage:
         return found.select(_strongest_first(found))
 
 
-class SurfBlobs:
+@DETECTORS.register("dog")
+def _difference_of_gaussians(config: FrontendConfig) -> Detector:
+    """SIFT's detector (Lowe 2004).
+
+    OpenCV doubles the image first, as Lowe does. On video the finest octave costs three quarters of
+    the time and gives the least stable keypoints, so the image is halved before.
+    """
+    return _MultiScale(cv2.SIFT.create(4 * config.max_features, contrastThreshold=0.02), shrink=2)
+
+
+@DETECTORS.register("orb")
+def _orb(config: FrontendConfig) -> Detector:
+    """ORB's detector (Rublee et al. 2011): FAST on a pyramid, ranked by Harris, with direction."""
+    return _MultiScale(
+        cv2.ORB.create(
+            20 * config.max_features,
+            nlevels=ORB_LEVELS,
+            edgeThreshold=ORB_EDGE_PX,
+            fastThreshold=max(1, config.fast_threshold // 4),
+        )
+    )
+
+
+@DETECTORS.register("brisk")
+def _brisk(config: FrontendConfig) -> Detector:
+    """BRISK's detector (Leutenegger et al. 2011): AGAST corners, maximal over scale too."""
+    return _MultiScale(cv2.BRISK.create(thresh=config.fast_threshold, octaves=BRISK_OCTAVES))
+
+
+@DETECTORS.register("surf")
+class _SurfBlobs:
     """SURF's detector: maxima of the determinant of the Hessian over space and scale (Bay 2008).
 
     Raises:
@@ -174,10 +231,10 @@ class SurfBlobs:
 
     local = False
 
-    def __init__(self) -> None:
+    def __init__(self, config: FrontendConfig) -> None:
         self._surf = require("mahotas.features.surf", "detector and descriptor SURF")
 
-    def detect(self, image: Image, allowed: Image, count: int) -> Keypoints:
+    def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest blobs."""
         rows = self._surf.interest_points(image, nr_octaves=3, nr_scales=4, max_points=2 * count)
         found = Keypoints.of(rows[:, 1::-1].astype(np.float32), rows[:, 3].astype(np.float32), 0.0)
@@ -192,52 +249,11 @@ class SurfBlobs:
         return found.select(_strongest_first(found))
 
 
-def _difference_of_gaussians(config: FrontendConfig) -> Detector:
-    """SIFT's detector (Lowe 2004).
-
-    OpenCV doubles the image first, as Lowe does. On video the finest octave costs three quarters of
-    the time and gives the least stable keypoints, so the image is halved before.
-    """
-    return WholeImage(cv2.SIFT.create(4 * config.features, contrastThreshold=0.02), shrink=2)
-
-
-def _orb(config: FrontendConfig) -> Detector:
-    """ORB's detector (Rublee et al. 2011): FAST on a pyramid, ranked by Harris, with direction."""
-    return WholeImage(
-        cv2.ORB.create(
-            20 * config.features,
-            nlevels=ORB_LEVELS,
-            edgeThreshold=ORB_EDGE_PX,
-            fastThreshold=max(1, config.fast_threshold // 4),
-        )
-    )
-
-
-def _brisk(config: FrontendConfig) -> Detector:
-    """BRISK's detector (Leutenegger et al. 2011): AGAST corners, maximal over scale too."""
-    return WholeImage(cv2.BRISK.create(thresh=config.fast_threshold, octaves=BRISK_OCTAVES))
-
-
-ORB_LEVELS = 4
-ORB_EDGE_PX = 20
-BRISK_OCTAVES = 2
-
-DETECTORS: dict[str, Callable[[FrontendConfig], Detector]] = {
-    "shi_tomasi": lambda config: GradientCorners(config, harris=False),
-    "harris": lambda config: GradientCorners(config, harris=True),
-    "fast": FastCorners,
-    "dog": _difference_of_gaussians,
-    "surf": lambda config: SurfBlobs(),
-    "orb": _orb,
-    "brisk": _brisk,
-}
-"""Detectors by the name that `FrontendConfig.detector` gives."""
-
-
-def refine(image: Image, pixels: Points) -> Points:
+def refine(image: Image, pixels: Pixels) -> Pixels:
     """Corners (N, 2) to a fraction of a pixel.
 
-    All gradients around a corner are orthogonal to the way to it (Förstner and Gülch 1987).
+    The corner is the point that is orthogonal, as seen from every pixel around it, to the gradient
+    at that pixel (Förstner and Gülch 1987).
     """
     if len(pixels) == 0:
         return pixels
@@ -249,5 +265,5 @@ def refine(image: Image, pixels: Points) -> Points:
     return np.where((moved < SUBPIXEL_LIMIT_PX)[:, None], refined, pixels).astype(np.float32)
 
 
-def _strongest_first(keypoints: Keypoints) -> Indices:
+def _strongest_first(keypoints: Keypoints) -> IntArray:
     return np.argsort(-keypoints.scores, kind="stable")

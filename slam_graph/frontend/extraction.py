@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Feature extraction: new keypoints where a grid over the image has too few."""
+"""Feature extraction: keypoints spread over the image by a grid, and the masks of cameras."""
 
 from __future__ import annotations
 
@@ -9,28 +9,34 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.detectors import DETECTORS, refine
-from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points, spread
-from slam_graph.frontend.tracked_features import Image
-from slam_graph.sensors.camera import WIDE, Camera
+from slam_graph.frontend.detectors import refine
+from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
+from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
+from slam_graph.sensors.camera import Camera
+
+__all__ = ["BORDER_PX", "FeatureExtractor", "camera_mask"]
+
+BORDER_PX = 5
+"""Features are neither found nor kept within this distance of the edge of the image, where the
+windows of detectors and descriptors are cut."""
 
 REST_FRAMES = 3
-"""A cell that could not be filled is left alone for so many frames: it would hardly be now."""
+"""Frames for which a cell is skipped that could not be filled: it hardly could be in the next."""
 
 REACH = 2.75
-"""Features of wide lenses lie less than 70° off the axis. On the plane z = 1, where matches are
-tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at 70°, 33 at 80°."""
+"""Largest normalised coordinate of features of wide lenses: 70° off the axis. On the plane z = 1,
+where matches are tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at
+70°, by 33 at 80°."""
 
 MARGIN_PX = 4
 """Cells are cut out with this margin, so that scores at their edge see the pixels beyond."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class _Cell:
     """A cell of the grid: columns [left, right) and rows [top, bottom) of the image."""
 
     left: int
@@ -40,78 +46,85 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Extracted:
-    """New points, in groups of one cell each.
+class _Extracted:
+    """New points, grouped by cell.
 
     Attributes:
         points: (N, 2) float32 pixels, the best of a group first.
-        group: (N,) ascending number of each one's group.
-        quotas: (G,) how many of each group are wanted.
+        group: (N,) index of the group of each point, ascending.
+        quotas: (G,) how many points of each group are wanted.
     """
 
-    points: Points
-    group: Indices
-    quotas: Indices
+    points: Pixels
+    group: IntArray
+    quotas: IntArray
 
-    def within_quotas(self, good: Mask) -> Mask:
-        """The first of the good points (N,) of each group, as many as are wanted."""
+    def within_quotas(self, good: BoolArray) -> BoolArray:
+        """Of the good points (N,) of each group the first ones, as many as are wanted."""
         count = np.cumsum(good)
         before = np.concatenate([[0], count])[np.searchsorted(self.group, self.group)]
-        wanted: Mask = good & (count - before <= self.quotas[self.group])
+        wanted: BoolArray = good & (count - before <= self.quotas[self.group])
         return wanted
 
 
-class CornerExtractor:
-    """Spreads keypoints over an image: every cell of a grid gets its share of the features."""
+class FeatureExtractor:
+    """Spreads keypoints over an image: every cell of a grid gets its share of the features.
 
-    def __init__(self, config: FrontendConfig, width: int, height: int, mask: Image | None) -> None:
-        """Prepare the grid.
+    Args:
+        config: number of features, grid and detector.
+        width: of the images in pixels.
+        height: of the images in pixels.
+        mask: (height, width), zero where no features are wanted; None for no such place.
+        distance_px: least distance of two features; that of the settings if None.
 
-        Args:
-            config: number of features, grid and detector.
-            width: of the images in pixels.
-            height: of the images in pixels.
-            mask: (height, width), zero where no features are wanted; None for no such place.
+    Raises:
+        ConfigError: if the detector needs a library that is not installed.
+    """
 
-        Raises:
-            ConfigError: if the detector needs a library that is not installed.
-        """
+    def __init__(
+        self,
+        config: FrontendConfig,
+        width: int,
+        height: int,
+        mask: Image | None,
+        distance_px: float | None = None,
+    ) -> None:
         self._config = config
+        self._distance_px = config.min_distance_px if distance_px is None else distance_px
         self._detector = DETECTORS[config.detector_name](config)
         columns, rows = config.grid
         xs = np.linspace(0, width, columns + 1).astype(int)
         ys = np.linspace(0, height, rows + 1).astype(int)
         self._cells = [
-            Cell(int(xs[i]), int(ys[j]), int(xs[i + 1]), int(ys[j + 1]))
+            _Cell(int(xs[i]), int(ys[j]), int(xs[i + 1]), int(ys[j + 1]))
             for j in range(rows)
             for i in range(columns)
         ]
         self._edges = xs, ys
         allowed = np.zeros((height, width), np.uint8)
-        border = config.border_px
-        allowed[border : height - border, border : width - border] = 255
+        allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
         self._rest = np.zeros(len(self._cells), np.int64)
-        self._share = -(-config.features // len(self._cells))
+        self._share = -(-config.max_features // len(self._cells))
 
-    def allows(self, points: Points) -> Mask:
+    def allows(self, points: Pixels) -> BoolArray:
         """Which points (N, 2), all inside the image, the mask allows."""
         u, v = np.rint(points).astype(int).T
-        result: Mask = self._allowed[v, u] > 0
+        result: BoolArray = self._allowed[v, u] > 0
         return result
 
-    def extract(self, image: Image, occupied: Points, surplus: int = 1) -> Extracted:
-        """New points that fill up the cells in which few of the `occupied` (N, 2) lie.
+    def extract(self, image: Image, occupied: Pixels, surplus: int = 1) -> _Extracted:
+        """Detect new points in the cells that have few features.
 
         Args:
-            image: to look at.
-            occupied: features that are there.
-            surplus: so many times the points that are wanted, if not all will do.
+            image: where to detect them.
+            occupied: (N, 2) features that are there.
+            surplus: factor on the number of points, for callers that will reject some.
         """
         free = self._free(occupied)
-        found: list[Points] = []
+        found: list[Pixels] = []
         quotas: list[int] = []
-        missing = self._config.features - len(occupied)
+        missing = self._config.max_features - len(occupied)
         whole: Keypoints | None = None
         for i, share in self._wanted(occupied):
             quota = min(missing, share)
@@ -122,7 +135,7 @@ class CornerExtractor:
                 whole = self._whole(image, free) if whole is None else whole
                 best = whole.select(_inside(whole.pixels, cell))
             best = best.select(self._still_free(free, best.pixels))
-            chosen = spread(best.pixels, surplus * quota, self._config.min_distance_px)
+            chosen = spread(best.pixels, surplus * quota, self._distance_px)
             pixels = best.pixels[chosen]
             if len(pixels) < quota:
                 self._rest[i] = REST_FRAMES
@@ -136,14 +149,14 @@ class CornerExtractor:
         if self._config.subpixel:
             pixels = refine(image, pixels)
         group = np.repeat(np.arange(len(found)), [len(part) for part in found])
-        return Extracted(pixels, group, np.array(quotas, np.int64))
+        return _Extracted(pixels, group, np.array(quotas, np.int64))
 
     def candidates(self, image: Image, count: int) -> Keypoints:
-        """Keypoints all over the image, whatever is there already: what matching chooses from.
+        """Detect keypoints all over the image, whatever features are there already.
 
         Args:
-            image: to look at.
-            count: about so many, spread over the grid.
+            image: where to detect them.
+            count: approximate number, spread over the grid.
         """
         share = -(-count // len(self._cells))
         whole = None if self._detector.local else self._whole(image, self._allowed)
@@ -153,21 +166,21 @@ class CornerExtractor:
                 best = self._in_cell(image, self._allowed, cell, share)
             else:
                 best = whole.select(_inside(whole.pixels, cell))
-            found.append(best.select(spread(best.pixels, share, self._config.min_distance_px)))
+            found.append(best.select(spread(best.pixels, share, self._distance_px)))
         keypoints = Keypoints.concatenate(found)
         return keypoints.at(refine(image, keypoints.pixels)) if self._config.subpixel else keypoints
 
-    def fill(self, keypoints: Keypoints, occupied: Points) -> NDArray[np.int64]:
-        """Which keypoints (M,) fill up the cells in which few of the `occupied` (N, 2) lie."""
+    def fill(self, keypoints: Keypoints, occupied: Pixels) -> IntArray:
+        """Indices of keypoints to add in cells that have few of the `occupied` features (N, 2)."""
         free = self._free(occupied)
         chosen: list[int] = []
-        missing = self._config.features - len(occupied)
+        missing = self._config.max_features - len(occupied)
         for i, share in self._wanted(occupied):
             inside = np.flatnonzero(_inside(keypoints.pixels, self._cells[i]))
             inside = inside[self._still_free(free, keypoints.pixels[inside])]
             inside = inside[np.argsort(-keypoints.scores[inside], kind="stable")]
             pixels = keypoints.pixels[inside]
-            best = inside[spread(pixels, min(missing, share), self._config.min_distance_px)]
+            best = inside[spread(pixels, min(missing, share), self._distance_px)]
             self._occupy(free, keypoints.pixels[best])
             chosen += best.tolist()
             missing -= len(best)
@@ -175,20 +188,20 @@ class CornerExtractor:
                 break
         return np.array(chosen, np.int64)
 
-    def _wanted(self, occupied: Points) -> list[tuple[int, int]]:
-        """The cells that want features, emptiest first, and how many each wants."""
+    def _wanted(self, occupied: Pixels) -> list[tuple[int, int]]:
+        """The cells that need features, emptiest first, and how many each needs."""
         self._rest = np.maximum(self._rest - 1, 0)
-        missing = self._config.features - len(occupied)
+        missing = self._config.max_features - len(occupied)
         if missing <= 0:
             return []
         counts = self._count(occupied)
         emptiest_first = np.argsort(counts, kind="stable")
         # No cell rests while many features are missing, e.g. after the lens was covered
-        awake = (self._rest == 0) | (2 * missing > self._config.features)
+        awake = (self._rest == 0) | (2 * missing > self._config.max_features)
         wanting = (counts < self._share) & awake
         return [(int(i), self._share - int(counts[i])) for i in emptiest_first if wanting[i]]
 
-    def _count(self, points: Points) -> NDArray[np.int64]:
+    def _count(self, points: Pixels) -> IntArray:
         """How many points (N, 2) lie in each cell."""
         xs, ys = self._edges
         columns, rows = self._config.grid
@@ -196,30 +209,32 @@ class CornerExtractor:
         row = np.clip(np.searchsorted(ys, points[:, 1], side="right") - 1, 0, rows - 1)
         return np.bincount(row * columns + column, minlength=columns * rows)
 
-    def _free(self, occupied: Points) -> Image:
+    def _free(self, occupied: Pixels) -> Image:
         """The mask of pixels where a new point may lie."""
         free = self._allowed.copy()
         self._occupy(free, occupied)
         return free
 
-    def _occupy(self, free: Image, points: Points) -> None:
+    def _occupy(self, free: Image, points: Pixels) -> None:
         """Clear a disk around each point (N, 2) of a mask."""
-        radius = round(self._config.min_distance_px)
+        radius = round(self._distance_px)
         for u, v in np.rint(points).astype(int).tolist():
             cv2.circle(free, (u, v), radius, 0, cv2.FILLED)
 
-    def _still_free(self, free: Image, points: Points) -> Mask:
-        """Which points (N, 2), all inside the image, have not been taken by a neighbouring cell."""
+    def _still_free(self, free: Image, points: Pixels) -> BoolArray:
+        """Which points (N, 2), all inside the image, are not too near to those chosen so far."""
         u, v = np.rint(points).astype(int).T
         height, width = free.shape
-        result: Mask = free[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] > 0
+        result: BoolArray = free[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] > 0
         return result
 
     def _whole(self, image: Image, allowed: Image) -> Keypoints:
-        """Everything that a detector finds that looks at the image as a whole, best first."""
-        return self._detector.detect(image, allowed, 2 * self._config.features)
+        """All keypoints of a detector that needs the whole image, best first."""
+        return self._detector.detect(
+            image, allowed, 2 * self._config.max_features, self._distance_px
+        )
 
-    def _in_cell(self, image: Image, free: Image, cell: Cell, count: int) -> Keypoints:
+    def _in_cell(self, image: Image, free: Image, cell: _Cell, count: int) -> Keypoints:
         """The best keypoints of a cell, best first."""
         height, width = image.shape
         left, top = max(0, cell.left - MARGIN_PX), max(0, cell.top - MARGIN_PX)
@@ -230,24 +245,24 @@ class CornerExtractor:
         if not allowed.any():
             return Keypoints.concatenate([])
         patch = np.ascontiguousarray(image[top:bottom, left:right])
-        found = self._detector.detect(patch, allowed, count)
+        found = self._detector.detect(patch, allowed, count, self._distance_px)
         return found.at(found.pixels + np.array([left, top], np.float32))
 
 
-def _inside(pixels: Points, cell: Cell) -> Mask:
+def _inside(pixels: Pixels, cell: _Cell) -> BoolArray:
     """Which points (N, 2) lie in a cell."""
     u, v = pixels[:, 0], pixels[:, 1]
-    result: Mask = (u >= cell.left) & (u < cell.right) & (v >= cell.top) & (v < cell.bottom)
+    result: BoolArray = (u >= cell.left) & (u < cell.right) & (v >= cell.top) & (v < cell.bottom)
     return result
 
 
 def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | None:
-    """Where features of a camera may lie: as told, and where a wide lens can be used.
+    """Where features of a camera may lie: by its mask, and by the usable field of a wide lens.
 
     Args:
         camera: its model.
         path: image that is zero where no features are wanted, or None.
-        window_px: side of the window that is tracked. It stays inside what can be used: where a
+        window_px: side of the window that is tracked. It stays inside the usable field: where a
             lens shows nothing beyond, the rim is an edge that moves with the camera.
 
     Returns:
@@ -256,15 +271,15 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
     Raises:
         ConfigError: if the image is not there, or does not fit the camera.
     """
-    mask = None if path is None else read_mask(path, camera.width, camera.height)
-    if camera.distortion not in WIDE:
+    mask = None if path is None else _read_mask(path, camera.width, camera.height)
+    if not camera.model.sees_sideways:
         return mask
     visible = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
     inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)
     return inside if mask is None else np.minimum(mask, inside)
 
 
-def read_mask(path: Path, width: int, height: int) -> Image:
+def _read_mask(path: Path, width: int, height: int) -> Image:
     """Read the mask of a camera.
 
     Raises:

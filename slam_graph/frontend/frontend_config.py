@@ -1,174 +1,176 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of the front end, with defaults that suit a 752x480 stereo camera at 20 Hz."""
+"""The settings of the front end, and the registries of the parts that they name.
+
+The defaults suit a 752x480 stereo camera at 20 Hz. A detector, a descriptor or a whole front end of
+another package is registered in one of the registries (`slam_graph.plugins`, docs/frontend.md).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from slam_graph.settings.base import Settings
+from slam_graph.plugins import Choice, Registry
+from slam_graph.settings.base import Settings, expert
 
-OWN_DETECTORS = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
-"""The detector that each descriptor was published with; BRIEF has none of its own."""
+if TYPE_CHECKING:
+    from slam_graph.diagnostics import Diagnostics
+    from slam_graph.frontend.descriptors import Descriptor
+    from slam_graph.frontend.detectors import Detector
+    from slam_graph.frontend.frontend_protocol import Frontend
+    from slam_graph.sensors.rig import Rig
 
-Pixels = Annotated[float, Field(gt=0.0)]
-Count = Annotated[int, Field(ge=1)]
+__all__ = ["DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"]
 
+DETECTORS: Registry[Callable[[FrontendConfig], Detector]] = Registry(
+    "slam_graph.detectors",
+    "detector",
+    home="slam_graph.frontend.detectors",
+    names=("shi_tomasi", "harris", "fast", "dog", "surf", "orb", "brisk"),
+)
+"""Detectors by name: callables that make one from the settings."""
 
-class MatchingConfig(Settings):
-    """How descriptors are matched, for the front ends that match."""
+DESCRIPTORS: Registry[Callable[[], Descriptor]] = Registry(
+    "slam_graph.descriptors",
+    "descriptor",
+    home="slam_graph.frontend.descriptors",
+    names=("sift", "surf", "orb", "brisk", "brief"),
+)
+"""Descriptors by name: callables without arguments that make one."""
 
-    candidates: Count = 500
-    """Keypoints that are described in each image; features are matched to these."""
+FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics, float], Frontend]] = Registry(
+    "slam_graph.frontends",
+    "front end",
+    home="slam_graph.frontend.image_frontend",
+    names=("klt",),
+)
+"""Front ends by name: callables that make one from rig, settings, seed, diagnostics and gravity in
+m/s²."""
 
-    distance_px: Pixels = 5.0
-    """Keypoints keep at least this distance from one another."""
+PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
+"""The detector that a descriptor was published with; for BRIEF, which has none, FAST."""
 
-    search_radius_px: Pixels = 20.0
-    """A match lies within this distance of where the feature is predicted."""
+TRACKED_RANSAC_PX, MATCHED_RANSAC_PX = 1.0, 1.5
+"""Defaults of `ransac_px`: matched keypoints are located anew in each image, less exactly."""
 
-    ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.85
-    """Ratio test: the best match is less than this share of the distance of the second best."""
+_MATCHING = "is a constant now, in slam_graph/frontend/matching.py"
+_TRACKING = "is a constant now, in slam_graph/frontend/lucas_kanade.py"
+_EXTRACTION = "is a constant now, in slam_graph/frontend/extraction.py"
 
-    mutual: bool = True
-    """Whether a match must be the best one seen from either image."""
-
-    epipolar_px: Pixels = 1.5
-    """What `ransac_px` is for corners that are followed; keypoints are found anew in each image,
-    which is less exact."""
-
-    memory_frames: Annotated[int, Field(ge=0)] = 5
-    """A feature that found no match is looked for in so many more frames before it is lost."""
+PositivePixels = Annotated[float, Field(gt=0.0)]
+PositiveCount = Annotated[int, Field(ge=1)]
 
 
 class FrontendConfig(Settings):
-    """How features are found, followed and checked. Distances are in pixels of the raw image."""
+    """How features are found, tracked and checked. Distances are in pixels of the raw image."""
 
-    method: str = "klt"
-    """`klt` follows corners by Lucas-Kanade; `sift`, `surf`, `orb`, `brisk` and `brief` match these
-    descriptors."""
+    moved: ClassVar[Mapping[str, str]] = {
+        "features": "is now frontend.max_features",
+        "matching": "has become constants, in slam_graph/frontend/matching.py",
+        "merge_distance_px": "is a constant now, in slam_graph/frontend/camera_tracker.py",
+        "border_px": _EXTRACTION,
+        "corner_window_px": "is a constant now, in slam_graph/frontend/detectors.py",
+        "relative_corner_score": "is a constant now, in slam_graph/frontend/detectors.py",
+        "verification": _TRACKING,
+        "guided_levels": _TRACKING,
+        "lk_iterations": _TRACKING,
+        "lk_epsilon_px": _TRACKING,
+        "lk_min_eigenvalue": _TRACKING,
+        "backward_levels": _TRACKING,
+        "ransac_confidence": "is a constant now, in slam_graph/frontend/outliers.py",
+        "clahe_clip_limit": "is a constant now, in slam_graph/frontend/image_frontend.py",
+        "clahe_tiles": "is a constant now, in slam_graph/frontend/image_frontend.py",
+    }
 
-    features: Count = 200
-    """Number of features aimed at in the first camera; the other cameras see these same ones."""
+    method: Annotated[str, Choice(FRONTENDS, DESCRIPTORS)] = "klt"
+    """How features are found again in the next image. `klt` tracks corners by Lucas-Kanade: the
+    longest tracks, in the least time. A descriptor (`sift`, `surf`, `orb`, `brisk`, `brief`)
+    matches keypoints, and finds features again that were hidden for a few frames."""
 
-    grid: tuple[Count, Count] = (8, 6)
-    """Columns and rows of the grid over which features are spread evenly."""
+    detector: Annotated[str, Choice(DETECTORS, others=("auto",))] = "auto"
+    """What finds features. `auto` is Shi-Tomasi for `klt`, and for a descriptor the detector that
+    it was published with (FAST for BRIEF). `fast` saves time."""
 
-    min_distance_px: Pixels = 12.0
-    """A new corner keeps at least this distance from every other feature."""
+    max_features: PositiveCount = 200
+    """Number of features aimed at in the first camera; the other cameras look for these same ones.
+    More make the estimate less dependent on single ones, and cost time in front and back end."""
 
-    merge_distance_px: Annotated[float, Field(ge=0.0)] = 3.0
-    """Of two features that come closer than this, the younger one is dropped."""
+    grid: tuple[PositiveCount, PositiveCount] = (8, 6)
+    """Columns and rows of the grid over which features are spread evenly. Fit it to the shape of
+    the image; with fewer cells features crowd where the texture is strongest."""
 
-    border_px: Annotated[int, Field(ge=0)] = 5
-    """Features are neither found nor kept within this distance of the edge of the image."""
-
-    detector: Literal["auto", "shi_tomasi", "harris", "fast", "dog", "surf", "orb", "brisk"] = (
-        "auto"
-    )
-    """What finds features; `auto` is Shi-Tomasi for `klt`, and what a descriptor was published with
-    for the others (FAST for BRIEF)."""
-
-    subpixel: bool = False
-    """Whether new keypoints are moved to the corner to a fraction of a pixel."""
+    min_distance_px: PositivePixels = 12.0
+    """Least distance of a new feature from every other one. Scale it with the resolution."""
 
     prediction: Literal["none", "flow", "gyroscope", "state"] = "gyroscope"
-    """Where features are looked for first: where they were; moved on as in the last frame; the same
-    with the rotation that the gyroscope measured; or where state and map of the back end say."""
-
-    verify_new: bool = True
-    """Whether a new feature must also be found in the image before."""
-
-    verification: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
-    """Errors allowed to a new corner of `klt`, as a share of those allowed to one that is
-    followed."""
-
-    min_corner_score: Annotated[float, Field(ge=0.0)] = 1e-3
-    """Smallest Shi-Tomasi eigenvalue of a corner (OpenCV's scale: grey levels / 255)."""
-
-    corner_window_px: Annotated[int, Field(ge=2)] = 7
-    """Side of the window over which Shi-Tomasi sums the gradients."""
-
-    relative_corner_score: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.05
-    """A corner of a cell scores at least this share of the best one of the cell (Shi-Tomasi)."""
-
-    fast_threshold: Count = 20
-    """Grey levels by which FAST's circle must differ; halved once in cells without corners."""
-
-    window_px: Annotated[int, Field(ge=3)] = 17
-    """Side of the window that Lucas-Kanade tracks; OpenCV is fastest at 8n or 8n + 1."""
-
-    pyramid_levels: Annotated[int, Field(ge=0, le=8)] = 3
-    """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
-
-    guided_levels: Annotated[int, Field(ge=0, le=8)] = 1
-    """Halvings where the prediction is good (the rotation is measured, the rest known); features
-    that are not found that way are looked for again with all `pyramid_levels`."""
-
-    lk_iterations: Count = 15
-    """Most iterations on each level of the pyramid."""
-
-    lk_epsilon_px: Pixels = 0.02
-    """Lucas-Kanade stops when a step is smaller than this."""
-
-    lk_min_eigenvalue: Annotated[float, Field(ge=0.0)] = 1e-3
-    """Windows with less gradient than this are not tracked (OpenCV's `minEigThreshold`)."""
-
-    backward_levels: Annotated[int, Field(ge=0, le=8)] = 0
-    """Pyramid levels of the backward pass, which starts at the point where it should end."""
-
-    forward_backward_px: Pixels = 0.5
-    """Largest distance between a point and itself after tracking forward and back."""
+    """Where the search for a feature begins. none: where it was; flow: moved on as in the last
+    frame; gyroscope: the same with the rotation that the gyroscope measured; state: where the
+    state and the map of the back end place it. Use `flow` if gyroscope or extrinsics are poor."""
 
     outliers: Literal["fundamental", "essential", "magsac", "gyroscope", "none"] = "fundamental"
     """RANSAC between two frames: on the fundamental matrix (7 points), the essential matrix (5),
     the fundamental matrix by MAGSAC++, or the direction of motion under the gyroscope's rotation
-    (2)."""
+    (2), which needs the fewest inliers."""
 
-    ransac_px: Pixels = 1.0
-    """Largest epipolar distance of an inlier between two frames, for `klt`."""
-
-    ransac_confidence: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.999
-    """Probability with which RANSAC draws at least one sample without an outlier."""
-
-    map_check_px: Pixels | None = None
-    """Largest reprojection error against the back end's map (PnP with RANSAC); no check if null."""
-
-    drop_rejected: bool = False
-    """Whether features that the χ² gate of the back end rejects are not followed any more."""
-
-    stereo_epipolar_px: Pixels = 1.5
-    """Largest distance of a match in another camera from its epipolar line."""
-
-    stereo_min_depth_m: Annotated[float, Field(gt=0.0)] = 0.3
-    """Matches in other cameras that triangulate nearer than this, or behind, are refused."""
+    ransac_px: PositivePixels | None = None
+    """Largest epipolar distance of an inlier between two frames; null is 1 px for `klt` and 1.5 px
+    for descriptors. Raise it for a poor calibration, if many features are `rejected_ransac`."""
 
     equalization: Literal["none", "histogram", "clahe"] = "none"
-    """Contrast equalisation before anything else: of the whole histogram, or adaptive (CLAHE)."""
-
-    clahe_clip_limit: Annotated[float, Field(gt=0.0)] = 3.0
-    """Contrast limit of CLAHE."""
-
-    clahe_tiles: tuple[Count, Count] = (8, 8)
-    """Columns and rows of CLAHE's tiles."""
+    """Contrast equalization of every image: none, of the whole histogram, or adaptive (CLAHE). Try
+    `clahe` where images are dark or of low contrast and few features are found."""
 
     masks: tuple[Path | None, ...] = ()
-    """One grey image per camera, or none; no features are taken where it is black (< 128)."""
+    """One grey image per camera, or null; no features are taken where it is black (< 128). Mask
+    whatever is fixed to the platform and visible."""
 
-    matching: MatchingConfig = MatchingConfig()
-    """How descriptors are matched."""
+    subpixel: bool = expert(False)
+    """Whether new keypoints are refined to a fraction of a pixel."""
+
+    verify_new: bool = expert(True)
+    """Whether a new feature must also be found in the image before."""
+
+    min_corner_score: float = expert(1e-3, ge=0.0)
+    """Smallest Shi-Tomasi eigenvalue of a corner (OpenCV's scale: grey levels / 255)."""
+
+    fast_threshold: int = expert(20, ge=1)
+    """Grey levels by which FAST's circle must differ; halved once in cells without corners."""
+
+    window_px: int = expert(17, ge=3)
+    """Side of the window that Lucas-Kanade tracks; OpenCV is fastest at 8n or 8n + 1."""
+
+    pyramid_levels: int = expert(3, ge=0, le=8)
+    """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
+
+    forward_backward_px: float = expert(0.5, gt=0.0)
+    """Largest distance between a point and itself after tracking it forward and back."""
+
+    map_check_px: PositivePixels | None = expert(None)
+    """Largest reprojection error against the back end's map (PnP with RANSAC); null: no check."""
+
+    drop_rejected: bool = expert(False)
+    """Whether to stop tracking features that the χ² gate of the back end rejects."""
+
+    stereo_epipolar_px: float = expert(1.5, gt=0.0)
+    """Largest distance of a match in another camera from its epipolar line."""
+
+    stereo_min_depth_m: float = expert(0.3, gt=0.0)
+    """Matches in other cameras that triangulate nearer than this, or behind, are rejected."""
 
     @property
     def detector_name(self) -> str:
         """The detector that `detector` and `method` choose."""
         if self.detector != "auto":
             return self.detector
-        return OWN_DETECTORS.get(self.method, "shi_tomasi")
+        return PUBLISHED_WITH.get(self.method, "shi_tomasi")
 
     @property
     def epipolar_px(self) -> float:
         """Largest epipolar distance of an inlier between two frames, for the method chosen."""
-        return self.ransac_px if self.method == "klt" else self.matching.epipolar_px
+        if self.ransac_px is not None:
+            return self.ransac_px
+        return MATCHED_RANSAC_PX if self.method in DESCRIPTORS else TRACKED_RANSAC_PX

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol that every front end fulfils, and what it hears of the back end.
+"""The protocol of front ends: frames in, features out, and feedback of the back end.
 
-What a front end counts and times in a frame.
+`FrameStats` collects what a front end counts and times in a frame.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.frontend.tracked_features import Mask
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
+
+__all__ = ["Feedback", "FrameStats", "Frontend"]
 
 
 class FrameStats(defaultdict[str, float]):
@@ -29,13 +30,13 @@ class FrameStats(defaultdict[str, float]):
         super().__init__(float)
 
     def add(self, name: str, number: int) -> None:
-        """Count some more."""
+        """Increase a count."""
         self[name] += number
 
-    def count(self, **fates: Mask) -> None:
-        """Count features by what became of them."""
-        for fate, features in fates.items():
-            self.add(fate, int(np.count_nonzero(features)))
+    def count(self, **features: BoolArray) -> None:
+        """Increase several counts, each by the number of features (N,) for which it holds."""
+        for name, selected in features.items():
+            self.add(name, int(np.count_nonzero(selected)))
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -50,23 +51,20 @@ class Feedback:
     """What the back end knows after a frame.
 
     Attributes:
-        state: its estimate; None as long as there is none.
+        state: its estimate; None before it is initialised.
         rejected: (N,) ids of features that its χ² gate rejected.
         ids: (M,) ids of features whose position is estimated, ascending.
-        points: (M, 3) these positions in the world.
+        points: (M, 3) these positions in the world frame, in metres.
     """
 
     state: NavState | None = None
-    rejected: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    rejected: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @staticmethod
     def of(
-        state: NavState | None,
-        rejected: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        points: NDArray[np.float64],
+        state: NavState | None, rejected: IntArray, ids: IntArray, points: FloatArray
     ) -> Feedback:
         """The same from features in any order."""
         order = np.argsort(ids, kind="stable")
@@ -86,7 +84,8 @@ class Frontend(Protocol):
     def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
         """The features of the next frame.
 
-        Ids increase and are never used again for another feature.
+        The same id in another frame or camera is the same point of the world. The ids of new
+        features are larger than all before.
 
         Args:
             frame: what the cameras recorded.
@@ -94,10 +93,10 @@ class Frontend(Protocol):
         """
         ...
 
-    def drop(self, ids: NDArray[np.int64]) -> None:
+    def drop(self, ids: IntArray) -> None:
         """Do not report these features any more: the back end rejected them."""
         ...
 
-    def hear(self, feedback: Feedback) -> None:
-        """Take note of what the back end made of an earlier frame."""
+    def receive_feedback(self, feedback: Feedback) -> None:
+        """Take note of what the back end knows after an earlier frame."""
         ...

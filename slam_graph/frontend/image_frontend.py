@@ -1,49 +1,72 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The front end for images: features followed in time and matched across the rig."""
+"""The front end for images: features tracked in time and matched between the cameras."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.association import Associator
 from slam_graph.frontend.camera_tracker import CameraTracker
-from slam_graph.frontend.extraction import CornerExtractor, camera_mask
-from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
+from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
+from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.frontend.tracked_features import Image, Tracks
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["ImageFrontend"]
+
 FEW_FEATURES = 15
-"""Fewer features than this left of a frame with more are worth a warning."""
+"""A warning is given when fewer features than this are left of a frame that had more."""
+
+CLAHE_CLIP_LIMIT, CLAHE_TILES = 3.0, (8, 8)
+"""Contrast limit, and columns and rows of tiles, of CLAHE."""
 
 
+@FRONTENDS.register("klt")
 class ImageFrontend:
-    """Follows features of the first camera and finds them in the cameras that see the same.
+    """Tracks features of the first camera and finds them in the cameras that see the same.
 
-    A camera that sees little of what an earlier one sees has features of its own.
+    A camera that sees little of what an earlier one sees has features of its own. They are matched
+    if `method` names a descriptor, and tracked otherwise.
+
+    Args:
+        rig: calibrated cameras.
+        config: settings.
+        seed: decides the random samples of RANSAC.
+        diagnostics: where faults are counted.
+
+    Raises:
+        ConfigError: if a mask cannot be read or does not fit its camera, or a method needs a
+            library that is not installed.
 
     Attributes:
-        frame_stats: of the last frame: features by fate (`tracked`, `new`, `recovered`, `stereo`,
-            and those lost by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
+        frame_stats: of the last frame: counts of features (`tracked`, `new`, `recovered`, `stereo`,
+            and those lost, by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
             `lost_merged`, `rejected_ransac`, `rejected_map`, `rejected_gate`, `rejected_new`,
             `rejected_stereo`), and milliseconds per stage (`prepare_ms`, `temporal_ms`,
             `ransac_ms`, `detect_ms`, `stereo_ms`).
     """
 
     def __init__(
-        self, rig: Rig, config: FrontendConfig, seed: int, diagnostics: Diagnostics
+        self,
+        rig: Rig,
+        config: FrontendConfig,
+        seed: int,
+        diagnostics: Diagnostics,
+        gravity: float = STANDARD_GRAVITY,
     ) -> None:
         """Prepare for the first frame.
 
@@ -52,6 +75,7 @@ class ImageFrontend:
             config: options.
             seed: decides the random samples of RANSAC.
             diagnostics: where faults are counted.
+            gravity: magnitude in m/s², for predictions from the back end's state.
 
         Raises:
             ConfigError: if a mask cannot be read or does not fit its camera, or a method needs a
@@ -61,7 +85,7 @@ class ImageFrontend:
         self._config = config
         self._diagnostics = diagnostics
         self._stats = FrameStats()
-        self._motion = ImuMotion()
+        self._motion = ImuMotion(rig.imu, gravity)
         self._feedback = Feedback()
         self._gated = 0
         self._references = reference_cameras(rig)
@@ -71,12 +95,12 @@ class ImageFrontend:
         self._matchers: dict[int, StereoMatcher] = {}
         for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
             camera, reference = mounted.camera, self._references[i]
-            extractor = CornerExtractor(config, camera.width, camera.height, mask)
+            extractor = FeatureExtractor(config, camera.width, camera.height, mask)
             associator: Associator = CornerTracking(extractor, config)
             if reference == i:
                 associator = _associator(camera, extractor, config, mask)
             else:
-                # a camera that is matched follows its features by itself only in an emergency
+                # it tracks its features itself only while the reference camera has no image
                 pose = rig.cameras[reference].body_T_camera
                 self._matchers[i] = StereoMatcher(
                     camera,
@@ -89,7 +113,7 @@ class ImageFrontend:
             self._trackers.append(
                 CameraTracker(mounted, extractor, associator, predictor, config, self._stats, rng)
             )
-        self._clahe = cv2.createCLAHE(config.clahe_clip_limit, config.clahe_tiles)
+        self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
         self._tracks = [Tracks.empty() for _ in rig.cameras]
         self._next_id = 0
         self.frame_stats: dict[str, float] = {}
@@ -97,11 +121,11 @@ class ImageFrontend:
     def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
         """The features of the next frame; those of the frame before keep their ids.
 
-        Where the image of a camera is missing, its features wait in its last image; where the
-        reference has none, the other cameras go on by themselves.
+        A camera without an image keeps its features for the next one. While a reference camera has
+        none, the cameras matched to it track their features by themselves.
 
         Raises:
-            DataError: if the frame has not one image per camera of the size that the rig says.
+            DataError: if the frame does not have one image per camera of the calibrated size.
         """
         self._stats.clear()
         self._stats.add("rejected_gate", self._gated)
@@ -129,14 +153,14 @@ class ImageFrontend:
             ),
         )
 
-    def drop(self, ids: NDArray[np.int64]) -> None:
+    def drop(self, ids: IntArray) -> None:
         """Forget features in all cameras, e.g. those that the back end rejected."""
         self._tracks = [tracks.select(~np.isin(tracks.ids, ids)) for tracks in self._tracks]
         for tracker in self._trackers:
             tracker.forget(ids)
 
-    def hear(self, feedback: Feedback) -> None:
-        """Note state and map of the back end, and drop what it rejected if so configured."""
+    def receive_feedback(self, feedback: Feedback) -> None:
+        """Keep state and map of the back end, and drop what it rejected if so configured."""
         self._feedback = feedback
         self._motion.state = feedback.state or self._motion.state
         if self._config.drop_rejected and len(feedback.rejected):
@@ -145,7 +169,7 @@ class ImageFrontend:
             self.drop(feedback.rejected)
 
     def _checked(self, frame: CameraFrame | FeatureFrame) -> tuple[Image | None, ...]:
-        """The images of a frame, after a look at their number and sizes."""
+        """The images of a frame, once their number and sizes are checked."""
         if isinstance(frame, FeatureFrame):
             raise DataError(
                 f"frame {frame.stamp_ns} holds features, not images: there is nothing to track; "
@@ -175,7 +199,7 @@ class ImageFrontend:
         return np.asarray(self._clahe.apply(image), np.uint8)
 
     def _follow(self, index: int, image: Image, stamp_ns: int) -> None:
-        """Follow the features of a camera into its next image, and find new ones if it may."""
+        """Track the features of a camera, and find new ones unless it is matched to another."""
         before = self._tracks[index]
         tracker = self._trackers[index]
         after = tracker.follow(before, image, stamp_ns, self._feedback)
@@ -201,16 +225,16 @@ class ImageFrontend:
 
 
 def _associator(
-    camera: Camera, extractor: CornerExtractor, config: FrontendConfig, mask: Image | None
+    camera: Camera, extractor: FeatureExtractor, config: FrontendConfig, mask: Image | None
 ) -> Associator:
-    """What follows features: Lucas-Kanade, or the descriptor that the method names."""
-    if config.method == "klt":
-        return CornerTracking(extractor, config)
-    return DescriptorMatching(camera, extractor, config, mask)
+    """Matching of the descriptor that the method names, or Lucas-Kanade."""
+    if config.method in DESCRIPTORS:
+        return DescriptorMatching(camera, extractor, config, mask)
+    return CornerTracking(extractor, config)
 
 
 def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:
-    """The mask of each camera: what is told, and what a wide lens cannot use."""
+    """The mask of each camera: as configured, and the usable field of a wide lens."""
     if len(config.masks) > len(rig.cameras):
         raise ConfigError(
             f"frontend.masks lists {len(config.masks)} masks, "

@@ -1,42 +1,49 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keypoints: where a detector found something, and how large and how strong it is."""
+"""Points of an image: the keypoints of a detector, and the tracked features of a camera."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Points = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.sensors.measurements import FeatureObservations
+
+__all__ = ["Image", "Keypoints", "Pixels", "Tracks", "spread"]
+
+Image = NDArray[np.uint8]
+"""(height, width), grey."""
+
+Pixels = NDArray[np.float32]
+"""(N, 2) coordinates (u, v); the centres of pixels are at integers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Places in an image, as arrays.
+    """Keypoints of an image, as arrays.
 
     Attributes:
         pixels: (N, 2) float32 (u, v).
         scores: (N,) strength; comparable within one detector only.
-        sizes_px: (N,) diameter of what was found.
+        sizes_px: (N,) diameter of the corner or blob.
         angles_deg: (N,) orientation as OpenCV counts it; 0 where the detector has none, which
             leaves descriptors upright.
-        octaves: (N,) the detector's own numbers of pyramid levels; 0 is the image itself.
+        octaves: (N,) pyramid level, in the detector's own numbering; 0 is the image itself.
     """
 
-    pixels: Points
+    pixels: Pixels
     scores: NDArray[np.float32]
     sizes_px: NDArray[np.float32]
     angles_deg: NDArray[np.float32]
     octaves: NDArray[np.int32]
 
     @staticmethod
-    def of(pixels: Points, scores: NDArray[np.float32], size_px: float) -> Keypoints:
+    def of(pixels: Pixels, scores: NDArray[np.float32], size_px: float) -> Keypoints:
         """Corners of the image itself, all of one size, without an orientation."""
         n = len(pixels)
         return Keypoints(
@@ -58,7 +65,7 @@ class Keypoints:
 
     @staticmethod
     def concatenate(parts: Sequence[Keypoints]) -> Keypoints:
-        """All of some keypoints, in their order."""
+        """Several sets of keypoints joined, in their order."""
         if not parts:
             return Keypoints.of(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), 0.0)
         return Keypoints(
@@ -72,8 +79,8 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def select(self, which: Mask | Indices) -> Keypoints:
-        """Those where a mask (N,) is true, or with some indices."""
+    def select(self, which: BoolArray | IntArray) -> Keypoints:
+        """Those where a mask (N,) is true, or those with given indices."""
         return Keypoints(
             self.pixels[which],
             self.scores[which],
@@ -82,8 +89,8 @@ class Keypoints:
             self.octaves[which],
         )
 
-    def at(self, pixels: Points) -> Keypoints:
-        """The same ones in other places (N, 2)."""
+    def at(self, pixels: Pixels) -> Keypoints:
+        """The same keypoints at other pixels (N, 2)."""
         return Keypoints(
             np.asarray(pixels, np.float32),
             self.scores,
@@ -108,7 +115,86 @@ class Keypoints:
         ]
 
 
-def spread(pixels: Points, count: int, distance_px: float) -> Indices:
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """The features of one camera, and the image that they were last seen in.
+
+    Attributes:
+        image: the last image of the camera, equalised; None before the first one.
+        stamp_ns: its time.
+        ids: (N,) int64, increasing, so that older features come first.
+        pixels: (N, 2) float32 in `image`.
+        normalized: (N, 2) undistorted coordinates on the plane z = 1.
+        residual_flow: (N, 2) velocity of `normalized` in 1/s without the part that the rotation of
+            the camera explains; NaN where it is not known.
+    """
+
+    image: Image | None
+    stamp_ns: int
+    ids: IntArray
+    pixels: Pixels
+    normalized: FloatArray
+    residual_flow: FloatArray
+
+    @staticmethod
+    def of(
+        image: Image | None,
+        stamp_ns: int,
+        ids: IntArray,
+        pixels: Pixels,
+        normalized: FloatArray,
+    ) -> Tracks:
+        """Features whose residual flow is not known."""
+        return Tracks(image, stamp_ns, ids, pixels, normalized, np.full((len(ids), 2), np.nan))
+
+    @staticmethod
+    def empty(image: Image | None = None, stamp_ns: int = 0) -> Tracks:
+        """No features."""
+        nothing = np.zeros((0, 2))
+        return Tracks.of(
+            image, stamp_ns, np.zeros(0, np.int64), nothing.astype(np.float32), nothing
+        )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: BoolArray | IntArray) -> Tracks:
+        """Those where a mask `keep` (N,) is true, or those with given indices."""
+        return replace(
+            self,
+            ids=self.ids[keep],
+            pixels=self.pixels[keep],
+            normalized=self.normalized[keep],
+            residual_flow=self.residual_flow[keep],
+        )
+
+    def joined(self, other: Tracks) -> Tracks:
+        """These features and others, in the order of their ids."""
+        ids = np.concatenate([self.ids, other.ids])
+        order = np.argsort(ids, kind="stable")
+        return replace(
+            self,
+            ids=ids[order],
+            pixels=np.concatenate([self.pixels, other.pixels])[order],
+            normalized=np.concatenate([self.normalized, other.normalized])[order],
+            residual_flow=np.concatenate([self.residual_flow, other.residual_flow])[order],
+        )
+
+    def common(self, other: Tracks) -> tuple[IntArray, IntArray]:
+        """Indices here and there (M,) of the features in both."""
+        _, here, there = np.intersect1d(
+            self.ids, other.ids, assume_unique=True, return_indices=True
+        )
+        return here, there
+
+    def observations(self) -> FeatureObservations:
+        """As the back end receives them."""
+        return FeatureObservations(
+            self.ids.copy(), self.pixels.astype(np.float64), self.normalized.copy()
+        )
+
+
+def spread(pixels: Pixels, count: int, distance_px: float) -> IntArray:
     """Non-maximum suppression: the first `count` points that keep their distance from one another.
 
     Args:

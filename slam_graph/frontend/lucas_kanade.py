@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking: the same points in another image, by pyramidal Lucas-Kanade."""
+"""Data association by tracking: corners followed from image to image by pyramidal Lucas-Kanade."""
 
 from __future__ import annotations
 
@@ -10,18 +10,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.frontend.association import Births, Match, inside
-from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.arrays import BoolArray, IntArray
+from slam_graph.frontend.association import Association, Candidates, inside
+from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.frontend.tracked_features import Image, Tracks
+
+__all__ = ["CornerTracking", "LucasKanade"]
+
+ITERATIONS = 15
+"""Most iterations on each level of the pyramid; few are needed from a good prediction."""
+
+STEP_PX = 0.02
+"""Iterations end when a step is smaller than this, which is well below the noise of a track."""
+
+MIN_EIGENVALUE = 1e-3
+"""Windows with less gradient than this are not tracked (OpenCV's `minEigThreshold`)."""
 
 GUIDED_LEVELS = 1
 """Pyramid levels where the guess is good; more of them lead away from it."""
 
+BACKWARD_LEVELS = 0
+"""Pyramid levels of the backward pass: it starts at the point where it should end."""
+
 SURPLUS = 2
-"""So many corners are tried for each new feature: not all can be followed back."""
+"""Corners tried for each new feature that is wanted: not all can be tracked back."""
+
+VERIFICATION = 0.3
+"""Errors allowed to a new corner, as a share of those allowed to one that is tracked already. There
+are more corners than are needed, and one that barely passes is soon lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +48,12 @@ class Flow:
 
     Attributes:
         points: (N, 2) float32 pixels in the other image.
-        found: (N,) whether Lucas-Kanade converged inside the image, there and back.
-        error_px: (N,) how far tracking back ends from where it started.
+        found: (N,) whether Lucas-Kanade converged inside the image, forward and back.
+        error_px: (N,) distance between a point and itself after tracking it forward and back.
     """
 
-    points: Points
-    found: Mask
+    points: Pixels
+    found: BoolArray
     error_px: NDArray[np.float32]
 
 
@@ -43,15 +61,11 @@ class LucasKanade:
     """Pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check (Kalal et al. 2010)."""
 
     def __init__(self, config: FrontendConfig) -> None:
-        self._config = config
-        self._criteria = (
-            cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
-            config.lk_iterations,
-            config.lk_epsilon_px,
-        )
+        self._window_px = config.window_px
+        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, STEP_PX)
 
     def flow(
-        self, source: Image, target: Image, points: Points, guess: Points, levels: int
+        self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
     ) -> Flow:
         """Find `points` of `source` in `target`.
 
@@ -60,84 +74,83 @@ class LucasKanade:
             target: image of the same size.
             points: (N, 2) float32 pixels in `source`.
             guess: (N, 2) where to start in `target`.
-            levels: of the pyramid.
+            levels: of the pyramid, besides the image itself.
         """
         if len(points) == 0:
             return Flow(points, np.zeros(0, np.bool_), np.zeros(0, np.float32))
         forward, found = self._lucas_kanade(source, target, points, guess, levels)
-        found &= inside(forward, target.shape, self._config.border_px)
+        found &= inside(forward, target.shape, BORDER_PX)
         # The way back starts where it should end, so it needs no pyramid: what it tests is whether
         # the patch that was found is, seen from the other side, the patch that was looked for.
-        levels = self._config.backward_levels
-        back, returned = self._lucas_kanade(target, source, forward, points, levels)
+        back, returned = self._lucas_kanade(target, source, forward, points, BACKWARD_LEVELS)
         error_px = np.linalg.norm(back - points, axis=1)
         return Flow(forward, found & returned, error_px)
 
     def _lucas_kanade(
-        self, source: Image, target: Image, points: Points, start: Points, levels: int
-    ) -> tuple[Points, Mask]:
-        window = self._config.window_px
+        self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
+    ) -> tuple[Pixels, BoolArray]:
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,
             points,
             start.astype(np.float32),  # a copy: it is overwritten
-            winSize=(window, window),
+            winSize=(self._window_px, self._window_px),
             maxLevel=levels,
             criteria=self._criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=self._config.lk_min_eigenvalue,
+            minEigThreshold=MIN_EIGENVALUE,
         )
         return np.asarray(moved, np.float32), status[:, 0] == 1
 
 
 class CornerTracking:
-    """Follows the corners of one camera by Lucas-Kanade."""
+    """Tracks the corners of one camera by Lucas-Kanade: an `Associator`."""
 
-    def __init__(self, extractor: CornerExtractor, config: FrontendConfig) -> None:
+    def __init__(self, extractor: FeatureExtractor, config: FrontendConfig) -> None:
         self._extractor = extractor
-        self._config = config
         self._lucas_kanade = LucasKanade(config)
-        self._guided = min(config.guided_levels, config.pyramid_levels)
+        self._levels = config.pyramid_levels
+        self._largest_px = config.forward_backward_px
 
-    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
         """Find features in the next image."""
         n = len(before)
         points = np.zeros((n, 2), np.float32)
         found, good = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         if before.image is None:
-            return Match(points, good, {})
-        # A guess that is good needs no pyramid, which can lead away from it; what is not found near
-        # it is looked for again like the features without one.
-        for levels, tried in ((self._guided, guess.trusted), (self._config.pyramid_levels, None)):
+            return Association(points, good, {})
+        # A good guess needs no pyramid, which can lead away from it; what is not found near it is
+        # looked for again like the features without one.
+        guided = min(GUIDED_LEVELS, self._levels)
+        for levels, tried in ((guided, guess.trusted), (self._levels, None)):
             rows = np.flatnonzero(~good if tried is None else tried)
             flow = self._lucas_kanade.flow(
                 before.image, image, before.pixels[rows], guess.points[rows], levels
             )
             points[rows], found[rows] = flow.points, flow.found
-            good[rows] = flow.found & (flow.error_px < self._config.forward_backward_px)
-        return Match(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
+            good[rows] = flow.found & (flow.error_px < self._largest_px)
+        return Association(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
 
-    def recover(self, before: Tracks, after: Tracks) -> tuple[NDArray[np.int64], Points]:
-        """Nothing: without an image of it, a corner that was lost cannot be told from others."""
+    def recover(self, before: Tracks, after: Tracks) -> tuple[IntArray, Pixels]:
+        """None: a corner without a descriptor cannot be recognised once it is lost."""
         return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
-    def births(self, before: Tracks, after: Tracks, verify: bool) -> Births:
-        """New corners that can be followed back to the image before."""
+    def propose(self, before: Tracks, after: Tracks, verify: bool) -> Candidates:
+        """New corners; if they are verified, those that can be tracked back."""
         assert after.image is not None
         if not verify or before.image is None:
-            return Births(self._extractor.extract(after.image, after.pixels).points, None)
+            return Candidates(self._extractor.extract(after.image, after.pixels).points, None)
         found = self._extractor.extract(after.image, after.pixels, SURPLUS)
         points = found.points
         here, there = after.common(before)
         guess = points + neighbour_flow(after.pixels[here], before.pixels[there], points)
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, GUIDED_LEVELS)
-        limit_px = self._config.verification * self._config.forward_backward_px
+        limit_px = VERIFICATION * self._largest_px
         good = found.within_quotas(flow.found & (flow.error_px < limit_px))
-        return Births(points[good], flow.points[good], self._config.verification)
+        return Candidates(points[good], flow.points[good], VERIFICATION)
 
-    def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
+    def accept(self, ids: IntArray, chosen: BoolArray) -> None:
         """Nothing to remember: corners are found again by their image."""
 
-    def forget(self, ids: NDArray[np.int64]) -> None:
+    def forget(self, ids: IntArray) -> None:
         """Nothing to forget."""

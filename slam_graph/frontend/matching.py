@@ -1,37 +1,57 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Matching: the same points in another image, by their descriptors near where they should be."""
+"""Data association by matching: keypoints found again by their descriptors near a prediction."""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from slam_graph.frontend.association import Births, Match, inside
-from slam_graph.frontend.descriptors import DESCRIPTORS, Descriptor, Vectors
-from slam_graph.frontend.extraction import CornerExtractor
-from slam_graph.frontend.frontend_config import FrontendConfig, MatchingConfig
-from slam_graph.frontend.keypoints import Indices, Keypoints, Mask, Points
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.frontend.association import Association, Candidates, inside
+from slam_graph.frontend.descriptors import Descriptor, Vectors
+from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
+from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
+from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks
 from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.frontend.tracked_features import Image, Tracks
 from slam_graph.sensors.camera import Camera
+
+__all__ = ["DescriptorMatching", "descriptor_distances", "match"]
+
+KEYPOINTS = 500
+"""Keypoints described in each image: two to three times the default number of features, so that
+most features are among them."""
+
+KEYPOINT_DISTANCE_PX = 5.0
+"""Least distance of these keypoints: closer than features, so that each is found again."""
+
+SEARCH_RADIUS_PX = 20.0
+"""A match lies within this distance of the prediction, which the gyroscope makes good to a few
+pixels."""
+
+RATIO = 0.85
+"""Ratio test (Lowe 2004): the best match is closer than this share of the distance to the second
+best. Less strict than Lowe's 0.8, because the search window leaves few rivals."""
+
+MEMORY_FRAMES = 5
+"""Frames in which a feature without a match is still looked for; later the prediction of where it
+is has drifted."""
 
 SAME_PX = 3.0
 """Keypoints this close are the same corner at two scales, and do not rival one another."""
 
 
-def descriptor_distances(a: Vectors, b: Vectors) -> NDArray[np.float64]:
+def descriptor_distances(a: Vectors, b: Vectors) -> FloatArray:
     """Distances (N, M) of descriptors (N, D) and (M, D).
 
     The number of bits that differ where they are uint8, Euclidean otherwise.
     """
     if a.dtype != np.uint8:
-        distances: NDArray[np.float64] = cdist(a, b)
+        distances: FloatArray = cdist(a, b)
         return distances
     words_a, words_b = (np.ascontiguousarray(v).view(np.uint64) for v in (a, b))
     bits = np.bitwise_count(words_a[:, None] ^ words_b[None])
@@ -39,41 +59,41 @@ def descriptor_distances(a: Vectors, b: Vectors) -> NDArray[np.float64]:
 
 
 def match(
-    wanted: Vectors,
-    offered: Vectors,
-    guess: Points,
-    pixels: Points,
-    descriptor: Descriptor,
-    config: MatchingConfig,
-) -> Indices:
-    """Match descriptors under a search window, the ratio test and the mutual check.
+    features: Vectors,
+    keypoints: Vectors,
+    guess: Pixels,
+    pixels: Pixels,
+    max_distance: float,
+    search_radius_px: float = SEARCH_RADIUS_PX,
+    mutual: bool = True,
+) -> IntArray:
+    """Match descriptors within a search window, with the ratio test and the mutual check.
 
     Args:
-        wanted: (N, D) descriptors to find.
-        offered: (M, D) descriptors to choose from.
-        guess: (N, 2) where the first should be, in the image of the second.
-        pixels: (M, 2) where the second are.
-        descriptor: its largest distance.
-        config: window, ratio and mutual check.
+        features: (N, D) descriptors to find.
+        keypoints: (M, D) descriptors to choose from.
+        guess: (N, 2) predicted pixels of the features, in the image of the keypoints.
+        pixels: (M, 2) pixels of the keypoints.
+        max_distance: largest distance of two descriptors that match.
+        search_radius_px: largest distance of a match from the guess.
+        mutual: whether a match must be the best one seen from either image.
 
     Returns:
         (N,) index of the match, or -1; no index twice.
     """
-    n, m = len(wanted), len(offered)
+    n, m = len(features), len(keypoints)
     if n == 0 or m == 0:
         return np.full(n, -1, np.int64)
-    distance = descriptor_distances(wanted, offered)
-    distance[cdist(guess, pixels) > config.search_radius_px] = np.inf
+    distance = descriptor_distances(features, keypoints)
+    distance[cdist(guess, pixels) > search_radius_px] = np.inf
     rows = np.arange(n)
     best = np.argmin(distance, axis=1)
     shortest = distance[rows, best]
     rivals = np.where(cdist(pixels, pixels)[best] < SAME_PX, np.inf, distance)
-    good = (shortest <= descriptor.max_distance) & (
-        shortest < config.ratio * np.min(rivals, axis=1)
-    )
-    if config.mutual:
+    good = (shortest <= max_distance) & (shortest < RATIO * np.min(rivals, axis=1))
+    if mutual:
         good &= np.argmin(distance, axis=0)[best] == rows
-    # of several that chose the same one, the closest gets it
+    # of several features that chose the same keypoint, the closest gets it
     order = np.lexsort((shortest, ~good))
     _, first = np.unique(best[order], return_index=True)
     closest = np.zeros(n, np.bool_)
@@ -82,41 +102,50 @@ def match(
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
-    """The keypoints of an image and their descriptors, (N, D)."""
+class _Described:
+    """The keypoints of an image, their descriptors, and which are features.
+
+    Attributes:
+        keypoints: N of them.
+        vectors: (N, D) descriptors.
+        free: (N,) whether a keypoint belongs to no feature; changed in place.
+    """
 
     keypoints: Keypoints
     vectors: Vectors
+    free: BoolArray
 
-    def select(self, which: Mask | Indices) -> Described:
-        """Some of them."""
-        return Described(self.keypoints.select(which), self.vectors[which])
+    @staticmethod
+    def empty() -> _Described:
+        """No keypoints."""
+        nothing = np.zeros((0, 1), np.uint8)
+        return _Described(Keypoints.concatenate([]), nothing, np.zeros(0, np.bool_))
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
 
 @dataclass(frozen=True, eq=False)
-class Missing:
-    """Features that were not seen of late.
+class _Lost:
+    """Features without a match in the last images.
 
     Attributes:
         ids: (N,) ascending.
         vectors: (N, D) descriptors.
-        pixels: (N, 2) where they should be.
-        normalized: (N, 2) where they were when they were last seen.
-        seen: (N,) number of that image.
+        pixels: (N, 2) predicted in the last image.
+        normalized: (N, 2) where they were last seen.
+        seen: (N,) number of the image in which they were last seen.
     """
 
-    ids: NDArray[np.int64]
+    ids: IntArray
     vectors: Vectors
-    pixels: Points
-    normalized: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    pixels: Pixels
+    normalized: FloatArray
+    seen: IntArray
 
-    def select(self, which: Mask | Indices) -> Missing:
-        """Some of them."""
-        return Missing(
+    def select(self, which: BoolArray | IntArray) -> _Lost:
+        """Those where a mask (N,) is true, or those with given indices."""
+        return _Lost(
             self.ids[which],
             self.vectors[which],
             self.pixels[which],
@@ -124,12 +153,12 @@ class Missing:
             self.seen[which],
         )
 
-    def joined(self, other: Missing) -> Missing:
+    def joined(self, other: _Lost) -> _Lost:
         """These and others, in the order of their ids."""
         if len(self.ids) == 0:
             return other
         ids = np.concatenate([self.ids, other.ids])
-        return Missing(
+        return _Lost(
             ids,
             np.concatenate([self.vectors, other.vectors]),
             np.concatenate([self.pixels, other.pixels]),
@@ -139,12 +168,12 @@ class Missing:
 
 
 class DescriptorMatching:
-    """Follows the keypoints of one camera by their descriptors.
+    """Finds the features of one camera by their descriptors: an `Associator`.
 
     Args:
         camera: for its distortion.
         extractor: spreads new features over the image.
-        config: options; `method` names the descriptor.
+        config: `method` names the descriptor.
         mask: (height, width), zero where no features are wanted.
 
     Raises:
@@ -154,146 +183,136 @@ class DescriptorMatching:
     def __init__(
         self,
         camera: Camera,
-        extractor: CornerExtractor,
+        extractor: FeatureExtractor,
         config: FrontendConfig,
         mask: Image | None,
     ) -> None:
         self._camera = camera
         self._extractor = extractor
-        self._config = config
-        self._matching = config.matching
-        dense = config.model_copy(update={"min_distance_px": config.matching.distance_px})
-        self._dense = CornerExtractor(dense, camera.width, camera.height, mask)
-        self._descriptor = DESCRIPTORS[config.method]()
-        nothing = Keypoints.concatenate([])
-        self._offered = self._last = Described(nothing, np.zeros((0, 1), np.uint8))
-        self._free = self._last_free = np.zeros(0, np.bool_)
-        self._ids = np.zeros(0, np.int64)
-        self._vectors: Vectors = np.zeros((0, 1), np.uint8)
-        self._taken = np.zeros(0, np.int64)
-        self._born = np.zeros(0, np.int64)
-        self._missing: Missing | None = None
-        self._history: deque[Tracks] = deque(maxlen=self._matching.memory_frames + 1)
+        self._epipolar_px = config.epipolar_px
+        self._dense = FeatureExtractor(
+            config, camera.width, camera.height, mask, KEYPOINT_DISTANCE_PX
+        )
+        self._descriptor: Descriptor = DESCRIPTORS[config.method]()
+        self._current = self._last = _Described.empty()
+        self._ids = np.zeros(0, np.int64)  # of the features, ascending
+        self._vectors: Vectors = np.zeros((0, 1), np.uint8)  # their descriptors
+        self._matched = np.zeros(0, np.int64)  # index of the keypoint of each feature, or -1
+        self._proposed = np.zeros(0, np.int64)  # indices of the keypoints that were proposed
+        self._lost: _Lost | None = None
+        self._history: deque[Tracks] = deque(maxlen=MEMORY_FRAMES + 1)
         self._images = 0
 
-    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Match:
+    def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
         """Find features in the next image."""
-        self._last, self._last_free = self._offered, self._free
-        keypoints = self._dense.candidates(image, self._matching.candidates)
+        keypoints = self._dense.candidates(image, KEYPOINTS)
         kept, vectors = self._descriptor.describe(image, keypoints)
-        self._offered = Described(keypoints.select(kept), vectors)
-        self._free = np.ones(len(kept), np.bool_)
+        self._last = self._current
+        self._current = _Described(keypoints.select(kept), vectors, np.ones(len(kept), np.bool_))
         self._images += 1
-        pixels = self._offered.keypoints.pixels
+        pixels = self._current.keypoints.pixels
         chosen = np.full(len(before), -1, np.int64)
         known = np.isin(before.ids, self._ids)
-        wanted = self._vectors[np.searchsorted(self._ids, before.ids[known])]
-        chosen[known] = self._match(wanted, guess.points[known], np.arange(len(pixels)))
+        features = self._vectors[np.searchsorted(self._ids, before.ids[known])]
+        chosen[known] = self._match(features, guess.points[known], np.arange(len(pixels)))
         good = chosen >= 0
         points = guess.points.copy()
         points[good] = pixels[chosen[good]]
-        good[good] = inside(points[good], image.shape, self._config.border_px)
-        self._taken = chosen
-        return Match(points, good, {"lost_match": ~good})
+        good[good] = inside(points[good], image.shape, BORDER_PX)
+        self._matched = chosen
+        return Association(points, good, {"lost_match": ~good})
 
-    def recover(self, before: Tracks, after: Tracks) -> tuple[NDArray[np.int64], Points]:
+    def recover(self, before: Tracks, after: Tracks) -> tuple[IntArray, Pixels]:
         """Features that found no match at first, or not in the last few images."""
         here, there = before.common(after)
-        chosen = self._taken[here]
-        self._free[chosen] = False
-        self._remember_missing(before, after)
-        missing = self._missing
-        found = np.full(0 if missing is None else len(missing.ids), -1, np.int64)
-        if missing is not None and len(here) >= MIN_POINTS:
-            guess = missing.pixels + neighbour_flow(
-                before.pixels[here], after.pixels[there], missing.pixels
-            )
-            missing = Missing(missing.ids, missing.vectors, guess, missing.normalized, missing.seen)
-            found = self._match(missing.vectors, guess, np.flatnonzero(self._free))
-            found[~self._fits(missing, found, after)] = -1
+        chosen = self._matched[here]
+        self._current.free[chosen] = False
+        lost = self._remember_lost(before, after)
+        found = np.full(len(lost.ids), -1, np.int64)
+        if len(here) >= MIN_POINTS:
+            flow = neighbour_flow(before.pixels[here], after.pixels[there], lost.pixels)
+            lost = replace(lost, pixels=lost.pixels + flow)
+            found = self._match(lost.vectors, lost.pixels, np.flatnonzero(self._current.free))
+            found[~self._fits(lost, found, after)] = -1
         self._update(after.ids[there], chosen)
-        if missing is None:
-            return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         seen = found >= 0
-        self._free[found[seen]] = False
-        self._update(missing.ids[seen], found[seen])
-        young = self._images - missing.seen <= self._matching.memory_frames
+        self._current.free[found[seen]] = False
+        self._update(lost.ids[seen], found[seen])
+        young = self._images - lost.seen <= MEMORY_FRAMES
         size = (self._camera.height, self._camera.width)
-        self._missing = missing.select(~seen & young & inside(missing.pixels, size, 0))
+        self._lost = lost.select(~seen & young & inside(lost.pixels, size, 0))
         self._history.append(after)
-        return missing.ids[seen], self._offered.keypoints.pixels[found[seen]]
+        return lost.ids[seen], self._current.keypoints.pixels[found[seen]]
 
-    def births(self, before: Tracks, after: Tracks, verify: bool) -> Births:
-        """Keypoints that are no feature yet, and match one of the image before that is none."""
-        free = np.flatnonzero(self._free)
-        origins: Points | None = None
+    def propose(self, before: Tracks, after: Tracks, verify: bool) -> Candidates:
+        """Keypoints that are no feature; if verified, they match such a one in the image before."""
+        free = np.flatnonzero(self._current.free)
+        origins: Pixels | None = None
         if verify and len(self._last):
             here, there = after.common(before)
-            pixels = self._offered.keypoints.pixels[free]
+            pixels = self._current.keypoints.pixels[free]
             guess = pixels + neighbour_flow(after.pixels[here], before.pixels[there], pixels)
-            last = self._last.select(self._last_free)
+            last_pixels = self._last.keypoints.pixels[self._last.free]
             found = match(
-                self._offered.vectors[free],
-                last.vectors,
+                self._current.vectors[free],
+                self._last.vectors[self._last.free],
                 guess,
-                last.keypoints.pixels,
-                self._descriptor,
-                self._matching,
+                last_pixels,
+                self._descriptor.max_distance,
             )
             free, found = free[found >= 0], found[found >= 0]
-            origins = last.keypoints.pixels[found]
-        chosen = self._extractor.fill(self._offered.keypoints.select(free), after.pixels)
-        self._born = free[chosen]
-        points = self._offered.keypoints.pixels[self._born]
-        return Births(points, None if origins is None else origins[chosen])
+            origins = last_pixels[found]
+        chosen = self._extractor.fill(self._current.keypoints.select(free), after.pixels)
+        self._proposed = free[chosen]
+        points = self._current.keypoints.pixels[self._proposed]
+        return Candidates(points, None if origins is None else origins[chosen])
 
-    def adopt(self, ids: NDArray[np.int64], chosen: Mask) -> None:
-        """Remember what new features look like."""
-        self._free[self._born[chosen]] = False
-        self._update(ids, self._born[chosen])
+    def accept(self, ids: IntArray, chosen: BoolArray) -> None:
+        """Remember the descriptors of new features."""
+        self._current.free[self._proposed[chosen]] = False
+        self._update(ids, self._proposed[chosen])
 
-    def forget(self, ids: NDArray[np.int64]) -> None:
-        """Do not look for some features any more."""
-        if self._missing is not None:
-            self._missing = self._missing.select(~np.isin(self._missing.ids, ids))
+    def forget(self, ids: IntArray) -> None:
+        """Do not look for these features any more."""
+        if self._lost is not None:
+            self._lost = self._lost.select(~np.isin(self._lost.ids, ids))
 
-    def _match(self, wanted: Vectors, guess: Points, among: Indices) -> Indices:
-        """Index of the match of each feature (N,) among some keypoints, or -1."""
+    def _match(self, features: Vectors, guess: Pixels, among: IntArray) -> IntArray:
+        """For each feature (N,) the index of its match among some keypoints, or -1."""
         found = match(
-            wanted,
-            self._offered.vectors[among],
+            features,
+            self._current.vectors[among],
             guess,
-            self._offered.keypoints.pixels[among],
-            self._descriptor,
-            self._matching,
+            self._current.keypoints.pixels[among],
+            self._descriptor.max_distance,
         )
         return np.where(found >= 0, among[found], -1) if len(among) else found
 
-    def _update(self, ids: NDArray[np.int64], keypoints: Indices) -> None:
-        """Features look now as these keypoints do."""
+    def _update(self, ids: IntArray, keypoints: IntArray) -> None:
+        """Replace the descriptors of features by those of their keypoints in this image."""
         old = ~np.isin(self._ids, ids)
-        vectors = self._offered.vectors[keypoints]
+        vectors = self._current.vectors[keypoints]
         joined = np.concatenate([self._ids[old], ids])
         order = np.argsort(joined, kind="stable")
         if old.any():
             vectors = np.concatenate([self._vectors[old], vectors])
         self._ids, self._vectors = joined[order], vectors[order]
 
-    def _remember_missing(self, before: Tracks, after: Tracks) -> None:
-        """Note the features that have just gone missing, and forget what all others look like."""
+    def _remember_lost(self, before: Tracks, after: Tracks) -> _Lost:
+        """The lost features and those just lost; the descriptors of all others are dropped."""
         gone = before.select(~np.isin(before.ids, after.ids) & np.isin(before.ids, self._ids))
         vectors = self._vectors[np.searchsorted(self._ids, gone.ids)]
         seen = np.full(len(gone), self._images - 1)
-        new = Missing(gone.ids, vectors, gone.pixels, gone.normalized, seen)
-        self._missing = new if self._missing is None else self._missing.joined(new)
+        new = _Lost(gone.ids, vectors, gone.pixels, gone.normalized, seen)
         kept = np.isin(self._ids, after.ids)
         self._ids, self._vectors = self._ids[kept], self._vectors[kept]
+        return new if self._lost is None else self._lost.joined(new)
 
-    def _fits(self, missing: Missing, found: Indices, after: Tracks) -> Mask:
+    def _fits(self, lost: _Lost, found: IntArray, after: Tracks) -> BoolArray:
         """Which of the features (N,) that were found again fit the motion since they were seen."""
         fits = np.zeros(len(found), np.bool_)
-        limit = self._config.epipolar_px / self._camera.fx
-        for number in np.unique(missing.seen[found >= 0]).tolist():
+        limit = self._epipolar_px / self._camera.fx
+        for number in np.unique(lost.seen[found >= 0]).tolist():
             back = self._images - number
             if back > len(self._history):
                 continue
@@ -302,8 +321,8 @@ class DescriptorMatching:
             if len(here) < MIN_POINTS:
                 continue
             F = eight_point(then.normalized[there], after.normalized[here])
-            rows = np.flatnonzero((found >= 0) & (missing.seen == number))
-            pixels = self._offered.keypoints.pixels[found[rows]].astype(np.float64)
+            rows = np.flatnonzero((found >= 0) & (lost.seen == number))
+            pixels = self._current.keypoints.pixels[found[rows]].astype(np.float64)
             m = self._camera.undistort(pixels)
-            fits[rows] = epipolar_distance(F, missing.normalized[rows], m) < limit
+            fits[rows] = epipolar_distance(F, lost.normalized[rows], m) < limit
         return fits

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rejection of wrong matches by epipolar geometry, on undistorted normalised coordinates."""
+"""Outlier rejection: RANSAC on epipolar geometry or on the map, in normalised coordinates."""
 
 from __future__ import annotations
 
@@ -9,38 +9,55 @@ from collections.abc import Callable
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
 
-Mask = NDArray[np.bool_]
+__all__ = [
+    "MIN_POINTS",
+    "coherent_groups",
+    "direction_inliers",
+    "eight_point",
+    "epipolar_distance",
+    "essential_matrix",
+    "fundamental_inliers",
+    "map_inliers",
+    "triangulated_depths",
+]
 
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
 
 GROUP_SHARE = 0.1
 GROUP_POINTS = 16
-"""What moves otherwise than most matches is an object, not a few errors, if so many agree."""
+"""Matches that agree on another motion are an object, not errors, if they are this share of all
+and this many at least."""
+
+CONFIDENCE = 0.999
+"""Probability with which RANSAC draws at least one sample without an outlier."""
 
 MAX_ITERATIONS = 1000
 """Most samples that RANSAC draws."""
 
+PNP_ITERATIONS = 100
+"""Most samples of PnP's RANSAC, which starts from a predicted pose."""
+
 DIRECTION_SAMPLES = 64
-"""Samples of two points: with half of the matches wrong, one in four is good."""
+"""Samples of two points: with half of the matches wrong, one sample in four is good."""
 
 
 def coherent_groups(
-    inliers: Callable[[IntArray], Mask], rest: IntArray, count: int
+    inliers: Callable[[IntArray], BoolArray], rest: IntArray, count: int
 ) -> list[IntArray]:
-    """What else moves as one, among matches that do not fit the motion of the others.
+    """Further rigid motions among the RANSAC outliers.
 
-    Images alone cannot say which of two motions is that of the camera before a world that stands
-    still: an object that is near or rich in texture has more features. What fits none is an error.
+    They are kept as inliers, because images alone cannot say which motion is relative to the static
+    world: a moving object that is near or rich in texture has more features than the background.
+    The back end can tell, from the IMU.
 
     Args:
         inliers: which of the matches, given by their rows (N,), fit the motion of most of them.
-        rest: (M,) rows of the matches to look at.
+        rest: (M,) rows of the outliers.
         count: number of all matches.
 
     Returns:
@@ -62,32 +79,32 @@ def fundamental_inliers(
     after: FloatArray,
     focal_px: float,
     config: FrontendConfig,
-    share: float = 1.0,
-) -> Mask:
+    scale: float = 1.0,
+) -> BoolArray:
     """Which matches between two frames of one camera fit a single rigid motion.
 
     Args:
         before: (N, 2) normalised coordinates in the earlier frame.
         after: (N, 2) the same points in the later frame.
         focal_px: focal length, which turns the threshold in pixels into one on the plane z = 1.
-        config: method, threshold and confidence.
-        share: of the threshold that is allowed.
+        config: method and threshold.
+        scale: factor on the threshold.
 
     Returns:
         (N,) True for inliers.
     """
     if len(before) < MIN_POINTS:
         return np.ones(len(before), np.bool_)
-    tolerance_px = share * config.epipolar_px
+    tolerance_px = scale * config.epipolar_px
     result = _sampled(before, after, focal_px, config, tolerance_px)
     if result is None:
         return np.ones(len(before), np.bool_)
-    # A sample of a few noisy points fits some others badly; all that agree fit them better
+    # A model of a few noisy points misses inliers that one of all inliers so far fits
     for _ in range(2):
         if np.count_nonzero(result) < MIN_POINTS:
             break
         F = eight_point(before[result], after[result])
-        refined: Mask = epipolar_distance(F, before, after) * focal_px < tolerance_px
+        refined: BoolArray = epipolar_distance(F, before, after) * focal_px < tolerance_px
         if np.count_nonzero(refined) <= np.count_nonzero(result):
             break
         result = refined
@@ -100,16 +117,16 @@ def _sampled(
     focal_px: float,
     config: FrontendConfig,
     tolerance_px: float,
-) -> Mask | None:
-    """The inliers (N,) of the best sample that OpenCV finds; None if it finds none."""
+) -> BoolArray | None:
+    """The inliers (N,) of the best sample of OpenCV's RANSAC; None if it finds no model."""
     if config.outliers == "essential":
-        # five points, calibrated: what does not belong to a rotation and a direction is excluded
+        # five points, calibrated: only a rotation and a direction of motion are estimated
         matrix, inliers = cv2.findEssentialMat(
             before,
             after,
             np.eye(3),
             cv2.RANSAC,
-            config.ransac_confidence,
+            CONFIDENCE,
             tolerance_px / focal_px,
             MAX_ITERATIONS,
         )
@@ -120,12 +137,12 @@ def _sampled(
             after * focal_px,
             cv2.USAC_MAGSAC if config.outliers == "magsac" else cv2.FM_RANSAC,
             tolerance_px,
-            config.ransac_confidence,
+            CONFIDENCE,
             MAX_ITERATIONS,
         )
     if matrix is None or inliers is None:
         return None
-    found: Mask = np.asarray(inliers)[:, 0] == 1
+    found: BoolArray = np.asarray(inliers)[:, 0] == 1
     return found
 
 
@@ -136,8 +153,8 @@ def direction_inliers(
     focal_px: float,
     config: FrontendConfig,
     rng: np.random.Generator,
-    share: float = 1.0,
-) -> Mask:
+    scale: float = 1.0,
+) -> BoolArray:
     """Which matches fit a motion whose rotation is known, by 2-point RANSAC.
 
     With the rotation given, the planes of all matches contain the translation: their normals
@@ -151,7 +168,7 @@ def direction_inliers(
         focal_px: focal length.
         config: threshold.
         rng: draws the samples.
-        share: of the threshold that is allowed.
+        scale: factor on the threshold.
 
     Returns:
         (N,) True for inliers.
@@ -168,11 +185,11 @@ def direction_inliers(
     length = np.linalg.norm(directions, axis=1)
     directions = directions[length > 0] / length[length > 0, None]
     # m'ᵀ [t]× R m = t · n, and its gradients by m and m' are of the length |t × m|, first two rows
-    tolerance = share * config.epipolar_px / focal_px
+    tolerance = scale * config.epipolar_px / focal_px
     if len(directions) == 0:
         return np.ones(n, np.bool_)
     best = _within(directions, normals, turned, seen, tolerance)
-    inlier: Mask = best[np.argmax(np.count_nonzero(best, axis=1))]
+    inlier: BoolArray = best[np.argmax(np.count_nonzero(best, axis=1))]
     for _ in range(2):
         _, vectors = np.linalg.eigh(normals[inlier].T @ normals[inlier])
         refined = _within(vectors[:, :1].T, normals, turned, seen, tolerance)[0]
@@ -184,8 +201,8 @@ def direction_inliers(
 
 def _within(
     directions: FloatArray, normals: FloatArray, a: FloatArray, b: FloatArray, tolerance: float
-) -> NDArray[np.bool_]:
-    """Whether Sampson's distance (K, N) from each direction of motion (K, 3) is small."""
+) -> BoolArray:
+    """Whether the Sampson distance (K, N) for each direction of motion (K, 3) is small."""
     residual = np.abs(directions @ normals.T)
     tx, ty, tz = (directions[:, i, None] for i in range(3))
 
@@ -195,7 +212,7 @@ def _within(
         return squared
 
     gradient = np.sqrt(squared_gradient(a) + squared_gradient(b))
-    close: NDArray[np.bool_] = residual < tolerance * np.maximum(gradient, 1e-9)
+    close: BoolArray = residual < tolerance * np.maximum(gradient, 1e-9)
     return close
 
 
@@ -205,7 +222,7 @@ def map_inliers(
     guess: gtsam.Pose3,
     focal_px: float,
     config: FrontendConfig,
-) -> Mask:
+) -> BoolArray:
     """Which observations fit one pose against known points, by PnP with RANSAC.
 
     Args:
@@ -213,7 +230,7 @@ def map_inliers(
         normalized: (N, 2) where the camera sees them.
         guess: camera_T_world to start from.
         focal_px: focal length.
-        config: `map_check_px` and confidence.
+        config: `map_check_px`.
 
     Returns:
         (N,) True for inliers; all where there are too few to tell, or no pose fits most of them.
@@ -226,12 +243,13 @@ def map_inliers(
         normalized,
         np.eye(3),
         None,
-        rvec=np.array(gtsam.Rot3.Logmap(guess.rotation())).reshape(3, 1),  # copies: they are
-        tvec=np.array(guess.translation()).reshape(3, 1),  # overwritten
+        # copies, because OpenCV overwrites them
+        rvec=np.array(gtsam.Rot3.Logmap(guess.rotation())).reshape(3, 1),
+        tvec=np.array(guess.translation()).reshape(3, 1),
         useExtrinsicGuess=True,
-        iterationsCount=100,
+        iterationsCount=PNP_ITERATIONS,
         reprojectionError=config.map_check_px / focal_px,
-        confidence=config.ransac_confidence,
+        confidence=CONFIDENCE,
     )
     if not found or inliers is None or 2 * len(inliers) < len(points):
         return everything

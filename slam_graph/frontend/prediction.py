@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the features of a camera will be in its next image."""
+"""Prediction: where the features of a camera will be in its next image."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
-from slam_graph.frontend.keypoints import Mask, Points
+from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.frontend.motion import ImuMotion
-from slam_graph.frontend.tracked_features import Tracks
 from slam_graph.sensors.rig import RigCamera
 
+__all__ = ["PointPredictor", "Prediction", "neighbour_flow"]
+
 NEAREST_DEPTH_M = 0.1
-"""Points of the map nearer than this, or behind the camera, predict nothing."""
+"""Points of the map nearer than this, or behind the camera, are not used for prediction."""
 
 MAX_TANGENT = 2.75
-"""Largest normalised coordinate that a camera model is asked about."""
+"""Largest normalised coordinate for which a camera model is evaluated: 70° off the axis."""
 
 NEIGHBOURS = 3
-"""The motion of this many neighbours stands for that of a new feature."""
+"""The median motion of this many neighbours predicts that of a new feature."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +35,21 @@ class Prediction:
 
     Attributes:
         points: (N, 2) float32 pixels.
-        trusted: (N,) whether the rotation was measured and the rest is known of the frame before.
+        trusted: (N,) whether the prediction is good to a few pixels: the rotation was measured and
+            the residual flow is known, or the feature is in the map.
     """
 
-    points: Points
-    trusted: Mask
+    points: Pixels
+    trusted: BoolArray
 
 
 class PointPredictor:
     """Predicts the features of one camera.
+
+    Args:
+        mounted: the camera.
+        motion: of the body, by the IMU.
+        config: `prediction` chooses how.
 
     Attributes:
         camera_R: end_R_start of the camera over the last prediction; the identity where unknown.
@@ -72,15 +78,15 @@ class PointPredictor:
         """Where to look for the features of the image before.
 
         Args:
-            before: in the image from which `advance` started.
+            before: features of the image from which `advance` started.
             stamp_ns: time of the new image.
-            feedback: the map, for the mode `state`.
+            feedback: the map of the back end, used by `state`.
         """
         if self._mode == "none" or len(before) == 0:
             return Prediction(before.pixels, np.zeros(len(before), np.bool_))
-        trusted: Mask = np.isfinite(before.drift[:, 0]) & self.rotation_known
+        trusted: BoolArray = np.isfinite(before.residual_flow[:, 0]) & self.rotation_known
         m = self._rotated(before.normalized)
-        m = m + np.nan_to_num(before.drift) * ((stamp_ns - before.stamp_ns) * 1e-9)
+        m = m + np.nan_to_num(before.residual_flow) * ((stamp_ns - before.stamp_ns) * 1e-9)
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True
@@ -96,14 +102,21 @@ class PointPredictor:
         """world_T_body at a time of the camera; None where it is not known."""
         return self._motion.pose(stamp_ns + self._offset_ns)
 
-    def drift(self, start: FloatArray, end: FloatArray, seconds: float) -> FloatArray:
-        """What (N, 2) normalised points have moved beyond the rotation, in 1/s."""
+    def residual_flow(self, start: FloatArray, end: FloatArray, seconds: float) -> FloatArray:
+        """Velocity (N, 2) of normalised points in 1/s that the rotation does not explain.
+
+        Args:
+            start: (N, 2) where they were.
+            end: (N, 2) where they are.
+            seconds: between the two.
+        """
         if seconds <= 0:
             return np.zeros_like(end)
         moved: FloatArray = (end - self._rotated(start)) / seconds
         return moved
 
     def _rotated(self, normalized: FloatArray) -> FloatArray:
+        """Normalised points (N, 2) after the rotation of the camera; `flow` leaves it out."""
         if self._mode == "flow":
             return normalized.copy()
         rays = np.column_stack([normalized, np.ones(len(normalized))]) @ self.camera_R.T
@@ -111,8 +124,8 @@ class PointPredictor:
         return turned
 
     def _by_map(
-        self, ids: NDArray[np.int64], stamp_ns: int, feedback: Feedback
-    ) -> tuple[NDArray[np.bool_], FloatArray]:
+        self, ids: IntArray, stamp_ns: int, feedback: Feedback
+    ) -> tuple[BoolArray, FloatArray]:
         """Which features (N,) are in the map, and where (N, 2) the predicted pose sees them."""
         m = np.zeros((len(ids), 2))
         known = np.isin(ids, feedback.ids)
@@ -127,8 +140,8 @@ class PointPredictor:
         return known, m
 
 
-def neighbour_flow(start: Points, end: Points, at: Points) -> Points:
-    """The motion (M, 2) of the nearest of N features at other places.
+def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
+    """The motion (M, 2) at other places, as the median of the nearest of N features.
 
     Args:
         start: (N, 2) pixels of features in one image.

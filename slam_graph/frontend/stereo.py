@@ -1,19 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Matches across the rig: the features of the reference camera in another camera's image.
+"""Matches between cameras: the features of a reference camera in another camera's image.
 
-Every frame is matched anew, from left to right, so that the disparity of a feature does not drift
-as it would if both cameras followed it for themselves (measured on EuRoC: the median epipolar error
-is 0.18 instead of 0.24 px). Lucas-Kanade starts from the disparity that the feature had before;
-features without one are searched along their epipolar line.
-
-A first guess across cameras: a coarse search along epipolar lines by normalised correlation.
-
-Lucas-Kanade finds its way over some pixels; the same point in two cameras that are 0.1 m apart and
-0.5 m away is off by a hundred. The depth at which a small patch of the reduced images agrees best
-is close enough.
-
-Which cameras of a rig see the same: each that does is matched to an earlier one.
+`reference_cameras` finds which cameras of a rig see the same; each of them is matched to an earlier
+one. Every frame is matched anew, from the reference to the other camera, so that the disparity of a
+feature does not drift as it would if both cameras tracked it for themselves. Lucas-Kanade starts
+from the disparity that a feature had before. Features without one are searched along their epipolar
+line first: Lucas-Kanade converges over a few pixels, but the same point in two cameras that are
+0.1 m apart, 0.5 m away, is off by a hundred.
 """
 
 from __future__ import annotations
@@ -25,54 +19,125 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
-from slam_graph.frontend.extraction import CornerExtractor
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
-from slam_graph.frontend.tracked_features import Image, Tracks
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig, RigCamera
 
+__all__ = ["StereoMatcher", "reference_cameras"]
+
+OVERLAP_GRID = 8
+"""Rays through OVERLAP_GRID x OVERLAP_GRID pixels are followed into the other camera."""
+
+OVERLAP_DEPTHS_M = (1.0, 3.0, 10.0, 100.0)
+"""Distances at which it is computed what two cameras both see."""
+
+MIN_OVERLAP = 0.25
+"""A camera that sees less than this share of another one's view has features of its own."""
+
+MAX_TANGENT = 3.0
+"""Points with larger normalised coordinates, 72° off the axis, are outside of any camera."""
+
 HALVINGS = 2
-"""The search runs on images of a quarter of the size."""
+"""The epipolar search runs on images of a quarter of the size."""
 
-RADIUS = 3
-"""Patches are (2 RADIUS + 1)² pixels of the reduced image."""
+PATCH_RADIUS = 3
+"""Its patches have (2 PATCH_RADIUS + 1)² pixels of the reduced image."""
 
-STEP_PX = 1.0
+SEARCH_STEP_PX = 1.0
 """Largest distance, in the reduced image, between neighbouring candidates at the image centre."""
 
+MIN_SCORE = 0.6
+"""Smallest normalised cross-correlation of a candidate that Lucas-Kanade starts from."""
 
-class EpipolarSearch:
-    """Searches the depth of points of one camera in the image of another."""
+LEVELS = 1
+"""Pyramid levels of Lucas-Kanade: the guess is good, and more levels lead away from it."""
+
+RETRY_FRAMES = 2
+"""A feature without a match is searched again every RETRY_FRAMES frames."""
+
+
+def reference_cameras(rig: Rig) -> tuple[int, ...]:
+    """For each camera the index of the one that it is matched to: an earlier one, or itself."""
+    references: list[int] = []
+    for index, mounted in enumerate(rig.cameras):
+        leaders = [i for i in sorted(set(references)) if references[i] == i]
+        shares = [_overlap(rig.cameras[i], mounted) for i in leaders]
+        if shares and max(shares) >= MIN_OVERLAP:
+            references.append(leaders[int(np.argmax(shares))])
+        else:
+            references.append(index)
+    return tuple(references)
+
+
+def _overlap(reference: RigCamera, other: RigCamera) -> float:
+    """The share of a camera's view that another one sees too, at the depth where it is largest."""
+    camera = reference.camera
+    u, v = np.meshgrid(
+        np.linspace(0, camera.width - 1, OVERLAP_GRID),
+        np.linspace(0, camera.height - 1, OVERLAP_GRID),
+    )
+    rays, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
+    if not usable.any():
+        return 0.0
+    rays = rays[usable]
+    ends = np.column_stack([rays, np.ones(len(rays))])
+    other_T_reference = other.body_T_camera.between(reference.body_T_camera)
+    shares = []
+    for depth_m in OVERLAP_DEPTHS_M:
+        points = np.asarray(other_T_reference.transformFrom((depth_m * ends).T)).T
+        shares.append(float(np.mean(_sees(other, points))))
+    return max(shares)
+
+
+def _sees(mounted: RigCamera, points: FloatArray) -> BoolArray:
+    """Which points (N, 3) of its frame a camera sees."""
+    camera = mounted.camera
+    ahead = points[:, 2] > 0
+    m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
+    ahead &= np.all(np.abs(m) < MAX_TANGENT, axis=1)
+    pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
+    sees: BoolArray = (
+        ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
+    )
+    return sees
+
+
+class _EpipolarSearch:
+    """Searches points of one camera along their epipolar lines in the image of another.
+
+    The candidates are projections at depths that are evenly spaced in 1 / z; the best one is that
+    with the largest normalised cross-correlation of a small patch of the reduced images.
+
+    Args:
+        camera: the one that is searched in.
+        other_T_reference: pose of the reference camera in the frame of `camera`.
+        min_depth_m: depth of the nearest candidate.
+    """
 
     def __init__(self, camera: Camera, other_T_reference: gtsam.Pose3, min_depth_m: float) -> None:
-        """Prepare the candidates.
-
-        Args:
-            camera: the one that is searched in.
-            other_T_reference: pose of the reference camera in the frame of `camera`.
-            min_depth_m: nearest candidate.
-        """
         self._camera = camera
         self._R = other_T_reference.rotation().matrix()
         self._t = other_T_reference.translation()
         disparity_px = camera.fx * float(np.linalg.norm(self._t)) / min_depth_m
-        count = int(disparity_px / (STEP_PX * 2**HALVINGS)) + 2
+        count = int(disparity_px / (SEARCH_STEP_PX * 2**HALVINGS)) + 2
         self._inverse_depths = np.linspace(0.0, 1.0 / min_depth_m, count)
-        steps = np.arange(-RADIUS, RADIUS + 1)
+        steps = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
         self._patch = np.stack(np.meshgrid(steps, steps, indexing="ij")).reshape(2, -1)
 
     def project(self, normalized: FloatArray, inverse_depth_per_m: FloatArray) -> FloatArray:
-        """Pixels in the other camera of points of the reference at given depths.
+        """Pixels in the other camera of points of the reference camera at given depths.
 
         Args:
-            normalized: (..., 2) in the reference.
-            inverse_depth_per_m: (...) 1 / z in the reference; 0 for points at infinity.
+            normalized: (..., 2) in the reference camera.
+            inverse_depth_per_m: (...) 1 / z in the reference camera; 0 for points at infinity.
 
         Returns:
-            (..., 2); what is not in front of the other camera comes out far off the image.
+            (..., 2); far off the image for points that are not in front of the other camera.
         """
         rays = np.concatenate([normalized, np.ones((*normalized.shape[:-1], 1))], axis=-1)
         points = rays @ self._R.T + self._t * inverse_depth_per_m[..., None]
@@ -80,12 +145,12 @@ class EpipolarSearch:
         return self._camera.distort(m.reshape(-1, 2))[0].reshape(m.shape)
 
     def search(
-        self, reference: Image, other: Image, pixels: NDArray[np.float32], normalized: FloatArray
+        self, reference: Image, other: Image, pixels: Pixels, normalized: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The depth at which each point looks most alike.
+        """The candidate that is most similar to each point.
 
         Args:
-            reference: image of the reference camera, reduced by `reduce`.
+            reference: image of the reference camera, reduced by `_reduce`.
             other: image of the other camera, reduced likewise.
             pixels: (N, 2) full-size pixels in the reference.
             normalized: (N, 2) the same, undistorted.
@@ -99,9 +164,9 @@ class EpipolarSearch:
             np.broadcast_to(normalized[:, None], (n, candidates, 2)),
             np.broadcast_to(self._inverse_depths, (n, candidates)),
         )
-        wanted = self._patches(reference, pixels.astype(np.float64))
-        offered = self._patches(other, targets.reshape(-1, 2)).reshape(n, candidates, -1)
-        scores = np.einsum("np,ncp->nc", wanted, offered)
+        patches = self._patches(reference, pixels.astype(np.float64))
+        candidate_patches = self._patches(other, targets.reshape(-1, 2)).reshape(n, candidates, -1)
+        scores = np.einsum("np,ncp->nc", patches, candidate_patches)
         height, width = other.shape
         scale = 2**HALVINGS
         outside = np.any((targets < 0) | (targets > (width * scale, height * scale)), axis=2)
@@ -116,8 +181,8 @@ class EpipolarSearch:
         # Pixel centres are at integers, so a reduced pixel u covers 4u - 1.5 … 4u + 1.5 of the full
         scale = 2**HALVINGS
         centre = np.rint((pixels + 0.5) / scale - 0.5)
-        u = np.clip(centre[:, 0], RADIUS, width - 1 - RADIUS).astype(np.int64)
-        v = np.clip(centre[:, 1], RADIUS, height - 1 - RADIUS).astype(np.int64)
+        u = np.clip(centre[:, 0], PATCH_RADIUS, width - 1 - PATCH_RADIUS).astype(np.int64)
+        v = np.clip(centre[:, 1], PATCH_RADIUS, height - 1 - PATCH_RADIUS).astype(np.int64)
         offsets = self._patch[0] * width + self._patch[1]
         patches = image.ravel()[(v * width + u)[:, None] + offsets].astype(np.float32)
         patches -= patches.mean(axis=1, keepdims=True)
@@ -126,7 +191,7 @@ class EpipolarSearch:
         return result
 
 
-def reduce(image: Image) -> Image:
+def _reduce(image: Image) -> Image:
     """An image of a quarter of the size, each pixel the mean of 4 x 4."""
     for _ in range(HALVINGS):
         # Halving twice is several times faster in OpenCV than the same in one step
@@ -135,79 +200,9 @@ def reduce(image: Image) -> Image:
     return image
 
 
-GRID = 8
-"""Rays through GRID x GRID pixels are followed into the other camera."""
-
-DEPTHS_M = (1.0, 3.0, 10.0, 100.0)
-"""How far away points may be that both see."""
-
-MIN_SHARE = 0.25
-"""A camera that sees less than this of another one's view has features of its own."""
-
-MAX_TANGENT = 3.0
-"""Points further from the axis than this are outside of any camera."""
-
-
-def reference_cameras(rig: Rig) -> tuple[int, ...]:
-    """For each camera the one whose features it looks for: an earlier one, or itself."""
-    references: list[int] = []
-    for index, mounted in enumerate(rig.cameras):
-        leaders = [i for i in sorted(set(references)) if references[i] == i]
-        shares = [overlap(rig.cameras[i], mounted) for i in leaders]
-        if shares and max(shares) >= MIN_SHARE:
-            references.append(leaders[int(np.argmax(shares))])
-        else:
-            references.append(index)
-    return tuple(references)
-
-
-def overlap(reference: RigCamera, other: RigCamera) -> float:
-    """The share of a camera's view that another one sees too, at the depth where it is largest."""
-    camera = reference.camera
-    u, v = np.meshgrid(
-        np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID)
-    )
-    rays, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
-    if not usable.any():
-        return 0.0
-    rays = rays[usable]
-    ends = np.column_stack([rays, np.ones(len(rays))])
-    other_T_reference = other.body_T_camera.between(reference.body_T_camera)
-    shares = []
-    for depth_m in DEPTHS_M:
-        points = np.asarray(other_T_reference.transformFrom((depth_m * ends).T)).T
-        shares.append(float(np.mean(_sees(other, points))))
-    return max(shares)
-
-
-def _sees(mounted: RigCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (N, 3) of its frame a camera sees."""
-    camera = mounted.camera
-    ahead = points[:, 2] > 0
-    m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
-    ahead &= np.all(np.abs(m) < MAX_TANGENT, axis=1)
-    pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
-    sees: NDArray[np.bool_] = (
-        ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
-    )
-    return sees
-
-
-Mask = NDArray[np.bool_]
-
-LEVELS = 1
-"""Pyramid levels of Lucas-Kanade: the guess is good, and more levels lead away from it."""
-
-RETRY_FRAMES = 2
-"""A feature that found no match is searched again on one frame out of so many."""
-
-MIN_SCORE = 0.6
-"""Smallest normalised cross-correlation of a guess that is worth following up."""
-
-
 @dataclass(frozen=True)
-class MatchCounts:
-    """What became of the features of the reference camera: matched, and refused by geometry."""
+class _MatchCounts:
+    """How many features of the reference camera were matched, and rejected by geometry."""
 
     matched: int = 0
     rejected: int = 0
@@ -215,6 +210,13 @@ class MatchCounts:
 
 class StereoMatcher:
     """Finds the features of the reference camera in one other camera, frame after frame.
+
+    Args:
+        camera: the other camera.
+        other_T_reference: pose of the reference camera in the other one's frame.
+        lucas_kanade: refines the matches.
+        extractor: of the other camera, for its mask.
+        config: thresholds.
 
     Attributes:
         counts: of the last frame.
@@ -225,18 +227,9 @@ class StereoMatcher:
         camera: Camera,
         other_T_reference: gtsam.Pose3,
         lucas_kanade: LucasKanade,
-        extractor: CornerExtractor,
+        extractor: FeatureExtractor,
         config: FrontendConfig,
     ) -> None:
-        """Prepare for the first frame.
-
-        Args:
-            camera: the other camera.
-            other_T_reference: pose of the reference camera in the other one's frame.
-            lucas_kanade: does the search.
-            extractor: of the other camera, for its mask.
-            config: thresholds.
-        """
         self._camera = camera
         self._other_T_reference = other_T_reference
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
@@ -244,11 +237,11 @@ class StereoMatcher:
         self._lucas_kanade = lucas_kanade
         self._extractor = extractor
         self._config = config
-        self._search = EpipolarSearch(camera, other_T_reference, config.stereo_min_depth_m)
+        self._search = _EpipolarSearch(camera, other_T_reference, config.stereo_min_depth_m)
         self._ids = np.zeros(0, np.int64)
         self._offsets = np.zeros((0, 2), np.float32)
         self._frames = 0
-        self.counts = MatchCounts()
+        self.counts = _MatchCounts()
 
     def match(self, reference: Tracks, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
         """The features of the reference camera that another camera sees at the same time.
@@ -257,29 +250,29 @@ class StereoMatcher:
             reference: features of the reference camera.
             image: of the other camera.
             stamp_ns: its time.
-            first_new_id: features from this id on have not been matched before.
+            first_new_id: features from this id on are new, and are searched at once.
         """
         self._frames += 1
-        self.counts = MatchCounts()
+        self.counts = _MatchCounts()
         reference_image = reference.image
         if reference_image is None or len(reference) == 0:
             return Tracks.empty(image, stamp_ns)
         worthwhile, guess = self._guess(reference, reference_image, image, first_new_id)
         reference, guess = reference.select(worthwhile), guess[worthwhile]
-        match = self._lucas_kanade.flow(reference_image, image, reference.pixels, guess, LEVELS)
-        keep = match.found & (match.error_px < self._config.forward_backward_px)
-        keep[keep] = self._extractor.allows(match.points[keep])
-        reference, pixels = reference.select(keep), match.points[keep]
+        flow = self._lucas_kanade.flow(reference_image, image, reference.pixels, guess, LEVELS)
+        keep = flow.found & (flow.error_px < self._config.forward_backward_px)
+        keep[keep] = self._extractor.allows(flow.points[keep])
+        reference, pixels = reference.select(keep), flow.points[keep]
         normalized = self._camera.undistort(pixels.astype(np.float64))
         good = self._inliers(reference.normalized, normalized)
-        self.counts = MatchCounts(int(np.sum(good)), int(np.sum(~good)))
+        self.counts = _MatchCounts(int(np.sum(good)), int(np.sum(~good)))
         matches = Tracks.of(image, stamp_ns, reference.ids, pixels, normalized).select(good)
         self._ids, self._offsets = matches.ids, matches.pixels - reference.pixels[good]
         return matches
 
     def _guess(
         self, reference: Tracks, reference_image: Image, image: Image, first_new_id: int
-    ) -> tuple[Mask, NDArray[np.float32]]:
+    ) -> tuple[BoolArray, Pixels]:
         """Which features (N,) to look for, and where to start (N, 2)."""
         guess = reference.pixels.copy()
         known = np.isin(reference.ids, self._ids)
@@ -288,8 +281,8 @@ class StereoMatcher:
         seek = ~known & (due | (reference.ids >= first_new_id))
         if seek.any():
             points, score = self._search.search(
-                reduce(reference_image),
-                reduce(image),
+                _reduce(reference_image),
+                _reduce(image),
                 reference.pixels[seek],
                 reference.normalized[seek],
             )
@@ -297,7 +290,7 @@ class StereoMatcher:
             seek[seek] = score > MIN_SCORE
         return known | seek, guess
 
-    def _inliers(self, m_reference: FloatArray, m_other: FloatArray) -> Mask:
+    def _inliers(self, m_reference: FloatArray, m_other: FloatArray) -> BoolArray:
         """Which matches (N, 2) fit the calibration of the rig, (N,)."""
         focal_px = self._camera.fx
         distance_px = epipolar_distance(self._E, m_reference, m_other) * focal_px
@@ -306,5 +299,5 @@ class StereoMatcher:
         disparity_px = focal_px * self._baseline_m / depth_m
         nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m
         tolerance_px = self._config.stereo_epipolar_px
-        good: Mask = distance_px < tolerance_px
+        good: BoolArray = distance_px < tolerance_px
         return good & (disparity_px < nearest_px) & (disparity_px > -tolerance_px)

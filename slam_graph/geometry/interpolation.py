@@ -1,28 +1,30 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory at other times: positions linearly, orientations on the shortest arc (slerp)."""
+"""Interpolation of trajectories: positions linearly, orientations by slerp."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry.trajectory import Trajectory
 
+__all__ = ["DEFAULT_MAX_GAP_S", "interpolate"]
+
 DEFAULT_MAX_GAP_S = 0.2
+"""Four frames at 20 Hz; over a longer gap a straight line says little of the motion."""
 
 
 def interpolate(
     trajectory: Trajectory, stamps_ns: IntArray, max_gap_s: float = DEFAULT_MAX_GAP_S
-) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """The trajectory at given times, where it has poses before and after that are close enough.
+) -> tuple[Trajectory, BoolArray]:
+    """The trajectory at those of the given times that have poses before and after, near enough.
 
     Args:
         trajectory: of at least one pose.
         stamps_ns: (M,) increasing times.
-        max_gap_s: no pose is made up inside a gap longer than this.
+        max_gap_s: inside a longer gap between poses nothing is interpolated.
 
     Returns:
         The trajectory at the K times that can be interpolated, and a mask (M,) of which these are.
@@ -50,8 +52,8 @@ def interpolate(
             positions,
             _slerp(trajectory.quaternions[before], trajectory.quaternions[after], weight),
             blend(trajectory.velocities),
-            blend(trajectory.gyro_biases),
-            blend(trajectory.accel_biases),
+            accel_biases=blend(trajectory.accel_biases),
+            gyro_biases=blend(trajectory.gyro_biases),
         ),
         valid,
     )

@@ -1,46 +1,63 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing trajectories as TUM files: `t[s] x y z qx qy qz qw`, nine decimals each.
+"""States and trajectories: one state, poses over time, all states of a run, and TUM's format.
 
-A trajectory: time-stamped poses `world_T_body`, and what else is known at these times.
-
-All states that a run has estimated, as compact rows: about 0.6 kB a frame.
+The accelerometer bias stands before the gyroscope bias everywhere: in the fields, in the covariance
+of a state (where it is GTSAM's order), and in the columns of ``states.csv``.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 
+__all__ = ["NavState", "StateHistory", "Trajectory", "tum_lines"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavState:
     """The state of the platform at one time.
 
+    Its error is a vector of 15 components in the order of the fields: rotation (rad, body frame),
+    position (m, body frame), velocity (m/s, world frame), accelerometer bias (m/s², body frame),
+    gyroscope bias (rad/s, body frame). These are the tangents of GTSAM's Pose3, Vector3 and
+    ConstantBias. Biases and covariance are given by name.
+
     Attributes:
+        COMPONENTS: names of the 15 components, with units.
         stamp_ns: time.
         world_T_body: pose of the body in the world (z up).
         velocity: (3,) m/s, in the world frame.
-        gyro_bias: (3,) rad/s, in the body frame.
         accel_bias: (3,) m/s², in the body frame.
-        covariance: (15, 15) of the error in the order rotation (rad, body frame), position (m, body
-            frame), velocity (m/s, world), accelerometer bias, gyroscope bias: the tangents of
-            GTSAM's Pose3, Vector3 and ConstantBias. None where it is not known.
+        gyro_bias: (3,) rad/s, in the body frame.
+        covariance: (15, 15) of the error, in the order of `COMPONENTS`; None where it is not known.
     """
+
+    COMPONENTS: ClassVar[tuple[str, ...]] = tuple(
+        f"{part}_{axis}_{unit}"
+        for part, unit in (
+            ("rotation_body", "rad"),
+            ("position_body", "m"),
+            ("velocity", "m_s"),
+            ("accel_bias", "m_s2"),
+            ("gyro_bias", "rad_s"),
+        )
+        for axis in "xyz"
+    )
 
     stamp_ns: int
     world_T_body: gtsam.Pose3
     velocity: FloatArray
-    gyro_bias: FloatArray
-    accel_bias: FloatArray
-    covariance: FloatArray | None = None
+    accel_bias: FloatArray = field(kw_only=True)
+    gyro_bias: FloatArray = field(kw_only=True)
+    covariance: FloatArray | None = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         position = ", ".join(f"{value:.3f}" for value in self.world_T_body.translation())
@@ -56,16 +73,16 @@ class Trajectory:
         positions: (N, 3) of the body in the world, in metres.
         quaternions: (N, 4) of world_R_body as (x, y, z, w), of unit length.
         velocities: (N, 3) in the world frame, m/s, or None where the source has none.
+        accel_biases: (N, 3) m/s², or None. Biases are given by name.
         gyro_biases: (N, 3) rad/s, or None.
-        accel_biases: (N, 3) m/s², or None.
     """
 
     stamps_ns: IntArray
     positions: FloatArray
     quaternions: FloatArray
     velocities: FloatArray | None = None
-    gyro_biases: FloatArray | None = None
-    accel_biases: FloatArray | None = None
+    accel_biases: FloatArray | None = field(default=None, kw_only=True)
+    gyro_biases: FloatArray | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -82,8 +99,8 @@ class Trajectory:
             ("position_{}_m", self.positions),
             ("quaternion_{}", self.quaternions),
             ("velocity_{}_m_s", self.velocities),
-            ("gyro_bias_{}_rad_s", self.gyro_biases),
             ("accel_bias_{}_m_s2", self.accel_biases),
+            ("gyro_bias_{}_rad_s", self.gyro_biases),
         ):
             if values is not None:
                 columns |= {
@@ -100,17 +117,18 @@ class Trajectory:
         return f"Trajectory({len(self)} poses, {length_s:.2f} s, {path_m:.2f} m)"
 
 
-STATE_WIDTH = 16
-"""Position, quaternion (x y z w), velocity, gyroscope bias, accelerometer bias."""
+_STATE_WIDTH = 16
+"""Position, quaternion (x y z w), velocity, accelerometer bias, gyroscope bias."""
 
-COVARIANCE_WIDTH = 15
-POSE_WIDTH = 6
+_ERROR_WIDTH = len(NavState.COMPONENTS)
+_POSE_WIDTH = 6
 
 
 class StateHistory:
-    """Grows by one state at a time and gives arrays.
+    """All states of a run, as compact rows: about 0.6 kB a state.
 
-    Where a state has no covariance its rows are NaN.
+    It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
+    NaN.
     """
 
     def __init__(self) -> None:
@@ -131,39 +149,39 @@ class StateHistory:
                 pose.translation(),
                 quaternion.coeffs(),
                 state.velocity,
-                state.gyro_bias,
                 state.accel_bias,
+                state.gyro_bias,
             ]
         )
         covariance = state.covariance
         if covariance is None:
-            covariance = np.full((COVARIANCE_WIDTH, COVARIANCE_WIDTH), np.nan)
+            covariance = np.full((_ERROR_WIDTH, _ERROR_WIDTH), np.nan)
         variances = np.maximum(np.diag(covariance), 0.0)
         self._stamps_ns.append(state.stamp_ns)
         self._states.extend(row.tolist())
         self._sigmas.extend(np.sqrt(variances).tolist())
-        self._pose_covariances.extend(covariance[:POSE_WIDTH, :POSE_WIDTH].ravel().tolist())
+        self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
 
     def trajectory(self) -> Trajectory:
         """The states as a trajectory with velocities and biases."""
-        rows = _table(self._states, STATE_WIDTH)
+        rows = _table(self._states, _STATE_WIDTH)
         return Trajectory(
             np.array(self._stamps_ns, dtype=np.int64),
             rows[:, 0:3],
             rows[:, 3:7],
             velocities=rows[:, 7:10],
-            gyro_biases=rows[:, 10:13],
-            accel_biases=rows[:, 13:16],
+            accel_biases=rows[:, 10:13],
+            gyro_biases=rows[:, 13:16],
         )
 
     def sigmas(self) -> FloatArray:
-        """(N, 15) standard deviations, in the order and frames of `NavState.covariance`."""
-        return _table(self._sigmas, COVARIANCE_WIDTH)
+        """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
+        return _table(self._sigmas, _ERROR_WIDTH)
 
     def pose_covariances(self) -> FloatArray:
         """(N, 6, 6) covariances of rotation and position, in the body frame."""
-        return _table(self._pose_covariances, POSE_WIDTH * POSE_WIDTH).reshape(
-            -1, POSE_WIDTH, POSE_WIDTH
+        return _table(self._pose_covariances, _POSE_WIDTH * _POSE_WIDTH).reshape(
+            -1, _POSE_WIDTH, _POSE_WIDTH
         )
 
 
@@ -179,7 +197,7 @@ def seconds_text(stamp_ns: int) -> str:
 
 
 def tum_lines(trajectory: Trajectory) -> Iterator[str]:
-    """The lines of a TUM file."""
+    """The lines of a TUM file: t[s] x y z qx qy qz qw, with nine decimals."""
     rows = np.hstack([trajectory.positions, trajectory.quaternions])
     for stamp, row in zip(trajectory.stamps_ns, rows, strict=True):
         yield f"{seconds_text(int(stamp))} {' '.join(f'{value:.9f}' for value in row.tolist())}\n"

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Alignment of an estimated trajectory with a reference: yaw, SE(3) or Sim(3) in closed form.
 
-What a sensor cannot observe decides how much may be aligned: a visual-inertial system does not
-know its position and heading (`yaw`), a stereo camera alone its whole pose (`se3`), a single
-camera alone its scale too (`sim3`).
+The unobservable directions of a system decide how much may be aligned: position and heading of a
+visual-inertial one (`yaw`), the whole pose of a stereo camera alone (`se3`), the scale too of a
+single camera alone (`sim3`).
 """
 
 from __future__ import annotations
@@ -16,13 +16,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.errors import DataError
+from slam_graph.errors import DataError, closest
 from slam_graph.geometry.trajectory import Trajectory
+
+__all__ = [
+    "ALIGNMENT_MODES",
+    "AlignmentMode",
+    "Similarity",
+    "align",
+    "align_first_pose",
+    "align_yaw",
+    "umeyama",
+]
 
 AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
 ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
 
-RELATIVE_RANK = 1e-14
+_RELATIVE_RANK = 1e-14
 """A singular value below this fraction of the largest one counts as zero."""
 
 
@@ -46,7 +56,7 @@ class Similarity:
         return Similarity(np.eye(3), np.zeros(3))
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
-        """The trajectory seen from the reference's world; biases stay, they live in the body."""
+        """The trajectory in the world of the reference; biases are in the body and stay."""
         linear = self.scale * self.rotation
         velocities = trajectory.velocities
         turned = Rotation.from_matrix(self.rotation) * Rotation.from_quat(trajectory.quaternions)
@@ -76,7 +86,7 @@ def umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = Fals
     centred = estimate - mean_estimate
     covariance = (reference - mean_reference).T @ centred / len(reference)
     U, d, Vt = np.linalg.svd(covariance)
-    if len(reference) < 3 or d[1] <= RELATIVE_RANK * max(float(d[0]), np.finfo(float).tiny):
+    if len(reference) < 3 or d[1] <= _RELATIVE_RANK * max(float(d[0]), np.finfo(float).tiny):
         raise DataError(
             f"cannot align {len(reference)} positions that lie on one line or coincide; "
             "use --align none or yaw, or a recording that moves"
@@ -114,10 +124,10 @@ def align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
 
 
 def align_first_pose(reference: Trajectory, estimate: Trajectory) -> Similarity:
-    """Yaw and translation that lay the first pose of the estimate onto that of the reference.
+    """Yaw and translation that align the first pose of the estimate with that of the reference.
 
-    Unlike a least-squares fit it leaves the errors that grow from the start as they are, which is
-    what a consistency test compares with a covariance that starts at zero.
+    Unlike a least-squares fit it leaves the errors that grow from the start as they are. A
+    consistency test needs these, because the covariance starts at zero.
     """
     difference = (
         Rotation.from_quat(reference.quaternions[0])
@@ -135,7 +145,12 @@ def align(reference: FloatArray, estimate: FloatArray, mode: AlignmentMode) -> S
         reference: (N, 3) positions.
         estimate: (N, 3) positions at the same times.
         mode: `scale` corrects the scale of Sim(3) alone, neither rotation nor translation.
+
+    Raises:
+        DataError: if the mode is unknown, or the positions do not determine the map.
     """
+    if mode not in ALIGNMENT_MODES:
+        raise DataError(f"unknown alignment '{mode}'; {closest(mode, ALIGNMENT_MODES)}")
     if mode == "none":
         return Similarity.identity()
     if mode == "yaw":

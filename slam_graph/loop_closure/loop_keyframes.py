@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes for loop closure: what was seen from where, as it was estimated then.
+"""Keyframes of loop closure and maps: pose, descriptors and triangulated points of one frame.
 
-What a keyframe looks like: descriptors of its tracked features, and of further corners.
+They are further apart than the keyframes of the smoother, and chosen by distance instead of time.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import TrackWindow
+from slam_graph.backend.backend_config import TriangulationConfig
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.frontend.descriptors import Orb
-from slam_graph.frontend.keypoints import Keypoints
-from slam_graph.frontend.tracked_features import Image
+from slam_graph.frontend.keypoints import Image, Keypoints
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.loop_closure.loop_config import KeyframeConfig
@@ -29,71 +29,38 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
 
-CORNER_QUALITY, CORNER_DISTANCE_PX = 0.01, 8
-PATCH_PX = 31.0
-NOT_TRACKED = -1
-"""Id of the further corners."""
+__all__ = ["Descriptors", "Keyframe", "KeyframeDescriber", "KeyframeLog", "reposed"]
 
-
-class KeyframeDescriber:
-    """Describes what one camera sees.
-
-    Descriptors are ORB's, upright and of one size: a platform that comes back to a place holds its
-    camera upright again, and what is turned with the image says less.
-
-    Args:
-        camera: that takes the images.
-        corners: how many corners are added to the tracked features.
-    """
-
-    def __init__(self, camera: Camera, corners: int) -> None:
-        self._camera = camera
-        self._corners = corners
-        self._descriptor = Orb()
-
-    def describe(self, image: Image, seen: FeatureObservations) -> FeatureObservations:
-        """The features of an image with descriptors, followed by further corners.
-
-        Features too close to the edge to be described are left out.
-        """
-        found = self._further_corners(image, seen.pixels)
-        pixels = np.concatenate([seen.pixels, found])
-        points = Keypoints.of(pixels.astype(np.float32), np.ones(len(pixels), np.float32), PATCH_PX)
-        kept, descriptors = self._descriptor.describe(image, points)
-        ids = np.concatenate([seen.ids, np.full(len(found), NOT_TRACKED)])
-        normalized = np.concatenate([seen.normalized, self._camera.undistort(found)])
-        return FeatureObservations(
-            ids[kept], pixels[kept], normalized[kept], descriptors.astype(np.uint8)
-        )
-
-    def _further_corners(self, image: Image, taken: np.ndarray) -> np.ndarray:
-        """Corners (N, 2) that are not where features are already."""
-        if self._corners == 0:
-            return np.zeros((0, 2))
-        free = np.full(image.shape, 255, np.uint8)
-        for u, v in np.rint(taken).astype(int).tolist():
-            cv2.circle(free, (u, v), CORNER_DISTANCE_PX, 0, -1)
-        corners = cv2.goodFeaturesToTrack(
-            image, self._corners, CORNER_QUALITY, CORNER_DISTANCE_PX, mask=free
-        )
-        found = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
-        return found[np.isfinite(self._camera.undistort(found)).all(axis=1)]
-
+POINT_FRAMES = 10
+"""Number of recent frames from which the points of a keyframe are triangulated …"""
+POINT_FRAME_SPACING_S = 0.1
+"""… and the time between them: within a second the estimator hardly drifts."""
+MAX_REPROJECTION_PX = 3.0
+"""Points of a larger root-mean-square reprojection error are left out."""
+MAX_DEPTH_ERROR = 0.1
+"""Points of a larger relative standard deviation of the inverse depth are left out."""
+TRIANGULATION = TriangulationConfig()
+_CORNER_QUALITY, _CORNER_DISTANCE_PX = 0.01, 8
+_PATCH_PX = 31.0
+_NOT_TRACKED = -1
+"""Id of corners that are not tracked."""
 
 Descriptors = NDArray[np.uint8]
+"""(N, B) binary descriptors of B bytes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A place that one may come back to.
+    """A frame as place recognition, loop closure and maps use it.
 
     Attributes:
         stamp_ns: time.
-        world_T_body: causal estimate of the pose.
-        ids: (N,) features that the first camera sees; -1 for corners that are not tracked.
-        normalized: (N, 2) where, on the plane z = 1.
-        descriptors: (N, B) what they look like.
-        points: (N, 3) where they are in the body frame, in metres; NaN where that is not known.
+        world_T_body: estimate of the pose.
+        ids: (N,) features seen by the first camera; -1 for corners that are not tracked.
+        normalized: (N, 2) observations on the plane z = 1.
+        descriptors: (N, B) binary descriptors.
+        points: (N, 3) in the body frame, metres; NaN where not triangulated. Drift so moves them
+            with the keyframe.
     """
 
     stamp_ns: int
@@ -104,16 +71,63 @@ class Keyframe:
     points: FloatArray
 
     def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
-        """Ids (M,) and world positions (M, 3) of known points, seen from this pose or another."""
+        """Ids (M,) and world positions (M, 3) of the known points, from this pose or another."""
         pose = world_T_body or self.world_T_body
         known = np.isfinite(self.points).all(axis=1)
         rotation = pose.rotation().matrix()
         return self.ids[known], self.points[known] @ rotation.T + pose.translation()
 
 
+class KeyframeDescriber:
+    """Computes the descriptors of a keyframe.
+
+    They are upright ORB descriptors of one scale: platforms hold their camera upright, and without
+    the rotation invariance descriptors are more distinctive.
+
+    Args:
+        camera: of the images.
+        corners: number of corners that are added to the tracked features.
+    """
+
+    def __init__(self, camera: Camera, corners: int) -> None:
+        self._camera = camera
+        self._corners = corners
+        self._descriptor = Orb()
+
+    def describe(self, image: Image, seen: FeatureObservations) -> FeatureObservations:
+        """The tracked features of an image with descriptors, followed by further corners.
+
+        Features too close to the border are left out.
+        """
+        found = self._further_corners(image, seen.pixels)
+        pixels = np.concatenate([seen.pixels, found])
+        points = Keypoints.of(
+            pixels.astype(np.float32), np.ones(len(pixels), np.float32), _PATCH_PX
+        )
+        kept, descriptors = self._descriptor.describe(image, points)
+        ids = np.concatenate([seen.ids, np.full(len(found), _NOT_TRACKED)])
+        normalized = np.concatenate([seen.normalized, self._camera.undistort(found)])
+        return FeatureObservations(
+            ids[kept], pixels[kept], normalized[kept], descriptors.astype(np.uint8)
+        )
+
+    def _further_corners(self, image: Image, taken: FloatArray) -> FloatArray:
+        """Corners (N, 2) away from the features."""
+        if self._corners == 0:
+            return np.zeros((0, 2))
+        free = np.full(image.shape, 255, np.uint8)
+        for u, v in np.rint(taken).astype(int).tolist():
+            cv2.circle(free, (u, v), _CORNER_DISTANCE_PX, 0, -1)
+        corners = cv2.goodFeaturesToTrack(
+            image, self._corners, _CORNER_QUALITY, _CORNER_DISTANCE_PX, mask=free
+        )
+        found = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+        return found[np.isfinite(self._camera.undistort(found)).all(axis=1)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """A recent frame and where it was taken."""
+    """A recent frame and its pose."""
 
     frame: FeatureFrame
     rotation: FloatArray
@@ -121,14 +135,14 @@ class _View:
 
 
 class KeyframeLog:
-    """Picks keyframes from a run and triangulates what they see.
+    """Selects the keyframes of a run and triangulates their points.
 
-    Points are triangulated from a few recent frames at their causal poses: over so short a way the
-    estimator does not drift, and whatever it has drifted before moves points and keyframe alike.
+    Points are triangulated from the last frames at their causal poses: the drift over this second
+    is negligible, and earlier drift moves points and keyframe alike.
 
     Args:
         rig: the cameras.
-        config: how dense keyframes are.
+        config: the spacing of keyframes.
 
     Attributes:
         keyframes: so far.
@@ -141,20 +155,20 @@ class KeyframeLog:
         camera = rig.cameras[0].camera
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
-        self._recent: deque[_View] = deque(maxlen=config.points_from_frames)
+        self._recent: deque[_View] = deque(maxlen=POINT_FRAMES)
 
     def add(
         self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
     ) -> Keyframe | None:
-        """Take a frame, and the keyframe that it has become, if any.
+        """Add a frame; returns the keyframe that it becomes, if any.
 
         Args:
-            frame: features; those of the first camera with descriptors if there is no image.
-            world_T_body: causal estimate of the pose then.
+            frame: features; without an image those of the first camera need descriptors.
+            world_T_body: causal estimate of its pose.
             image: of the first camera.
         """
         wanted = self._is_keyframe(frame, world_T_body)
-        spacing_ns = self._config.frame_spacing_s * 1e9
+        spacing_ns = POINT_FRAME_SPACING_S * 1e9
         if self._recent and frame.stamp_ns - self._recent[-1].frame.stamp_ns < spacing_ns:
             if not wanted:
                 return None
@@ -180,20 +194,20 @@ class KeyframeLog:
         last, config = self.keyframes[-1], self._config
         moved = last.world_T_body.between(world_T_body)
         turn = float(np.linalg.norm(gtsam.Rot3.Logmap(moved.rotation())))
-        way = float(np.linalg.norm(moved.translation()))
-        if way >= config.distance_m or turn >= config.angle_rad:
+        distance = float(np.linalg.norm(moved.translation()))
+        if distance >= config.distance_m or turn >= config.angle_rad:
             return True
-        # what is new is triangulated from frames that the last keyframe did not use
+        # new features are triangulated from frames that the last keyframe did not use
         since_s = (frame.stamp_ns - last.stamp_ns) * 1e-9
-        if since_s < config.points_from_frames * config.frame_spacing_s:
+        if since_s < POINT_FRAMES * POINT_FRAME_SPACING_S:
             return False
         tracked = last.ids[last.ids >= 0]
         common = np.isin(tracked, frame.cameras[0].ids)
         return len(common) > 0 and bool(np.mean(common) < config.min_common_features)
 
     def _points(self, ids: IntArray) -> FloatArray:
-        """Where features (N,) are in the world, (N, 3); NaN where that is not known."""
-        window = TrackWindow()
+        """(N, 3) world points of features (N,); NaN where not triangulated."""
+        window = FeatureTracks()
         for index, view in enumerate(self._recent):
             window.add(index, view.frame)
         obs = window.observations(np.unique(ids))
@@ -203,9 +217,9 @@ class KeyframeLog:
             return points
         rotations = np.array([self._recent[i].rotation for i in obs.frames])
         positions = np.array([self._recent[i].position for i in obs.frames])
-        found = triangulate(obs, self._projection, rotations, positions, self._config.triangulation)
-        good = found.good & (found.reprojection_px < self._config.max_reprojection_px)
-        good &= found.depth_error < self._config.max_depth_error * self._focal_px
+        found = triangulate(obs, self._projection, rotations, positions, TRIANGULATION)
+        good = found.good & (found.reprojection_px < MAX_REPROJECTION_PX)
+        good &= found.depth_error < MAX_DEPTH_ERROR * self._focal_px
         place = np.minimum(np.searchsorted(obs.ids, ids), len(obs.ids) - 1)
         known = good[place] & (obs.ids[place] == ids)
         points[known] = found.points[place[known]]
@@ -213,7 +227,7 @@ class KeyframeLog:
 
 
 def reposed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[Keyframe]:
-    """Keyframes at the poses of a trajectory; those that it does not reach stay."""
+    """Keyframes at the poses of a trajectory; those outside of it keep their poses."""
     found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in keyframes]))
     keyframes = list(keyframes)
     for row, number in enumerate(np.flatnonzero(valid).tolist()):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Verification of loop candidates: matches of descriptors, then a relative pose that they agree on.
+"""Verification of loop candidates: matched descriptors, and a relative pose that they support.
 
-The relative pose is that from which the second keyframe sees the points of the first one: P3P in
+The relative pose is that from which the second keyframe sees the points of the first: P3P in
 RANSAC, refined on the inliers (OpenCV).
 """
 
@@ -13,27 +13,34 @@ from dataclasses import dataclass
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray, skew
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, skew
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 from slam_graph.sensors.rig import RigCamera
 
+__all__ = ["Loop", "LoopVerifier"]
+
+RANSAC_ITERATIONS = 200
+"""Largest number of samples."""
+MAX_TILT_RAD = 0.05
+"""Largest contradiction between the relative pose and the roll and pitch that gravity gives."""
+SIGMA_PX = 2.0
+"""Standard deviation of reprojection errors, the errors of the points included."""
 FLOOR_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3)
-"""No relative pose is better known than this: rad, then m."""
+"""Least standard deviations of a relative pose, for the common errors of the points: rad, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """A loop closure.
+    """A verified loop closure.
 
     Attributes:
         first, second: numbers of the keyframes, the earlier one first.
         first_T_second: relative pose of the bodies.
         covariance: (6, 6) of it in GTSAM's tangent: rotation (rad), translation (m).
-        inliers, matches: how many matches agree with it, of how many.
-        pairs: (inliers, 2) rows of what matches and agrees, in the first and the second.
+        inliers, matches: numbers of inliers and of all matches.
+        pairs: (inliers, 2) matching rows of the first and the second keyframe.
     """
 
     first: int
@@ -45,8 +52,8 @@ class Loop:
     pairs: IntArray
 
 
-def match(first: Descriptors, second: Descriptors, max_bits: int) -> IntArray:
-    """Pairs (M, 2) of descriptors that are each other's nearest and differ in few bits."""
+def _match(first: Descriptors, second: Descriptors, max_bits: int) -> IntArray:
+    """Pairs (M, 2) of descriptors that are mutual nearest neighbours and differ in few bits."""
     if len(first) == 0 or len(second) == 0:
         return np.zeros((0, 2), np.int64)
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first, second)
@@ -59,7 +66,7 @@ class LoopVerifier:
 
     Args:
         mounted: the first camera.
-        config: what it takes.
+        config: thresholds.
     """
 
     def __init__(self, mounted: RigCamera, config: VerificationConfig) -> None:
@@ -70,10 +77,10 @@ class LoopVerifier:
     def verify(
         self, keyframes: list[Keyframe], first: int, second: int, gravity: bool = True
     ) -> Loop | None:
-        """The loop closure between two keyframes, or None if there is none.
+        """The loop closure between two keyframes, or None if verification fails.
 
         Args:
-            keyframes: all.
+            keyframes: all keyframes.
             first: number of the earlier one.
             second: number of the later one.
             gravity: whether roll and pitch of the keyframes are known.
@@ -81,7 +88,7 @@ class LoopVerifier:
         config = self._config
         a, b = keyframes[first], keyframes[second]
         known = np.flatnonzero(np.isfinite(a.points).all(axis=1))
-        pairs = match(a.descriptors[known], b.descriptors, config.max_descriptor_bits)
+        pairs = _match(a.descriptors[known], b.descriptors, config.max_descriptor_bits)
         if len(pairs) < config.min_inliers:
             return None
         points, rays = a.points[known[pairs[:, 0]]], b.normalized[pairs[:, 1]]
@@ -91,16 +98,14 @@ class LoopVerifier:
         pose, inliers = found
         if inliers.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
             return None
-        if gravity and tilt(a.world_T_body, b.world_T_body, pose) > config.max_tilt_rad:
+        if gravity and tilt_error(a.world_T_body, b.world_T_body, pose) > MAX_TILT_RAD:
             return None
         covariance = self._covariance(points[inliers], pose)
-        agreeing = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
-        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), agreeing)
+        supporting = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
+        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), supporting)
 
-    def _pose(
-        self, points: FloatArray, rays: FloatArray
-    ) -> tuple[gtsam.Pose3, NDArray[np.bool_]] | None:
-        """first_T_second from points (M, 3) of the first and where (M, 2) the second sees them."""
+    def _pose(self, points: FloatArray, rays: FloatArray) -> tuple[gtsam.Pose3, BoolArray] | None:
+        """first_T_second from points (M, 3) of the first, observed at (M, 2) in the second."""
         cv2.setRNGSeed(0)  # OpenCV draws from one global generator
         error = self._config.max_error_px / self._focal_px
         found, rotation, translation, rows = cv2.solvePnPRansac(
@@ -108,7 +113,7 @@ class LoopVerifier:
             rays,
             np.eye(3),
             None,
-            iterationsCount=self._config.ransac_iterations,
+            iterationsCount=RANSAC_ITERATIONS,
             reprojectionError=error,
             confidence=0.999,
             flags=cv2.SOLVEPNP_AP3P,
@@ -127,7 +132,7 @@ class LoopVerifier:
         return first_T_second, (np.linalg.norm(seen - rays, axis=1) < error) & ahead
 
     def _covariance(self, points: FloatArray, pose: gtsam.Pose3) -> FloatArray:
-        """(6, 6) of the relative pose from points (M, 3) that agree with it."""
+        """(6, 6) covariance of the relative pose from the points (M, 3) of its inliers."""
         body = (points - pose.translation()) @ pose.rotation().matrix()
         camera_R_body = self._body_T_camera.rotation().matrix().T
         x, y, z = ((body - self._body_T_camera.translation()) @ camera_R_body.T).T
@@ -138,13 +143,13 @@ class LoopVerifier:
         turn = skew(body)
         by_pose = np.concatenate([turn, np.tile(-np.eye(3), (len(points), 1, 1))], axis=2)
         J = (by_camera @ camera_R_body @ by_pose).reshape(-1, 6)
-        sigma = self._config.sigma_px / self._focal_px
+        sigma = SIGMA_PX / self._focal_px
         return np.asarray(sigma**2 * np.linalg.inv(J.T @ J) + np.diag(FLOOR_SIGMAS**2))
 
 
-def tilt(first: gtsam.Pose3, second: gtsam.Pose3, first_T_second: gtsam.Pose3) -> float:
-    """By how much, in rad, a relative pose contradicts what two poses know of the vertical."""
+def tilt_error(first: gtsam.Pose3, second: gtsam.Pose3, first_T_second: gtsam.Pose3) -> float:
+    """Angle, in rad, between the verticals of two poses under a relative pose."""
     up = np.array([0.0, 0.0, 1.0])
     in_first = first.rotation().matrix().T @ up
-    carried = first_T_second.rotation().matrix() @ second.rotation().matrix().T @ up
-    return float(np.arccos(np.clip(in_first @ carried, -1.0, 1.0)))
+    transformed = first_T_second.rotation().matrix() @ second.rotation().matrix().T @ up
+    return float(np.arccos(np.clip(in_first @ transformed, -1.0, 1.0)))

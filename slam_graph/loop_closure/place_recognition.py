@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Place recognition: which keyframes look like this one, by bags of binary words.
+"""Place recognition: keyframes of similar appearance, by bags of binary words.
 
 A descriptor is quantised to the nearest word of a vocabulary, a keyframe becomes a vector of word
-frequencies weighted by how rare the words are (tf-idf), and keyframes are compared by the cosine of
-their vectors (Sivic and Zisserman 2003; with binary words, Galvez-Lopez and Tardos 2012). An
-inverted index reaches the keyframes that share a word without looking at the others.
+frequencies weighted by the rarity of the words (tf-idf), and keyframes are compared by the cosine
+of their vectors (Sivic and Zisserman 2003; with binary words, Galvez-Lopez and Tardos 2012). An
+inverted index reaches the keyframes that share a word without visiting the others.
 """
 
 from __future__ import annotations
@@ -18,8 +18,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.loop_closure.loop_config import PlaceConfig
+from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 
-Descriptors = NDArray[np.uint8]
+__all__ = [
+    "SAME_PLACE",
+    "PlaceDatabase",
+    "PlaceRecognition",
+    "Vocabulary",
+    "WordVector",
+    "best_places",
+    "majority",
+]
+
+TRAINING_DESCRIPTORS = 30_000
+"""Largest number of descriptors that a vocabulary is trained on, for its time (some seconds)."""
+TRAINING_ROUNDS = 6
+"""Rounds of k-majority: later ones hardly move the words."""
+MIN_SCORE_RATIO = 0.3
+"""Least similarity of a candidate relative to that of the preceding keyframe, which shows nearly
+the same view (Galvez-Lopez and Tardos 2012)."""
+CONSECUTIVE = 1
+"""Number of preceding keyframes that must have had candidates of the same place."""
+SAME_PLACE = 5
+"""Keyframes whose numbers differ by no more than this show the same place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +49,7 @@ class WordVector:
     """A bag of words.
 
     Attributes:
-        words: (M,) numbers of the words that it has, ascending.
+        words: (M,) numbers of its words, ascending.
         weights: (M,) tf-idf weights, of unit length.
     """
 
@@ -36,11 +58,11 @@ class WordVector:
 
 
 class Vocabulary:
-    """Binary words, and how much each says.
+    """Binary words and their weights.
 
     Attributes:
         words: (W, B) descriptors.
-        idf: (W,) inverse document frequency: the logarithm of how rare a word is.
+        idf: (W,) inverse document frequency of each word.
     """
 
     def __init__(self, words: Descriptors, idf: FloatArray) -> None:
@@ -64,36 +86,36 @@ class Vocabulary:
     def train(
         documents: list[Descriptors],
         words: int,
-        limit: int,
-        iterations: int,
         rng: np.random.Generator,
+        limit: int = TRAINING_DESCRIPTORS,
+        rounds: int = TRAINING_ROUNDS,
     ) -> Vocabulary:
-        """Cluster descriptors by k-majority: the centre of a cluster has the bits of most of it.
+        """Cluster descriptors by k-majority: a centre has the majority of the bits of its cluster.
 
         Args:
             documents: (N, B) descriptors of each keyframe.
-            words: how many clusters; fewer where there are fewer descriptors.
-            limit: how many descriptors to train on at most.
-            iterations: rounds of assignment and update.
-            rng: draws descriptors and first centres.
+            words: number of clusters; fewer if there are fewer descriptors.
+            rng: draws descriptors and initial centres.
+            limit: largest number of descriptors to train on.
+            rounds: of assignment and update.
         """
         pool = np.concatenate(documents)
         pool = pool[rng.permutation(len(pool))[:limit]]
         centres = np.unique(pool[:words], axis=0)
         bits = np.unpackbits(pool, axis=1).astype(np.int32)
-        for _ in range(iterations):
+        for _ in range(rounds):
             nearest = Vocabulary(centres, np.zeros(len(centres))).quantize(pool)
             centres = majority(bits, nearest, centres)
         unweighted = Vocabulary(centres, np.zeros(len(centres)))
         present = np.zeros(len(centres))
         for document in documents:
             present[np.unique(unweighted.quantize(document))] += 1
-        # a word that every keyframe has says nothing; one that none has is as rare as can be
+        # words of all keyframes have no weight; those of none count as the rarest
         return Vocabulary(centres, np.log((len(documents) + 1) / np.maximum(present, 1.0)))
 
 
 def majority(bits: NDArray[np.int32], nearest: IntArray, centres: Descriptors) -> Descriptors:
-    """New centres: the bits of most of each cluster; empty clusters stay."""
+    """New centres: the majority of the bits of each cluster; those of empty clusters stay."""
     order = np.argsort(nearest, kind="stable")
     used, first, sizes = np.unique(nearest[order], return_index=True, return_counts=True)
     ones = np.add.reduceat(bits[order], first, axis=0)
@@ -103,9 +125,7 @@ def majority(bits: NDArray[np.int32], nearest: IntArray, centres: Descriptors) -
 
 
 class PlaceDatabase:
-    """Keyframes by the words that they have.
-
-    A query is one pass over the entries of the words that it has.
+    """An inverted index of keyframes by their words.
 
     Args:
         words: size of the vocabulary.
@@ -138,20 +158,61 @@ class PlaceDatabase:
 
 
 def best_places(scores: FloatArray, least: float, count: int, apart: int) -> IntArray:
-    """Numbers of the most similar keyframes, the best first, each the best of its neighbours.
+    """The most similar keyframes, best first, each the best of its neighbourhood.
 
     Args:
         scores: (K,) similarities.
-        least: what a candidate must reach.
-        count: how many at most.
+        least: lowest score of a candidate.
+        count: largest number of candidates.
         apart: numbers of two candidates differ by more than this.
     """
-    left = scores.copy()
+    remaining = scores.copy()
     best: list[int] = []
-    while len(best) < count and len(left):
-        at = int(np.argmax(left))
-        if left[at] < least or left[at] <= 0:
+    while len(best) < count and len(remaining):
+        at = int(np.argmax(remaining))
+        if remaining[at] < least or remaining[at] <= 0:
             break
         best.append(at)
-        left[max(at - apart, 0) : at + apart + 1] = 0.0
+        remaining[max(at - apart, 0) : at + apart + 1] = 0.0
     return np.array(best, dtype=np.int64)
+
+
+class PlaceRecognition:
+    """Loop candidates, keyframe by keyframe.
+
+    A candidate must be similar, and temporally consistent: the preceding keyframe must have had a
+    candidate of the same place.
+
+    Args:
+        vocabulary: of words.
+        config: thresholds.
+    """
+
+    def __init__(self, vocabulary: Vocabulary, config: PlaceConfig) -> None:
+        self._vocabulary = vocabulary
+        self._database = PlaceDatabase(len(vocabulary.words))
+        self._config = config
+        self._stamps_ns: list[int] = []
+        self._similar: list[IntArray] = []
+
+    def add(self, keyframe: Keyframe) -> IntArray:
+        """Add the next keyframe; returns the numbers of its candidates."""
+        config = self._config
+        bag = self._vocabulary.words_of(keyframe.descriptors)
+        scores = self._database.query(bag)
+        old = np.searchsorted(self._stamps_ns, keyframe.stamp_ns - config.min_gap_s * 1e9)
+        # the preceding keyframe shows how similar views of one place are here
+        least = MIN_SCORE_RATIO * scores[-1] if len(scores) else 0.0
+        similar = best_places(scores[:old], least, config.candidates, SAME_PLACE)
+        consistent = [place for place in similar.tolist() if self._was_similar(place)]
+        self._database.add(bag)
+        self._stamps_ns.append(keyframe.stamp_ns)
+        self._similar.append(similar)
+        return np.array(consistent, dtype=np.int64)
+
+    def _was_similar(self, place: int) -> bool:
+        """Whether the preceding keyframes had candidates of this place too."""
+        before = self._similar[len(self._similar) - CONSECUTIVE :]
+        return len(before) == CONSECUTIVE and all(
+            bool(np.any(np.abs(similar - place) <= SAME_PLACE)) for similar in before
+        )

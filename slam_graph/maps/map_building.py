@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the keyframes of a run to a map: observations become features with one place in the world.
+"""Building a map from the keyframes of a run: observations become features with world points.
 
-A feature is a track, or several that loop closures have matched. It lies where the keyframes that
-have triangulated it say on average, near ones counting more.
+A feature is a track, or several that loop closures have matched. Its point is the mean of the
+points that its keyframes have triangulated, weighted by the inverse squared distance.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.loop_closure.loop_verification import Loop
@@ -26,11 +26,13 @@ from slam_graph.maps.map_model import (
     Links,
     MapRecording,
     SlamMap,
-    common_look,
+    majority_descriptors,
 )
 from slam_graph.pose_graph.graph import Poses
 from slam_graph.sensors.rig import Rig
 from slam_graph.version import __version__
+
+__all__ = ["build_map", "links_of", "merged_groups", "train_vocabulary", "with_points"]
 
 
 def build_map(
@@ -48,15 +50,15 @@ def build_map(
     Args:
         keyframes: K, at least one, in the order of time.
         poses: K best estimates world_T_body.
-        recording: where they come from.
-        loops: closures that hold: what they match becomes one feature.
-        places: how the vocabulary is trained.
-        verification: how far from its feature an observation may be.
-        gravity_aligned: whether z of the world is up.
+        recording: the recording.
+        loops: accepted loop closures, whose matches become one feature.
+        places: size of the vocabulary.
+        verification: largest reprojection error of an observation.
+        gravity_aligned: whether the z axis of the world is up.
         seed: of the training.
     """
     offsets = np.cumsum([0, *(len(k.descriptors) for k in keyframes)])
-    features = _numbered(keyframes, loops, offsets)
+    features = _track_features(keyframes, loops, offsets)
     empty = np.zeros((0, 3))
     whole = SlamMap(
         (recording,),
@@ -73,19 +75,19 @@ def build_map(
         np.concatenate([k.normalized for k in keyframes]),
         np.concatenate([k.descriptors for k in keyframes]),
         links_of(loops),
-        trained([k.descriptors for k in keyframes], places, seed),
+        train_vocabulary([k.descriptors for k in keyframes], places, seed),
     )
     body_points = np.concatenate([k.points for k in keyframes])
-    return with_features(whole, features, body_points, verification.max_error_px)
+    return with_points(whole, features, body_points, verification.max_error_px)
 
 
-def trained(documents: list[NDArray[np.uint8]], places: PlaceConfig, seed: int) -> Vocabulary:
-    """The vocabulary of the descriptors (N, B) of all keyframes."""
+def train_vocabulary(
+    documents: list[NDArray[np.uint8]], places: PlaceConfig, seed: int
+) -> Vocabulary:
+    """A vocabulary of the descriptors (N, B) of all keyframes."""
     return Vocabulary.train(
         documents,
         places.words,
-        places.training_descriptors,
-        places.training_iterations,
         np.random.default_rng(seed),
     )
 
@@ -102,50 +104,50 @@ def links_of(loops: list[Loop]) -> Links:
     )
 
 
-def with_features(
+def with_points(
     whole: SlamMap, features: IntArray, body_points: FloatArray, max_error_px: float
 ) -> SlamMap:
-    """The map with its features placed anew, from what each observation says of its point.
+    """The map with its points computed anew from those of each observation.
 
-    Observations that are off their feature become unknown, and features that are then not seen,
-    or of which nobody knows a point, leave.
+    Observations with a larger reprojection error lose their feature, and features without
+    observations or points are removed.
 
     Args:
-        whole: its observations and poses are used.
-        features: (N,) number of the feature of each observation, -1 for none.
-        body_points: (N, 3) its point in the body frame then; NaN where it is not known.
-        max_error_px: how far off its feature an observation may be.
+        whole: the map, with its observations and poses.
+        features: (N,) feature of each observation, -1 for none.
+        body_points: (N, 3) its point in the body frame; NaN where not triangulated.
+        max_error_px: largest reprojection error of an observation.
     """
     features = features.copy()
-    points = _placed(whole, features, body_points)
-    features[~_fits(whole, features, points, max_error_px)] = NO_FEATURE
+    points = _world_points(whole, features, body_points)
+    features[~_is_inlier(whole, features, points, max_error_px)] = NO_FEATURE
     used, compact = np.unique(features, return_inverse=True)
     first = int(np.searchsorted(used, 0))
     features, points = compact.reshape(-1) - first, points[used[first:]]
-    looks = common_look(whole.descriptors, features, len(points))
-    return replace(whole, features=features, points=points, feature_descriptors=looks)
+    descriptors = majority_descriptors(whole.descriptors, features, len(points))
+    return replace(whole, features=features, points=points, feature_descriptors=descriptors)
 
 
-def together(count: int, pairs: IntArray) -> IntArray:
-    """(count,) the group of each of some things, of which pairs (M, 2) are the same."""
+def merged_groups(count: int, pairs: IntArray) -> IntArray:
+    """(count,) connected component of each of some items, of which pairs (M, 2) are the same."""
     links = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _numbered(keyframes: list[Keyframe], loops: list[Loop], offsets: IntArray) -> IntArray:
+def _track_features(keyframes: list[Keyframe], loops: list[Loop], offsets: IntArray) -> IntArray:
     """(N,) number of the feature of each observation: its track, and those matched with it."""
     ids = np.concatenate([k.ids for k in keyframes])
     tracked = ids >= 0
     _, track = np.unique(ids, return_inverse=True)
-    # a corner without a track is one of its own, which a loop may join to others
+    # a corner without a track is a feature of its own, which a loop may merge with others
     track = np.where(tracked, track.reshape(-1), track.max(initial=0) + 1 + np.arange(len(ids)))
     rows = [offsets[[loop.first, loop.second]] + loop.pairs for loop in loops]
     pairs = track[np.concatenate([np.zeros((0, 2), np.int64), *rows])]
-    return together(int(track.max(initial=-1)) + 1, pairs)[track]
+    return merged_groups(int(track.max(initial=-1)) + 1, pairs)[track]
 
 
-def _placed(whole: SlamMap, features: IntArray, body_points: FloatArray) -> FloatArray:
-    """(P, 3) world positions of features 0 to P - 1; NaN where no observation has a point."""
+def _world_points(whole: SlamMap, features: IntArray, body_points: FloatArray) -> FloatArray:
+    """(P, 3) world points of features 0 to P - 1; NaN where no observation has a point."""
     count = int(features.max(initial=-1)) + 1
     known = np.flatnonzero((features >= 0) & np.isfinite(body_points).all(axis=1))
     at, local = whole.keyframe_of[known], body_points[known]
@@ -157,25 +159,25 @@ def _placed(whole: SlamMap, features: IntArray, body_points: FloatArray) -> Floa
     return np.asarray(np.column_stack(sums) / np.where(total > 0, total, np.nan)[:, None])
 
 
-def _fits(
+def _is_inlier(
     whole: SlamMap, features: IntArray, points: FloatArray, max_error_px: float
-) -> NDArray[np.bool_]:
-    """(N,) whether each observation sees its feature where it is."""
-    fits = np.zeros(len(features), np.bool_)
+) -> BoolArray:
+    """(N,) whether the reprojection error of each observation is small."""
+    inlier = np.zeros(len(features), np.bool_)
     for number, recording in enumerate(whole.recordings):
         rows = np.flatnonzero((features >= 0) & (whole.recording_of[whole.keyframe_of] == number))
         at = whole.keyframe_of[rows]
         body = points[features[rows]] - whole.poses.translations[at]
         body = np.einsum("nji,nj->ni", whole.poses.rotations[at], body)
-        ahead, seen = seen_from(recording.rig, body)
+        ahead, seen = _projected(recording.rig, body)
         off = np.linalg.norm(seen - whole.normalized[rows], axis=1)
         camera = recording.rig.cameras[0].camera
-        fits[rows] = ahead & (off * np.sqrt(camera.fx * camera.fy) < max_error_px)
-    return fits
+        inlier[rows] = ahead & (off * np.sqrt(camera.fx * camera.fy) < max_error_px)
+    return inlier
 
 
-def seen_from(rig: Rig, body: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Which points (N, 3) of the body frame are ahead of the first camera, and where (N, 2)."""
+def _projected(rig: Rig, body: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Which points (N, 3) of the body are ahead of the first camera, and their projections."""
     mount = rig.cameras[0].body_T_camera
     local = (body - mount.translation()) @ mount.rotation().matrix()
     ahead = local[:, 2] > 0

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map files: a zip archive with `map.json` and arrays in NumPy's format (docs/maps.md).
 
-Nothing in a file is executed, and nothing is unpacked: members are stored as they are, so that no
-array is larger than the file, and what an array says of its size is checked before it is read.
-
-What must hold in a map that came from outside, beyond types and shapes.
+Files may come from strangers. Nothing in a file is executed, and members are stored uncompressed,
+so that no array is larger than the file; type and shape of an array are checked before it is read,
+and its values afterwards (`_check_map`).
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import BoolArray
 from slam_graph.errors import DataError
 from slam_graph.loop_closure.place_recognition import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
@@ -31,77 +31,20 @@ from slam_graph.sensors.euroc_calibration import read_imu_noise
 from slam_graph.sensors.kalibr_calibration import IMU_KEY, chain_cameras, kalibr_table
 from slam_graph.sensors.rig import Rig
 
-FARTHEST_M = 1e8
-"""No coordinate of a map is larger."""
+__all__ = ["ARRAYS", "arrays_of", "read_map", "write_map"]
 
-FARTHEST_RAY = 1e4
-"""No coordinate on the plane z = 1 is larger."""
+_MAX_COORDINATE_M = 1e8
+_MAX_NORMALIZED = 1e4
+"""Largest coordinate on the plane z = 1."""
 
-
-def check_map(content: SlamMap, path: Path) -> None:
-    """Refuse a map whose numbers make no sense.
-
-    Raises:
-        DataError: naming the array at fault, and where in it.
-    """
-    if len(content) == 0 or len(content.features) == 0:
-        raise DataError(f"{path}: the map is empty: no keyframes that see anything; make it again")
-    if content.descriptors.shape[1] == 0 or len(content.vocabulary.words) == 0:
-        raise DataError(
-            f"{path}: the map has no descriptors, so that no place can be recognised in it; make "
-            "it from images, or from tracks with descriptors"
-        )
-    for name, good, what in _rows(content):
-        if not good.all():
-            row = int(np.flatnonzero(~good.reshape(len(good), -1).all(axis=1))[0])
-            raise DataError(f"{path}: {name}.npy: row {row} {what}; make the map again")
-
-
-def _rows(content: SlamMap) -> Iterator[tuple[str, NDArray[np.bool_], str]]:
-    """Name of each array, whether its rows are good, and what is wrong with those that are not."""
-    links, words = content.links, content.vocabulary
-    for name, values, largest in (
-        ("positions", content.poses.translations, FARTHEST_M),
-        ("points", content.points, FARTHEST_M),
-        ("normalized", content.normalized, FARTHEST_RAY),
-        ("link_positions", links.measured.translations, FARTHEST_M),
-        ("link_covariances", links.covariances, FARTHEST_M),
-        ("word_weights", words.idf, FARTHEST_M),
-    ):
-        yield name, np.abs(values) <= largest, f"is not finite or beyond {largest:g}"
-    count, offsets = len(content), content.offsets
-    ends = (offsets[0] == 0) & (offsets[-1] == len(content.features))
-    rising = np.diff(offsets, prepend=offsets[0]) >= 0
-    yield "offsets", rising & ends, "does not lead from 0 to all observations"
-    yield "features", _within(content.features, NO_FEATURE, len(content.points)), "is no feature"
-    number = content.recording_of
-    yield "recording_of", _within(number, 0, len(content.recordings)), "is no recording"
-    yield "recording_of", np.diff(number, prepend=number[0]) >= 0, "is of an earlier recording"
-    later = np.concatenate([[True], content.stamps_ns[1:] > content.stamps_ns[:-1]])
-    first = np.diff(number, prepend=number[0]) > 0
-    yield "stamps_ns", later | first, "is not later than the row before"
-    yield "link_ends", _within(links.ends, 0, count), "is no keyframe"
-    yield "link_ends", links.ends[:, 0] != links.ends[:, 1], "joins a keyframe with itself"
-    covariances = links.covariances
-    same = np.isclose(covariances, covariances.transpose(0, 2, 1)).reshape(-1, 36)
-    sound = same.all(axis=1) & (np.linalg.eigvalsh(covariances)[:, 0] > 0)
-    yield "link_covariances", sound, "is not a covariance"
-    yield "word_weights", words.idf >= 0, "is negative"
-
-
-def _within(values: NDArray[Any], low: int, end: int) -> NDArray[np.bool_]:
-    """Which values are at least `low` and below `end`."""
-    return np.asarray((values >= low) & (values < end))
-
-
-FORMAT, VERSION = "slam_graph map", 1
+_FORMAT, _VERSION = "slam_graph map", 1
 HEADER = "map.json"
-HEADER_LIMIT = 1_000_000
-"""Bytes that the header may have."""
+_MAX_HEADER_BYTES = 1_000_000
+"""Largest size of the header."""
 
-Shape = tuple[int | str, ...]
+_Shape = tuple[int | str, ...]
 
-ARRAYS: dict[str, tuple[str, Shape]] = {
+ARRAYS: dict[str, tuple[str, _Shape]] = {
     "recording_of": ("<i8", ("K",)),
     "stamps_ns": ("<i8", ("K",)),
     "positions": ("<f8", ("K", 3)),
@@ -121,8 +64,8 @@ ARRAYS: dict[str, tuple[str, Shape]] = {
 }
 """Type and shape of every array; sizes of one letter are the same everywhere."""
 
-BROKEN = (zipfile.BadZipFile, EOFError, ValueError, struct.error, RuntimeError, OverflowError)
-"""What reading a damaged archive or array may raise."""
+_READ_ERRORS = (zipfile.BadZipFile, EOFError, ValueError, struct.error, RuntimeError, OverflowError)
+"""Exceptions of damaged archives and arrays."""
 
 
 class _Strict(BaseModel):
@@ -144,11 +87,11 @@ class _Header(_Strict):
     recordings: list[_Recording] = Field(min_length=1)
 
 
-def write_map(path: Path, content: SlamMap) -> None:
+def write_map(path: str | Path, content: SlamMap) -> None:
     """Write a map file."""
     header = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": _FORMAT,
+        "version": _VERSION,
         "created": content.created,
         "slam_graph": content.version,
         "gravity_aligned": content.gravity_aligned,
@@ -167,12 +110,13 @@ def write_map(path: Path, content: SlamMap) -> None:
                 )
 
 
-def read_map(path: Path) -> SlamMap:
-    """Read a map file, also one that comes from a stranger.
+def read_map(path: str | Path) -> SlamMap:
+    """Read a map file, which may come from a stranger.
 
     Raises:
-        DataError: one line that names what is wrong: no map, a newer version, a damaged file.
+        DataError: if it is no map, of a newer version, damaged, or inconsistent.
     """
+    path = Path(path)
     try:
         size = path.stat().st_size
         with zipfile.ZipFile(path) as archive:
@@ -181,13 +125,13 @@ def read_map(path: Path) -> SlamMap:
             arrays = _read_arrays(archive, members, path)
     except OSError as error:
         raise DataError(f"{path}: map cannot be read ({error.strerror or error})") from None
-    except BROKEN as error:
+    except _READ_ERRORS as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(
             f"{path}: not a slam_graph map, or damaged ({reason}); take another copy of it"
         ) from None
     content = _assemble(header, arrays, path)
-    check_map(content, path)
+    _check_map(content, path)
     return content
 
 
@@ -226,7 +170,7 @@ def _quaternions(poses: Poses) -> NDArray[np.float64]:
 
 
 def _members(archive: zipfile.ZipFile, size: int, path: Path) -> dict[str, zipfile.ZipInfo]:
-    """The members by name, if together they are no larger than the file."""
+    """The members by name; refused if they could unpack to more than the file."""
     members = {info.filename: info for info in archive.infolist()}
     plain = all(
         info.compress_type == zipfile.ZIP_STORED
@@ -245,18 +189,18 @@ def _members(archive: zipfile.ZipFile, size: int, path: Path) -> dict[str, zipfi
 
 def _header(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], path: Path) -> _Header:
     """The header, if this version can read the file."""
-    if HEADER not in members or members[HEADER].file_size > HEADER_LIMIT:
+    if HEADER not in members or members[HEADER].file_size > _MAX_HEADER_BYTES:
         raise DataError(f"{path}: not a slam_graph map: it has no {HEADER}, or too large a one")
     try:
         table = json.loads(archive.read(HEADER).decode("utf-8"))
     except (ValueError, RecursionError):
         raise DataError(f"{path}: {HEADER} is not JSON; take another copy of the map") from None
-    if not isinstance(table, dict) or table.get("format") != FORMAT:
+    if not isinstance(table, dict) or table.get("format") != _FORMAT:
         raise DataError(f"{path}: not a slam_graph map: {HEADER} does not say so")
     version = table.get("version")
-    if isinstance(version, int) and version > VERSION:
+    if isinstance(version, int) and version > _VERSION:
         raise DataError(
-            f"{path}: a map of version {version}, this slam_graph reads version {VERSION}; "
+            f"{path}: a map of version {version}, this slam_graph reads version {_VERSION}; "
             "update slam_graph"
         )
     try:
@@ -271,7 +215,7 @@ def _header(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], path:
 def _read_arrays(
     archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], path: Path
 ) -> dict[str, NDArray[Any]]:
-    """All arrays; their sizes agree with each other and with the file."""
+    """All arrays, with consistent shapes and sizes."""
     sizes: dict[str, int] = {}
     arrays = {}
     for name, (dtype, wanted) in ARRAYS.items():
@@ -281,10 +225,10 @@ def _read_arrays(
         info = members[_member(name)]
         with archive.open(info) as file:
             shape, by_column, found = _array_header(file, where)
-            _agree(shape, wanted, sizes, where)
+            _check_shape(shape, wanted, sizes, where)
             count = 1
             for size in shape:
-                count *= size  # whole numbers of any size: nothing overflows
+                count *= size  # Python integers do not overflow
             left = info.file_size - file.tell()
             if found.str != dtype or by_column or count * found.itemsize != left:
                 raise DataError(
@@ -301,14 +245,14 @@ def _array_header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, n
     try:
         if np.lib.format.read_magic(file) == (1, 0):
             return np.lib.format.read_array_header_1_0(file)
-    except Exception as error:  # it is parsed as Python: whatever that finds wrong with it
+    except Exception as error:  # NumPy parses it as Python: any exception is possible
         reason = " ".join(str(error).split())[:100]
         raise DataError(f"{where}: damaged ({reason}); take another copy of the map") from None
     raise DataError(f"{where}: not an array of NumPy's format 1.0")
 
 
-def _agree(shape: tuple[int, ...], wanted: Shape, sizes: dict[str, int], where: str) -> None:
-    """Check a shape against the wanted one, and note the sizes that it is the first to say."""
+def _check_shape(shape: tuple[int, ...], wanted: _Shape, sizes: dict[str, int], where: str) -> None:
+    """Check a shape against the expected one, and note new sizes."""
     good = len(shape) == len(wanted) and all(isinstance(n, int) and n >= 0 for n in shape)
     if good:
         for size, name in zip(shape, wanted, strict=True):
@@ -367,3 +311,59 @@ def _recording(entry: _Recording, path: Path) -> MapRecording:
     return MapRecording(
         entry.name, entry.poses, Rig(chain_cameras(chain), read_imu_noise(chain.require(IMU_KEY)))
     )
+
+
+def _check_map(content: SlamMap, path: Path) -> None:
+    """Refuse a map with inconsistent values.
+
+    Raises:
+        DataError: naming the array and the row.
+    """
+    if len(content) == 0 or len(content.features) == 0:
+        raise DataError(f"{path}: the map is empty: it has no observations; make it again")
+    if content.descriptors.shape[1] == 0 or len(content.vocabulary.words) == 0:
+        raise DataError(
+            f"{path}: the map has no descriptors, so that no place can be recognised in it; make "
+            "it from images, or from tracks with descriptors"
+        )
+    for name, good, what in _rows(content):
+        if not good.all():
+            row = int(np.flatnonzero(~good.reshape(len(good), -1).all(axis=1))[0])
+            raise DataError(f"{path}: {name}.npy: row {row} {what}; make the map again")
+
+
+def _rows(content: SlamMap) -> Iterator[tuple[str, BoolArray, str]]:
+    """Name of each array, whether its rows are valid, and what is wrong with invalid ones."""
+    links, words = content.links, content.vocabulary
+    for name, values, largest in (
+        ("positions", content.poses.translations, _MAX_COORDINATE_M),
+        ("points", content.points, _MAX_COORDINATE_M),
+        ("normalized", content.normalized, _MAX_NORMALIZED),
+        ("link_positions", links.measured.translations, _MAX_COORDINATE_M),
+        ("link_covariances", links.covariances, _MAX_COORDINATE_M),
+        ("word_weights", words.idf, _MAX_COORDINATE_M),
+    ):
+        yield name, np.abs(values) <= largest, f"is not finite or beyond {largest:g}"
+    count, offsets = len(content), content.offsets
+    ends = (offsets[0] == 0) & (offsets[-1] == len(content.features))
+    rising = np.diff(offsets, prepend=offsets[0]) >= 0
+    yield "offsets", rising & ends, "does not lead from 0 to all observations"
+    yield "features", _within(content.features, NO_FEATURE, len(content.points)), "is no feature"
+    number = content.recording_of
+    yield "recording_of", _within(number, 0, len(content.recordings)), "is no recording"
+    yield "recording_of", np.diff(number, prepend=number[0]) >= 0, "is of an earlier recording"
+    later = np.concatenate([[True], content.stamps_ns[1:] > content.stamps_ns[:-1]])
+    first = np.diff(number, prepend=number[0]) > 0
+    yield "stamps_ns", later | first, "is not later than the row before"
+    yield "link_ends", _within(links.ends, 0, count), "is no keyframe"
+    yield "link_ends", links.ends[:, 0] != links.ends[:, 1], "joins a keyframe with itself"
+    covariances = links.covariances
+    same = np.isclose(covariances, covariances.transpose(0, 2, 1)).reshape(-1, 36)
+    sound = same.all(axis=1) & (np.linalg.eigvalsh(covariances)[:, 0] > 0)
+    yield "link_covariances", sound, "is not a covariance"
+    yield "word_weights", words.idf >= 0, "is negative"
+
+
+def _within(values: NDArray[Any], low: int, end: int) -> BoolArray:
+    """Which values are at least `low` and below `end`."""
+    return np.asarray((values >= low) & (values < end))

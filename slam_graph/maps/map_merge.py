@@ -1,15 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Two maps of the same place made one.
+"""Merging of two maps of the same place.
 
-    keyframes of the second → places of the first → sightings → agreement → pose graph → features
+    keyframes of the second → places of the first → matches → consistency → pose graph → features
 
-The keyframes of the second map are located in the first one as views of a run are. The largest
-group of sightings that agree says how the second map lies in the first. A pose graph over the
-keyframes of both, with odometry, the links of each map and those between them, then moves both, and
-GNC decides once more which of the links are false. Features that are matched become one.
-
-How a map lies in another: keyframes that are recognised there, and the pose they agree on.
+The keyframes of the second map are localized in the first, as the frames of a run are. The largest
+group of matches that are consistent with one of them aligns the second map with the first. A pose
+graph over the keyframes of both, with odometry, the links of each map and the matches, then moves
+both, and GNC rejects false links. Matched features become one.
 """
 
 from __future__ import annotations
@@ -20,149 +18,56 @@ from datetime import UTC, datetime
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
-from slam_graph.loop_closure.loop_pose_graph import corrected, loop_graph
+from slam_graph.loop_closure.loop_pose_graph import body_poses, loop_graph
 from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.maps.map_building import links_of, together, trained, with_features
+from slam_graph.maps.map_building import (
+    links_of,
+    merged_groups,
+    train_vocabulary,
+    with_points,
+)
 from slam_graph.maps.map_config import LocalizationConfig
-from slam_graph.maps.map_model import NO_FEATURE, Links, SlamMap
-from slam_graph.maps.map_places import MapPlaces, Sighting
-from slam_graph.maps.pose_filter import MapPoseFilter, upright
+from slam_graph.maps.map_model import NO_FEATURE, SlamMap
+from slam_graph.maps.map_places import MapPlaces, PlaceMatch
+from slam_graph.maps.pose_filter import (
+    CONSISTENT_CHI2,
+    MapPoseFilter,
+    with_roll_and_pitch,
+)
 from slam_graph.pose_graph.graph import Poses
 from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
 from slam_graph.version import __version__
 
-HYPOTHESES = 50
-"""How many sightings are tried as what all others should agree with."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recognised:
-    """A keyframe of the second map that was located in the first."""
-
-    number: int
-    sighting: Sighting
-
-
-def names(content: SlamMap) -> str:
-    """The recordings of a map, for a message."""
-    return " + ".join(recording.name for recording in content.recordings)
-
-
-def recognised(
-    first: SlamMap,
-    second: SlamMap,
-    loops: LoopClosureConfig,
-    localization: LocalizationConfig,
-    level: bool,
-) -> Iterator[Recognised]:
-    """Keyframes of the second map that show places of the first.
-
-    Args:
-        first: the map that is looked in.
-        second: the map of which the keyframes are taken for views.
-        loops: how places are verified.
-        localization: how many candidates are tried.
-        level: whether gravity is known to both.
-
-    Raises:
-        DataError: if descriptors are of different kinds.
-    """
-    for number, recording in enumerate(second.recordings):
-        places = MapPlaces(
-            first, recording.rig, loops.places, loops.verification, localization.neighbours
-        )
-        places.check(second.descriptors, names(second))
-        for row in np.flatnonzero(second.recording_of == number).tolist():
-            view = second.keyframe(row)
-            found = [
-                sighting
-                for place in places.alike(view.descriptors, localization.candidates).tolist()
-                if (sighting := places.locate(view, place, level)) is not None
-            ]
-            if found:
-                yield Recognised(row, max(found, key=lambda sighting: sighting.loop.inliers))
-
-
-def agreement(
-    first: SlamMap,
-    second: SlamMap,
-    seen: list[Recognised],
-    config: LocalizationConfig,
-    level: bool,
-) -> tuple[list[Recognised], gtsam.Pose3]:
-    """The largest group of sightings that agree with one of them, and what that one says.
-
-    Two agree if the ways between them in both maps are the same, up to the drift on these ways.
-
-    Args:
-        first: the map in which the keyframes were recognised.
-        second: the map that they are of.
-        seen: what was recognised.
-        config: when sightings agree.
-        level: whether gravity is known to both.
-
-    Returns:
-        The group, and world_T_world: the world of the second map in that of the first.
-    """
-    bound = float(chi2.ppf(config.confidence, 6))
-    best: list[Recognised] = []
-    alignment = gtsam.Pose3()
-    step = max(len(seen) / HYPOTHESES, 1.0)
-    for row in np.arange(0, len(seen), step).astype(int).tolist():
-        trial = seen[row]
-        body = second.pose(trial.number)
-        group = []
-        for other in seen:
-            filter_ = MapPoseFilter(
-                config, level, body, trial.sighting.world_T_body, trial.sighting.covariance, 0
-            )
-            filter_.move(_apart_ns(first, second, trial, other), second.pose(other.number))
-            if filter_.distance(other.sighting.world_T_body, other.sighting.covariance) < bound:
-                group.append(other)
-        if len(group) > len(best):
-            best = group
-            placed = trial.sighting.world_T_body
-            placed = upright(placed, body) if level else placed
-            alignment = placed.compose(body.inverse())
-    return best, alignment
-
-
-def _apart_ns(first: SlamMap, second: SlamMap, one: Recognised, other: Recognised) -> int:
-    """How much time odometry had to drift between two sightings, in both maps."""
-    ways = (
-        (first, one.sighting.place, other.sighting.place),
-        (second, one.number, other.number),
-    )
-    return sum(abs(int(content.stamps_ns[a]) - int(content.stamps_ns[b])) for content, a, b in ways)
-
+__all__ = ["MIN_LINKS", "MergeSummary", "MergedMaps", "merge_maps"]
 
 MIN_LINKS = 5
-"""So many keyframes of one map must be recognised in the other, and agree."""
+"""Least number of consistent matches between two maps."""
+_HYPOTHESES = 50
+"""Number of matches that are tried as the alignment of the maps."""
 
 
 @dataclass(frozen=True, slots=True)
 class MergeSummary:
-    """How two maps fitted.
+    """How well two maps fit.
 
     Attributes:
-        verified: keyframes of the second map that were located in the first.
-        agreeing: how many of these agree with each other.
-        accepted: how many of these the pose graph did not reject.
-        fused: features of the second map that are now one with some of the first.
-        link_rmse_m: root mean square of what is left of the links between the maps.
+        verified: keyframes of the second map that were localized in the first.
+        consistent: number of these that are consistent with each other.
+        accepted: number of these that the pose graph kept.
+        fused: features of the second map that were merged with features of the first.
+        link_rmse_m: root-mean-square residual of the links between the maps.
         link_rmse_deg: the same of their orientation.
-        first_moved_m: how far keyframes of the first map were moved, on average.
+        first_moved_m: mean displacement of the keyframes of the first map.
     """
 
     verified: int
-    agreeing: int
+    consistent: int
     accepted: int
     fused: int
     link_rmse_m: float
@@ -172,7 +77,7 @@ class MergeSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedMaps:
-    """The map that came of two, in the world of the first, and how they fitted."""
+    """The merged map, in the world of the first, and how well the maps fit."""
 
     content: SlamMap
     summary: MergeSummary
@@ -181,61 +86,63 @@ class MergedMaps:
 def merge_maps(
     first: SlamMap,
     second: SlamMap,
-    loops: LoopClosureConfig,
-    localization: LocalizationConfig,
+    loops: LoopClosureConfig | None = None,
+    localization: LocalizationConfig | None = None,
     seed: int = 0,
 ) -> MergedMaps:
-    """One map of two.
+    """Merge two maps.
 
     Args:
-        first: its first keyframe stays where it is.
+        first: its first keyframe keeps its pose.
         second: of the same place; its world may be any other.
-        loops: how places are verified, and how much odometry drifts.
-        localization: how many candidates are tried, and when sightings agree.
+        loops: settings of verification, and the drift of odometry; defaults if not given.
+        localization: settings of matching; defaults if not given.
         seed: of the training of the new vocabulary.
 
     Raises:
-        DataError: if descriptors are of different kinds.
+        DataError: if the maps have different kinds of descriptors.
         EstimationError: if they share no place.
     """
+    loops, localization = loops or LoopClosureConfig(), localization or LocalizationConfig()
     level = first.gravity_aligned and second.gravity_aligned
-    seen = list(recognised(first, second, loops, localization, level))
-    agreeing, first_T_second = agreement(first, second, seen, localization, level)
-    if len(agreeing) < MIN_LINKS:
+    found = list(_matched(first, second, loops, localization, level))
+    consistent, first_T_second = _aligned(first, second, found, localization, level)
+    if len(consistent) < MIN_LINKS:
         raise EstimationError(
-            f"the maps of {names(first)} and {names(second)} share no place: {len(seen)} of "
-            f"{len(second)} keyframes were recognised, of which {len(agreeing)} agree, and "
-            f"{MIN_LINKS} must; are they of the same place, seen by cameras held alike? Maps with "
-            "more keyframes (loop_closure.keyframes.distance_m and angle_rad) overlap more"
+            f"the maps of {_names(first)} and {_names(second)} share no place: {len(found)} of "
+            f"{len(second)} keyframes were recognised, {len(consistent)} of them consistently, and "
+            f"{MIN_LINKS} are needed; are they of the same place, seen from similar directions? "
+            "Maps with denser keyframes (loop_closure.keyframes.distance_m and angle_rad) overlap "
+            "more"
         )
     joined = _side_by_side(first, second, first_T_second, level)
-    links = [_link(one, len(first)) for one in agreeing]
-    poses, held = _solved(joined, links, loops, level)
-    accepted = [one for one, good in zip(agreeing, held, strict=True) if good]
+    links = [_link(one, len(first)) for one in consistent]
+    poses, kept = _solved(joined, links, loops, level)
+    accepted = [one for one, good in zip(consistent, kept, strict=True) if good]
     if len(accepted) < MIN_LINKS:
         raise EstimationError(
-            f"the maps of {names(first)} and {names(second)} cannot be laid on each other: only "
-            f"{len(accepted)} of {len(agreeing)} links between them hold"
+            f"the maps of {_names(first)} and {_names(second)} cannot be aligned: only "
+            f"{len(accepted)} of {len(consistent)} links between them are consistent"
         )
     body_points = _body_points(joined)
     features, fused = _fused(first, second, accepted)
     moved = replace(
         joined,
         poses=poses,
-        links=_chained(joined.links, links_of([_link(one, len(first)) for one in accepted])),
-        vocabulary=trained(
+        links=joined.links.concatenated(links_of([_link(one, len(first)) for one in accepted])),
+        vocabulary=train_vocabulary(
             [joined.descriptors_of(n) for n in range(len(joined))], loops.places, seed
         ),
     )
-    error_px = 2.0 * loops.verification.max_error_px  # the maps do not fit as well as one does
-    content = with_features(moved, features, body_points, error_px)
-    rmse_m, rmse_deg = _left(content, len(accepted))
+    error_px = 2.0 * loops.verification.max_error_px  # two maps do not fit as well as one
+    content = with_points(moved, features, body_points, error_px)
+    rmse_m, rmse_deg = _link_residuals(content, len(accepted))
     shift = poses.translations[: len(first)] - first.poses.translations
     return MergedMaps(
         content,
         MergeSummary(
-            len(seen),
-            len(agreeing),
+            len(found),
+            len(consistent),
             len(accepted),
             fused,
             rmse_m,
@@ -245,25 +152,19 @@ def merge_maps(
     )
 
 
-def _link(one: Recognised, offset: int) -> Loop:
-    """The sighting as a loop closure of the joined map."""
-    return replace(one.sighting.loop, first=one.sighting.place, second=offset + one.number)
+def _link(one: _Matched, offset: int) -> Loop:
+    """The match as a loop closure of the joined map."""
+    return replace(one.match.loop, first=one.match.place, second=offset + one.number)
 
 
 def _side_by_side(
     first: SlamMap, second: SlamMap, first_T_second: gtsam.Pose3, level: bool
 ) -> SlamMap:
-    """Both in one map, none of the features fused."""
+    """Both maps in one, without merged features."""
     R, t = first_T_second.rotation().matrix(), first_T_second.translation()
-    turned = Poses(
-        R @ second.poses.rotations,
-        second.poses.translations @ R.T + t,
-    )
+    aligned = Poses(R @ second.poses.rotations, second.poses.translations @ R.T + t)
     features = second.features + np.where(second.features >= 0, len(first.points), 0)
     links = replace(second.links, ends=second.links.ends + len(first))
-
-    def both(name: str) -> FloatArray:
-        return np.concatenate([getattr(first, name), getattr(second, name)])
 
     return SlamMap(
         first.recordings + second.recordings,
@@ -272,45 +173,28 @@ def _side_by_side(
         level,
         np.concatenate([first.recording_of, second.recording_of + len(first.recordings)]),
         np.concatenate([first.stamps_ns, second.stamps_ns]),
-        _stacked(first.poses, turned),
+        first.poses.concatenated(aligned),
         np.concatenate([first.points, second.points @ R.T + t]),
         np.concatenate([first.feature_descriptors, second.feature_descriptors]),
         np.concatenate([first.offsets, second.offsets[1:] + first.offsets[-1]]),
         np.concatenate([first.features, features]),
-        both("normalized"),
+        np.concatenate([first.normalized, second.normalized]),
         np.concatenate([first.descriptors, second.descriptors]),
-        _chained(first.links, links),
+        first.links.concatenated(links),
         first.vocabulary,
-    )
-
-
-def _stacked(first: Poses, second: Poses) -> Poses:
-    """Poses behind one another."""
-    return Poses(
-        np.concatenate([first.rotations, second.rotations]),
-        np.concatenate([first.translations, second.translations]),
-    )
-
-
-def _chained(first: Links, second: Links) -> Links:
-    """Links behind one another."""
-    return Links(
-        np.concatenate([first.ends, second.ends]),
-        _stacked(first.measured, second.measured),
-        np.concatenate([first.covariances, second.covariances]),
     )
 
 
 def _solved(
     joined: SlamMap, between: list[Loop], config: LoopClosureConfig, level: bool
 ) -> tuple[Poses, list[bool]]:
-    """Poses of all keyframes, and whether each link between the maps holds."""
+    """Poses of all keyframes, and whether each link between the maps is kept."""
     own, none = joined.links, np.zeros((0, 2), np.int64)
     inner = [
         Loop(
             int(ends[0]),
             int(ends[1]),
-            gtsam.Pose3(gtsam.Rot3(own.measured.rotations[n]), own.measured.translations[n]),
+            own.measured.pose3(n),
             own.covariances[n],
             0,
             0,
@@ -318,22 +202,21 @@ def _solved(
         )
         for n, ends in enumerate(own.ends)
     ]
-    # an edge to the next number counts as odometry, which is above suspicion
+    # an edge between consecutive numbers would count as odometry, which is never rejected
     usable = [abs(loop.first - loop.second) > 1 for loop in between]
     loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
-    # two recordings have no common clock, by which a drift could be learned
-    update = {"degrees_of_freedom": 4 if level else 6, "learn_drift": False}
-    settings = config.model_copy(update=update)
-    graph = loop_graph(joined.stamps_ns, joined.poses, loops, settings, joined.recording_of)
+    # two recordings have no common clock, so that their drift cannot be learned
+    drift = (config.odometry_rotation_sigma, config.odometry_position_sigma)
+    graph = loop_graph(joined.stamps_ns, joined.poses, loops, drift, level, joined.recording_of)
     policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc", initialization="file"))
     solution = optimize_pose_graph(replace(graph, name="merged maps"), policy, Diagnostics())
-    poses = corrected(graph, solution.poses, joined.poses, settings.degrees_of_freedom)
+    poses = body_poses(solution.poses, joined.poses, level)
     weights = iter(solution.weights[len(solution.weights) - sum(usable) :].tolist())
     return poses, [good and next(weights) > 0.5 for good in usable]
 
 
 def _body_points(content: SlamMap) -> FloatArray:
-    """(N, 3) the feature of each observation in its body frame; NaN where there is none."""
+    """(N, 3) the point of each observation in its body frame; NaN without one."""
     points = np.full((len(content.features), 3), np.nan)
     known = np.flatnonzero(content.features >= 0)
     at = content.keyframe_of[known]
@@ -342,19 +225,19 @@ def _body_points(content: SlamMap) -> FloatArray:
     return points
 
 
-def _fused(first: SlamMap, second: SlamMap, accepted: list[Recognised]) -> tuple[IntArray, int]:
-    """(N,) feature of each observation of both maps, and how many of the second's were fused."""
+def _fused(first: SlamMap, second: SlamMap, accepted: list[_Matched]) -> tuple[IntArray, int]:
+    """(N,) feature of each observation of both maps, and the number of features merged."""
     offset = len(first.points)
     other = second.features.copy()
     other[other >= 0] += offset
     pairs = []
     for one in accepted:
-        rows = second.offsets[one.number] + one.sighting.loop.pairs[:, 1]
+        rows = second.offsets[one.number] + one.match.loop.pairs[:, 1]
         unknown = other[rows] == NO_FEATURE
-        other[rows[unknown]] = one.sighting.features[unknown]
-        pairs.append(np.column_stack([one.sighting.features, other[rows]]))
+        other[rows[unknown]] = one.match.features[unknown]
+        pairs.append(np.column_stack([one.match.features, other[rows]]))
     same = np.concatenate(pairs)
-    groups = together(offset + len(second.points), same)
+    groups = merged_groups(offset + len(second.points), same)
     features = np.concatenate([first.features, other])
     known = features >= 0
     features[known] = groups[features[known]]
@@ -362,8 +245,8 @@ def _fused(first: SlamMap, second: SlamMap, accepted: list[Recognised]) -> tuple
     return features, len(fused)
 
 
-def _left(content: SlamMap, count: int) -> tuple[float, float]:
-    """Root mean square of what the last links leave: metres and degrees."""
+def _link_residuals(content: SlamMap, count: int) -> tuple[float, float]:
+    """Root-mean-square residuals of the last links: metres and degrees."""
     links = content.links
     i, j = links.ends[-count:].T
     found = content.poses.select(i).inverse().compose(content.poses.select(j))
@@ -373,4 +256,105 @@ def _left(content: SlamMap, count: int) -> tuple[float, float]:
     return (
         float(np.sqrt(np.mean(metres**2))),
         float(np.degrees(np.sqrt(np.mean(off.angles() ** 2)))),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matched:
+    """A keyframe of the second map that was localized in the first."""
+
+    number: int
+    match: PlaceMatch
+
+
+def _names(content: SlamMap) -> str:
+    """The recordings of a map, for messages."""
+    return " + ".join(recording.name for recording in content.recordings)
+
+
+def _matched(
+    first: SlamMap,
+    second: SlamMap,
+    loops: LoopClosureConfig,
+    localization: LocalizationConfig,
+    level: bool,
+) -> Iterator[_Matched]:
+    """Keyframes of the second map that match places of the first.
+
+    Args:
+        first: the map that is searched.
+        second: the map whose keyframes are the views.
+        loops: settings of verification.
+        localization: number of candidates.
+        level: whether gravity is known to both.
+
+    Raises:
+        DataError: if the maps have different kinds of descriptors.
+    """
+    for number, recording in enumerate(second.recordings):
+        places = MapPlaces(first, recording.rig, loops.verification, localization.neighbours)
+        places.check(second.descriptors, _names(second))
+        for row in np.flatnonzero(second.recording_of == number).tolist():
+            view = second.keyframe(row)
+            found = [
+                match
+                for place in places.similar(view.descriptors, localization.candidates).tolist()
+                if (match := places.locate(view, place, level)) is not None
+            ]
+            if found:
+                yield _Matched(row, max(found, key=lambda match: match.loop.inliers))
+
+
+def _aligned(
+    first: SlamMap,
+    second: SlamMap,
+    matches: list[_Matched],
+    config: LocalizationConfig,
+    level: bool,
+) -> tuple[list[_Matched], gtsam.Pose3]:
+    """The largest group of matches that are consistent with one of them, and its alignment.
+
+    Two matches are consistent if the relative poses between them in both maps are the same, up to
+    the drift in between.
+
+    Args:
+        first: the map in which the keyframes were localized.
+        second: the map of the keyframes.
+        matches: between them.
+        config: standard deviations of map and odometry.
+        level: whether gravity is known to both.
+
+    Returns:
+        The group, and first_T_second: the world of the second map in that of the first.
+    """
+    best: list[_Matched] = []
+    alignment = gtsam.Pose3()
+    step = max(len(matches) / _HYPOTHESES, 1.0)
+    for row in np.arange(0, len(matches), step).astype(int).tolist():
+        trial = matches[row]
+        body = second.pose(trial.number)
+        group = []
+        for other in matches:
+            filter_ = MapPoseFilter(
+                config, level, body, trial.match.world_T_body, trial.match.covariance, 0
+            )
+            filter_.move(_apart_ns(first, second, trial, other), second.pose(other.number))
+            if filter_.distance(other.match.world_T_body, other.match.covariance) < CONSISTENT_CHI2:
+                group.append(other)
+        if len(group) > len(best):
+            best = group
+            placed = trial.match.world_T_body
+            placed = with_roll_and_pitch(placed, body) if level else placed
+            alignment = placed.compose(body.inverse())
+    return best, alignment
+
+
+def _apart_ns(first: SlamMap, second: SlamMap, one: _Matched, other: _Matched) -> int:
+    """Time during which odometry drifted between two matches, in both maps."""
+    stretches = (
+        (first, one.match.place, other.match.place),
+        (second, one.number, other.number),
+    )
+    return sum(
+        abs(int(content.stamps_ns[a]) - int(content.stamps_ns[b])) for content, a, b in stretches
     )

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map: keyframes, the features that they see, and what recognises them again.
+"""A map: keyframes, the features that they observe, and the vocabulary for place recognition.
 
-The world of a map has z up if it is aligned with gravity. Where several recordings went into it,
-keyframes stand recording by recording, each in the order of time.
+The z axis of a gravity-aligned map is up. In a map of several recordings the keyframes are ordered
+by recording, and in time within each.
 """
 
 from __future__ import annotations
@@ -15,33 +15,40 @@ from typing import Any, Literal
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 from slam_graph.loop_closure.place_recognition import Vocabulary, majority
 from slam_graph.pose_graph.graph import Poses
 from slam_graph.sensors.rig import Rig
 
-Descriptors = NDArray[np.uint8]
+__all__ = [
+    "NO_FEATURE",
+    "Links",
+    "MapRecording",
+    "PoseSource",
+    "SlamMap",
+    "in_body",
+    "majority_descriptors",
+]
 
 NO_FEATURE = -1
-"""Feature of an observation whose place is not known."""
+"""Feature index of an observation without a triangulated point."""
 
 PoseSource = Literal["adjusted", "loop_closed", "smoothed", "causal"]
-"""Which estimate the poses of a recording come from."""
+"""The estimate that the poses of a recording come from (adjusted: by an earlier version)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapRecording:
-    """A recording that went into a map.
+    """A recording that a map was made of.
 
     Attributes:
         name: of the recording.
-        poses: where its poses came from.
+        poses: the estimate that its poses come from.
         rig: its calibration.
     """
 
@@ -52,7 +59,7 @@ class MapRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
-    """Measured relative poses between keyframes that are not neighbours in time.
+    """Measured relative poses between keyframes: loop closures, and matches between maps.
 
     Attributes:
         ends: (L, 2) keyframes.
@@ -67,6 +74,14 @@ class Links:
     def __len__(self) -> int:
         return len(self.ends)
 
+    def concatenated(self, other: Links) -> Links:
+        """These links, followed by others."""
+        return Links(
+            np.concatenate([self.ends, other.ends]),
+            self.measured.concatenated(other.measured),
+            np.concatenate([self.covariances, other.covariances]),
+        )
+
     @staticmethod
     def none() -> Links:
         """No links."""
@@ -78,21 +93,21 @@ class SlamMap:
     """K keyframes with N observations of P features.
 
     Attributes:
-        recordings: that went into it.
-        created: when, as ISO 8601 text in UTC.
+        recordings: that it was made of.
+        created: time, ISO 8601 in UTC.
         version: of slam_graph that made it.
-        gravity_aligned: whether z of its world is up.
+        gravity_aligned: whether the z axis of its world is up.
         recording_of: (K,) number of the recording of each keyframe.
         stamps_ns: (K,) times of the keyframes.
         poses: K poses world_T_body.
         points: (P, 3) positions of the features in the world, in metres.
-        feature_descriptors: (P, B) what they look like: the bits that most observations have.
+        feature_descriptors: (P, B) majority of the descriptors of their observations, bit by bit.
         offsets: (K + 1,) first observation of each keyframe, and N.
-        features: (N,) the feature that is seen; -1 where its position is not known.
-        normalized: (N, 2) where the first camera sees it, on the plane z = 1.
-        descriptors: (N, B) what it looks like there.
-        links: between keyframes that see the same place.
-        vocabulary: that makes words of descriptors.
+        features: (N,) the observed feature; -1 without a triangulated point.
+        normalized: (N, 2) observations of the first camera on the plane z = 1.
+        descriptors: (N, B) of the observations.
+        links: relative poses between keyframes of the same place.
+        vocabulary: for place recognition.
     """
 
     recordings: tuple[MapRecording, ...]
@@ -129,16 +144,14 @@ class SlamMap:
 
     def pose(self, number: int) -> gtsam.Pose3:
         """world_T_body of a keyframe."""
-        return gtsam.Pose3(
-            gtsam.Rot3(self.poses.rotations[number]), self.poses.translations[number]
-        )
+        return self.poses.pose3(number)
 
     def descriptors_of(self, number: int) -> Descriptors:
-        """(n, B) what a keyframe sees."""
+        """(n, B) descriptors of a keyframe."""
         return self.descriptors[self.offsets[number] : self.offsets[number + 1]]
 
     def keyframe(self, number: int) -> Keyframe:
-        """A keyframe with the points that it sees; its ids are those of features."""
+        """A keyframe with the points that it observes; ids are feature indices."""
         rows = slice(self.offsets[number], self.offsets[number + 1])
         features, pose = self.features[rows], self.pose(number)
         points = np.full((len(features), 3), np.nan)
@@ -164,7 +177,7 @@ class SlamMap:
         return (self.trajectory(number) for number in range(len(self.recordings)))
 
     def summary(self) -> dict[str, Any]:
-        """What it holds, as a table; lengths in metres."""
+        """Sizes of the map as a table; lengths in metres."""
         low, high = (f(self.poses.translations, axis=0) for f in (np.min, np.max))
         path = sum(
             float(np.linalg.norm(np.diff(t.positions, axis=0), axis=1).sum())
@@ -186,25 +199,27 @@ class SlamMap:
 
 
 def in_body(pose: gtsam.Pose3, points: FloatArray) -> FloatArray:
-    """Points (N, 3) of the world in the frame of a body at world_T_body."""
+    """World points (N, 3) in the frame of a body at world_T_body."""
     rotation: FloatArray = pose.rotation().matrix()
     return np.asarray((points - pose.translation()) @ rotation)
 
 
-def common_look(descriptors: Descriptors, features: IntArray, count: int) -> Descriptors:
-    """(P, B) bits that most observations of each feature have; features without any have zeros.
+def majority_descriptors(descriptors: Descriptors, features: IntArray, count: int) -> Descriptors:
+    """(P, B) majority of the descriptors of each feature, bit by bit; zeros without observations.
 
     Args:
         descriptors: (N, B) of observations.
-        features: (N,) what they are of; negative ones are left out.
+        features: (N,) the observed features; negative ones are left out.
         count: P.
     """
     known = features >= 0
-    looks = np.zeros((count, descriptors.shape[1]), np.uint8)
+    found = np.zeros((count, descriptors.shape[1]), np.uint8)
     if not known.any():
-        return looks
-    for byte in range(descriptors.shape[1]):  # all bits of a long recording at once take gigabytes
+        return found
+    for byte in range(
+        descriptors.shape[1]
+    ):  # all bits of a long recording at once would take gigabytes
         column = slice(byte, byte + 1)
         bits = np.unpackbits(descriptors[known, column], axis=1).astype(np.int32)
-        looks[:, column] = majority(bits, features[known], looks[:, column])
-    return looks
+        found[:, column] = majority(bits, features[known], found[:, column])
+    return found

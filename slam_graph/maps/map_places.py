@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The places of a map: which look like a view, and from where the view was taken."""
+"""Matching of views with a map: similar keyframes, and the pose from which the view was taken."""
 
 from __future__ import annotations
 
@@ -11,29 +11,30 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
-from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_config import VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
-from slam_graph.loop_closure.place_recognition import PlaceDatabase, best_places
-from slam_graph.maps.map_model import Descriptors, SlamMap, in_body
+from slam_graph.loop_closure.place_recognition import SAME_PLACE, PlaceDatabase, best_places
+from slam_graph.maps.map_model import SlamMap, in_body
 from slam_graph.sensors.rig import Rig
 
-HALF_TURN_M = 4.0
-"""How far a keyframe that looks the opposite way counts as being away."""
+__all__ = ["MapPlaces", "PlaceMatch"]
 
-HELD_PLACES = 200
-"""How many places are held ready, about 0.1 MB each; the one made first makes room."""
+_HALF_TURN_M = 4.0
+"""Distance that a rotation by 180° counts as."""
+_CACHED_PLACES = 200
+"""Size of the cache of places, about 0.1 MB each; the oldest is removed first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
-    """A view that a place of the map explains.
+class PlaceMatch:
+    """A view that was localized at a place of the map.
 
     Attributes:
-        place: the keyframe of the map.
-        world_T_body: where the view was taken, in the world of the map.
+        place: number of the keyframe of the map.
+        world_T_body: pose of the view in the world of the map.
         covariance: (6, 6) of it in GTSAM's tangent: rotation (rad), translation (m).
-        loop: how it was found: from the place (`first`) to the view (`second`).
+        loop: the verified match, from the place (`first`) to the view (`second`).
         features: (inliers,) features of the map that the pairs of `loop` match.
     """
 
@@ -45,29 +46,26 @@ class Sighting:
 
 
 class MapPlaces:
-    """Compares views with a map.
+    """Matches views with a map.
 
-    A place is a keyframe with all features that it and its neighbours see. Neighbours are those
-    that share most features with it.
+    A place is a keyframe with all features that it and its most covisible neighbours observe.
 
     Args:
         content: the map.
         rig: of the views; only its first camera is used.
-        places: how alike a place must look.
-        verification: what it takes.
-        neighbours: how many of them.
+        verification: thresholds.
+        neighbours: number of covisible keyframes of a place.
     """
 
     def __init__(
         self,
         content: SlamMap,
         rig: Rig,
-        places: PlaceConfig,
         verification: VerificationConfig,
         neighbours: int,
     ) -> None:
         self.map = content
-        self._same_place, self._neighbours = places.same_place, neighbours
+        self._neighbours = neighbours
         self._verifier = LoopVerifier(rig.cameras[0], verification)
         self._database = PlaceDatabase(len(content.vocabulary.words))
         for number in range(len(content)):
@@ -76,10 +74,10 @@ class MapPlaces:
         self._places: dict[int, Keyframe] = {}
 
     def check(self, descriptors: Descriptors, name: str) -> None:
-        """Refuse descriptors of another kind than the map's.
+        """Check that descriptors are of the kind of the map.
 
         Raises:
-            DataError: naming both.
+            DataError: if they are not.
         """
         bits, own = 8 * descriptors.shape[1], 8 * self.map.descriptors.shape[1]
         if bits != own:
@@ -88,33 +86,33 @@ class MapPlaces:
                 "the same ones"
             )
 
-    def alike(self, descriptors: Descriptors, count: int) -> IntArray:
-        """Keyframes that look most like a view with descriptors (N, B), the best first."""
+    def similar(self, descriptors: Descriptors, count: int) -> IntArray:
+        """The keyframes most similar to a view with descriptors (N, B), best first."""
         scores = self._database.query(self.map.vocabulary.words_of(descriptors))
-        return best_places(scores, 0.0, count, self._same_place)
+        return best_places(scores, 0.0, count, SAME_PLACE)
 
     def nearest(self, world_T_body: gtsam.Pose3, count: int) -> IntArray:
-        """Keyframes nearest to a pose, in position and direction of view, the best first."""
+        """The keyframes nearest to a pose, in position and orientation, best first."""
         poses = self.map.poses
         away = np.linalg.norm(poses.translations - world_T_body.translation(), axis=1)
         # |R - S|² = 8 for a half turn
         turned = np.linalg.norm(poses.rotations - world_T_body.rotation().matrix(), axis=(1, 2))
-        near = 1.0 / (1.0 + away + turned * HALF_TURN_M / np.sqrt(8.0))
-        return best_places(near, 0.0, count, self._same_place)
+        near = 1.0 / (1.0 + away + turned * _HALF_TURN_M / np.sqrt(8.0))
+        return best_places(near, 0.0, count, SAME_PLACE)
 
-    def locate(self, view: Keyframe, number: int, gravity: bool) -> Sighting | None:
-        """Where a view was taken, if it shows the place of a keyframe of the map.
+    def locate(self, view: Keyframe, number: int, gravity: bool) -> PlaceMatch | None:
+        """Localize a view at a keyframe of the map; None if verification fails.
 
         Args:
             view: its points are not used, and its pose only for roll and pitch.
             number: of the keyframe.
-            gravity: whether both know roll and pitch.
+            gravity: whether roll and pitch of view and map are known.
         """
         place = self._place(number)
         loop = self._verifier.verify([place, view], 0, 1, gravity)
         if loop is None:
             return None
-        return Sighting(
+        return PlaceMatch(
             number,
             place.world_T_body.compose(loop.first_T_second),
             loop.covariance,
@@ -123,9 +121,9 @@ class MapPlaces:
         )
 
     def _place(self, number: int) -> Keyframe:
-        """A keyframe that sees all features of its neighbours too."""
+        """A keyframe with the features of its neighbours."""
         if number not in self._places:
-            if len(self._places) == HELD_PLACES:
+            if len(self._places) == _CACHED_PLACES:
                 del self._places[next(iter(self._places))]
             content, keyframe = self.map, self.map.keyframe(number)
             common = (self._shared @ self._shared[number].T).toarray()[:, 0]

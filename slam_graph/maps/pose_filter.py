@@ -1,40 +1,48 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a run in a map, from its odometry and from sightings of the map's places.
+"""Kalman filter of the pose of a run in a map, from its odometry and its matches with the map.
 
-A Kalman filter of the pose: relative poses of the odometry move it, with an uncertainty that grows
-in time, and sightings correct it. Where gravity is known to map and run, the run's own roll and
-pitch hold, and yaw and position are estimated; otherwise the whole pose is. The error is
-δ = (θ, p) in the world of the map: R = Exp(E θ) R̂, t = t̂ + p, with E the vertical (4 degrees of
-freedom) or the identity (6).
+Relative poses of the odometry propagate it, with an uncertainty that grows with time, and matches
+correct it. Where gravity is known to map and run, roll and pitch are those of the run, and yaw and
+position are estimated; otherwise the whole pose is. The error is δ = (θ, p) in the world of the
+map: R = Exp(E θ) R̂, t = t̂ + p, with E the vertical (4 degrees of freedom) or the identity (6).
 """
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
 from slam_graph.maps.map_config import LocalizationConfig
 
-VERTICAL = np.array([[0.0], [0.0], [1.0]])
+__all__ = ["CONSISTENT_CHI2", "MapPoseFilter", "with_roll_and_pitch"]
+
+CONFIDENCE = 0.999
+"""χ² quantile of consistent matches: so high because a rejected true match costs little."""
+CONSISTENT_CHI2 = float(chi2.ppf(CONFIDENCE, 6))
+"""Largest squared Mahalanobis distance of a consistent match."""
+TILT_SIGMA = 5e-3
+"""Standard deviation of roll and pitch of the run, rad."""
+_VERTICAL = np.array([[0.0], [0.0], [1.0]])
 
 
 class MapPoseFilter:
-    """The pose of the body in the map, after a first sighting.
+    """The pose of the body in the map, from a first match on.
 
     Args:
-        config: how uncertain everything is.
+        config: standard deviations.
         level: whether roll and pitch are known.
-        odom_T_body: the run's own estimate at the time of the sighting.
-        sighting: world_T_body then.
-        covariance: (6, 6) of the sighting in GTSAM's tangent.
-        stamp_ns: time of the sighting.
+        odom_T_body: the run's own estimate at the time of the match.
+        measured: world_T_body of the match.
+        covariance: (6, 6) of it in GTSAM's tangent.
+        stamp_ns: time of the match.
 
     Attributes:
-        pose: world_T_body, at the last time that the filter was moved to.
+        pose: world_T_body at `stamp_ns`.
         covariance: (n, n) of δ: n = 4 or 6, position last.
-        stamp_ns: that time.
+        stamp_ns: time of the estimate.
     """
 
     def __init__(
@@ -42,16 +50,16 @@ class MapPoseFilter:
         config: LocalizationConfig,
         level: bool,
         odom_T_body: gtsam.Pose3,
-        sighting: gtsam.Pose3,
+        measured: gtsam.Pose3,
         covariance: FloatArray,
         stamp_ns: int,
     ) -> None:
         self._config, self._level = config, level
-        self._axes = VERTICAL if level else np.eye(3)
+        self._axes = _VERTICAL if level else np.eye(3)
         self._odom_T_body = odom_T_body
         self.stamp_ns = stamp_ns
-        self.pose = upright(sighting, odom_T_body) if level else sighting
-        # without a prior: what the sighting says alone
+        self.pose = with_roll_and_pitch(measured, odom_T_body) if level else measured
+        # there is no prior: the covariance is that of the match
         H = self._jacobian()
         information = H.T @ np.linalg.inv(self._noise(covariance)) @ H
         self.covariance: FloatArray = np.asarray(np.linalg.inv(information))
@@ -62,33 +70,33 @@ class MapPoseFilter:
         return float(np.sqrt(np.diag(self.covariance)[-3:].max()))
 
     def move(self, stamp_ns: int, odom_T_body: gtsam.Pose3) -> None:
-        """Go on to the next time by the run's own estimate."""
+        """Propagate to a later time by the run's own estimate."""
         step = self._odom_T_body.between(odom_T_body)
-        way = self.pose.rotation().matrix() @ step.translation()
+        moved = self.pose.rotation().matrix() @ step.translation()
         size = self._axes.shape[1]
         F = np.eye(size + 3)
-        F[size:, :size] = np.cross(self._axes.T, way).T
+        F[size:, :size] = np.cross(self._axes.T, moved).T
         seconds = max(stamp_ns - self.stamp_ns, 0) * 1e-9
         config = self._config
         drift = [config.odometry_rotation_sigma] * size + [config.odometry_position_sigma] * 3
         self.covariance = F @ self.covariance @ F.T + np.diag(np.square(drift)) * seconds
         pose = self.pose.compose(step)
-        self.pose = upright(pose, odom_T_body) if self._level else pose
+        self.pose = with_roll_and_pitch(pose, odom_T_body) if self._level else pose
         self._odom_T_body, self.stamp_ns = odom_T_body, stamp_ns
 
-    def distance(self, sighting: gtsam.Pose3, covariance: FloatArray) -> float:
-        """Squared Mahalanobis distance of a sighting now; χ² with six degrees of freedom."""
-        innovation, S = self._innovation(sighting, covariance)
+    def distance(self, measured: gtsam.Pose3, covariance: FloatArray) -> float:
+        """Squared Mahalanobis distance of a match now; χ² with six degrees of freedom."""
+        innovation, S = self._innovation(measured, covariance)
         return float(innovation @ np.linalg.solve(S, innovation))
 
-    def correct(self, sighting: gtsam.Pose3, covariance: FloatArray) -> None:
-        """Take a sighting into account.
+    def correct(self, measured: gtsam.Pose3, covariance: FloatArray) -> None:
+        """Update with a match.
 
         Args:
-            sighting: world_T_body at the time of the filter.
+            measured: world_T_body at the time of the filter.
             covariance: (6, 6) of it in GTSAM's tangent.
         """
-        innovation, S = self._innovation(sighting, covariance)
+        innovation, S = self._innovation(measured, covariance)
         H = self._jacobian()
         gain = np.linalg.solve(S, H @ self.covariance).T
         δ = gain @ innovation
@@ -99,10 +107,10 @@ class MapPoseFilter:
         self.pose = gtsam.Pose3(turn.compose(self.pose.rotation()), position)
 
     def _innovation(
-        self, sighting: gtsam.Pose3, covariance: FloatArray
+        self, measured: gtsam.Pose3, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """What a sighting says more (6,), in the tangent of the body, and its covariance (6, 6)."""
-        between = self.pose.between(sighting)
+        """Innovation (6,) of a match, in the tangent of the body, and its covariance (6, 6)."""
+        between = self.pose.between(measured)
         innovation = np.concatenate([gtsam.Rot3.Logmap(between.rotation()), between.translation()])
         H = self._jacobian()
         return innovation, H @ self.covariance @ H.T + self._noise(covariance)
@@ -116,19 +124,19 @@ class MapPoseFilter:
         return H
 
     def _noise(self, covariance: FloatArray) -> FloatArray:
-        """(6, 6) of a sighting with what map and run do not know either."""
+        """(6, 6) covariance of a match, the uncertainty of map and run included."""
         config, noise = self._config, covariance.copy()
         noise[:3, :3] += np.eye(3) * config.map_rotation_sigma**2
         noise[3:, 3:] += np.eye(3) * config.map_position_sigma**2
         if self._level:
             back = self.pose.rotation().matrix().T
-            tilt = config.tilt_sigma**2 * np.diag([1.0, 1.0, 0.0])
+            tilt = TILT_SIGMA**2 * np.diag([1.0, 1.0, 0.0])
             noise[:3, :3] += back @ tilt @ back.T
         return noise
 
 
-def upright(pose: gtsam.Pose3, odom_T_body: gtsam.Pose3) -> gtsam.Pose3:
-    """A pose with the roll and pitch of another: turned about the vertical as near as can be."""
+def with_roll_and_pitch(pose: gtsam.Pose3, odom_T_body: gtsam.Pose3) -> gtsam.Pose3:
+    """The pose with roll and pitch of another that is nearest to a given one."""
     turn = pose.rotation().matrix() @ odom_T_body.rotation().matrix().T
     yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
     return gtsam.Pose3(gtsam.Rot3.Rz(yaw).compose(odom_T_body.rotation()), pose.translation())

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.backend.build_estimator import EstimatorLike, build_estimator
+from slam_graph.backend.estimator import Estimator
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.pipeline.stage import EstimatedFrame
@@ -35,7 +35,7 @@ class Estimation:
 
     def __init__(self, sequence: Sequence, result: RunResult) -> None:
         config = result.config
-        self.estimator: EstimatorLike = build_estimator(
+        self.estimator = Estimator(
             result.input.rig, config.algorithm, config.backend, sequence.diagnostics
         )
         self._start = KnownStart.of(sequence, result.input)

@@ -37,7 +37,7 @@ class Localization(Stage):
     def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
         rig, config = result.input.rig, result.config
         loops, settings = config.loop_closure, config.localization
-        self._places = MapPlaces(known, rig, loops.places, loops.verification, settings.neighbours)
+        self._places = MapPlaces(known, rig, loops.verification, settings.neighbours)
         self._localizer = MapLocalizer(self._places, settings)
         self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
         self._name, self._diagnostics = result.input.info.name, diagnostics
@@ -60,7 +60,7 @@ class Localization(Stage):
             if view is not None:
                 self._places.check(view.descriptors, self._name)
                 try:
-                    localizer.see(view)
+                    localizer.match(view)
                 except (cv2.error, np.linalg.LinAlgError) as error:
                     reason = " ".join(str(error).split())[:200]
                     self._diagnostics.warn("localization_query_failed", reason)
@@ -89,9 +89,9 @@ class Localization(Stage):
         localizer, log = self._localizer, self._log
         log.count(
             queries=localizer.queries,
-            sightings=localizer.sightings,
-            believed=localizer.believed,
-            starts=localizer.restarts,
+            matches=localizer.matches,
+            accepted=localizer.accepted,
+            starts=localizer.starts,
         )
         if len(log.located) and localizer.queries == 0:
             self._diagnostics.warn(

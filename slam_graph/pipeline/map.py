@@ -8,7 +8,6 @@ import logging
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.loop_closure.loop_keyframes import Keyframe, reposed
-from slam_graph.loop_closure.loop_pose_graph import stacked
 from slam_graph.loop_closure.loop_verification import Loop
 from slam_graph.maps.map_building import build_map
 from slam_graph.maps.map_model import MapRecording, PoseSource, SlamMap
@@ -82,5 +81,5 @@ def _best_poses(
         return "loop_closed", result.loops.poses
     if result.final_ba is not None:
         smoothed = reposed(keyframes, result.final_ba.trajectory)
-        return "smoothed", stacked([k.world_T_body for k in smoothed])
-    return "causal", stacked([k.world_T_body for k in keyframes])
+        return "smoothed", Poses.from_gtsam([k.world_T_body for k in smoothed])
+    return "causal", Poses.from_gtsam([k.world_T_body for k in keyframes])

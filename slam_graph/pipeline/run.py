@@ -162,6 +162,11 @@ def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:
     """Front end and reader of the recording."""
     config = asked.config
     frontend = build_frontend(
-        asked.rig, config.frontend, config.seed, sequence.diagnostics, asked.info.content
+        asked.rig,
+        config.frontend,
+        config.seed,
+        sequence.diagnostics,
+        asked.info.content,
+        config.backend.noise.gravity,
     )
     return Tracking(packets_of(sequence, asked), frontend, config.overlap)

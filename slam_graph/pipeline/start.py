@@ -99,7 +99,7 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
         stamp_ns,
         near.pose(middle),
         velocity,
-        np.zeros(3) if near.gyro_biases is None else near.gyro_biases[middle],
-        np.zeros(3) if near.accel_biases is None else near.accel_biases[middle],
-        np.diag(np.repeat(np.square(sigmas), 3)),
+        accel_bias=np.zeros(3) if near.accel_biases is None else near.accel_biases[middle],
+        gyro_bias=np.zeros(3) if near.gyro_biases is None else near.gyro_biases[middle],
+        covariance=np.diag(np.repeat(np.square(sigmas), 3)),
     )

@@ -15,8 +15,8 @@ from types import FrameType
 
 import numpy as np
 
-from slam_graph.backend.build_estimator import EstimatorLike
 from slam_graph.backend.cost.gating import Innovations
+from slam_graph.backend.estimator import Estimator
 from slam_graph.config import LimitsConfig
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry.trajectory import NavState
@@ -114,7 +114,7 @@ class Agreement:
 
 
 @contextmanager
-def outcome(result: RunResult, estimator: EstimatorLike) -> Iterator[None]:
+def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
     """Run the block and note in the result how it ended; `RunResult.check` raises it later."""
     began = time.perf_counter()
     ending = result.ending
@@ -138,7 +138,7 @@ def outcome(result: RunResult, estimator: EstimatorLike) -> Iterator[None]:
     logger.log(level, "%s", ending.message or done)
 
 
-def _judge(result: RunResult, estimator: EstimatorLike) -> None:
+def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked, ending = result.config.min_coverage, result.ending
     if not estimator.initialized:

@@ -84,7 +84,7 @@ class Tracking:
         """Read and track the next packet; None at the end."""
         clock = Stopwatch()
         if feedback is not None:
-            self._frontend.hear(feedback)
+            self._frontend.receive_feedback(feedback)
         packet = next(self._packets, None)
         if packet is None:
             return None

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether an optimum of a pose graph is the global one: a dual certificate, after SE-Sync.
+"""Certificate of global optimality of a pose graph: the dual bound of SE-Sync.
 
 For a stationary point X of F = tr(X M Xᵀ) let Λ be the block-diagonal multipliers of R_iᵀ R_i = I
 and S = M - Λ. For all rotations Y, with the translations that fit them best,
 
     F(Y) = tr(Y S Yᵀ) + tr Λ  ≥  tr Λ + d n λ,        tr Λ = F(X),
 
-where λ is the smallest eigenvalue of S after the translations are eliminated. It is never positive,
-as S X = 0. If it is zero, nothing is better than X (Rosen, Carlone, Bandeira and Leonard 2019).
+where λ is the smallest eigenvalue of S after elimination of the translations. It is never positive,
+because S X = 0. If it is zero, X is a global optimum (Rosen, Carlone, Bandeira and Leonard 2019).
 
-The certificate is one of SE-Sync's objective, not of GTSAM's: both are small at the same places,
-but their minima differ by the noise. So the estimate is first led to the minimum of F next to it,
-by Newton's method, and what is certified is that minimum.
+The certificate holds for SE-Sync's objective, not for GTSAM's: the two nearly agree, but their
+minima differ by the noise. So Newton's method first moves the estimate to the next minimum of F,
+and that minimum is certified.
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.solve.damped_steps import (
+    Attempt,
+    StepSettings,
+    TenfoldDamping,
+    levenberg_marquardt,
+)
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.chordal import (
     chordal_cost,
@@ -35,18 +41,21 @@ from slam_graph.pose_graph.chordal import (
 )
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
-RELATIVE_GAP = 1e-6
-"""An optimum counts as global if nothing can be better by more than this part of it …"""
-GAP_PER_EDGE = 1e-9
-"""… and this for each edge, which is what counts if all edges agree exactly."""
+__all__ = ["Certificate", "certify"]
 
-ROUNDING = 1e-12
-"""Where F promises to fall by no more than this part of it, it is a minimum."""
+_RELATIVE_GAP = 1e-6
+"""An optimum is global if no poses can have an F lower by more than this part of it, plus …"""
+_GAP_PER_EDGE = 1e-9
+"""… this for each edge, which decides if all edges agree exactly (F = 0)."""
 
-MAX_NEWTON_STEPS = 50
-MAX_DAMPING = 1e6
+_ROUNDING = 1e-12
+"""A step that is predicted to lower F by no more than this part of it has reached the minimum."""
 
-GENERATORS = {
+_MAX_ATTEMPTS = 100
+_FIRST_DAMPING, _MAX_DAMPING = 1e-6, 1e6
+"""Relative to the mean of the diagonal of the Hessian."""
+
+_GENERATORS = {
     2: np.array([[[0.0, -1.0], [1.0, 0.0]]]),
     3: np.array(
         [
@@ -56,21 +65,21 @@ GENERATORS = {
         ]
     ),
 }
-"""Derivatives of rotations by their tangents, (p, d, d)."""
+"""Generators of SO(d), (p, d, d)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """What is known of the global optimum of SE-Sync's objective.
+    """A bound on the global optimum of SE-Sync's objective F.
 
     Attributes:
-        certified: whether `poses` are the global optimum, to within the gap.
+        certified: whether `poses` are the global optimum, up to rounding.
         objective: F at `poses`.
-        bound: no poses have a lower F than this.
-        smallest_eigenvalue: λ; zero to within rounding if `poses` are optimal.
-        poses: the minimum of F next to the estimate.
-        moved_m, moved_deg: root-mean-square way from the estimate to `poses`.
-        newton_steps: steps that it took.
+        bound: lower bound of F over all poses.
+        smallest_eigenvalue: λ; zero up to rounding if `poses` are optimal.
+        poses: the local minimum of F that Newton's method reaches from the estimate.
+        moved_m, moved_deg: root-mean-square distance of `poses` from the estimate.
+        newton_steps: number of Newton steps.
     """
 
     certified: bool
@@ -84,67 +93,92 @@ class Certificate:
 
     @property
     def gap(self) -> float:
-        """By how much F could be lower, at most."""
+        """The most by which F could be lower than at `poses`."""
         return max(self.objective - self.bound, 0.0)
 
 
 def certify(graph: PoseGraph, estimate: Poses) -> Certificate:
-    """Lead an estimate to the next minimum of SE-Sync's objective, and bound what could be better.
+    """Move an estimate to the next minimum of SE-Sync's objective, and bound F from below.
 
     Raises:
         EstimationError: if the smallest eigenvalue cannot be found.
     """
     B = whitened_rows(graph)
-    poses, steps = refine(graph, B, estimate)
-    S, trace = dual(B, poses)
-    smallest = smallest_eigenvalue(S, graph)
+    poses, steps = _refine(graph, B, estimate)
+    S, trace = _dual(B, poses)
+    smallest = _smallest_eigenvalue(S, graph)
     objective = chordal_cost(graph, poses)
     bound = trace + min(smallest, 0.0) * graph.dimension * len(poses)
-    allowed = RELATIVE_GAP * objective + GAP_PER_EDGE * len(graph.edges)
-    way = estimate.inverse().compose(poses).in_space()
+    allowed = _RELATIVE_GAP * objective + _GAP_PER_EDGE * len(graph.edges)
+    moved = estimate.inverse().compose(poses).in_space()
     return Certificate(
         certified=objective - bound <= allowed,
         objective=objective,
         bound=bound,
         smallest_eigenvalue=smallest,
         poses=poses,
-        moved_m=float(np.sqrt(np.mean(np.sum(way.translations**2, axis=1)))),
+        moved_m=float(np.sqrt(np.mean(np.sum(moved.translations**2, axis=1)))),
         moved_deg=float(
-            np.degrees(np.sqrt(np.mean(Rotation.from_matrix(way.rotations).magnitude() ** 2)))
+            np.degrees(np.sqrt(np.mean(Rotation.from_matrix(moved.rotations).magnitude() ** 2)))
         ),
         newton_steps=steps,
     )
 
 
-def refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
-    """The minimum of SE-Sync's objective next to given poses, and the steps to it.
+def _refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
+    """The local minimum of SE-Sync's objective next to given poses, and the number of steps.
 
-    Newton's method with the exact Riemannian Hessian, which is S on the tangents; damped where that
+    Newton's method with the exact Riemannian Hessian, which is S in the tangents; damped where it
     is not positive definite or a step does not lower F.
     """
-    free = _free_tangents(graph)
-    cost, damping = chordal_cost(graph, poses), 0.0
-    for step in range(MAX_NEWTON_STEPS):
-        gradient, hessian = _derivatives(B, poses, free)
-        scale = hessian.diagonal().mean()
-        while True:
-            lu = _positive_factors(hessian + damping * scale * identity(len(free), format="csc"))
-            if lu is not None:
-                way = lu.solve(gradient)
-                moved = _retracted(poses, -way, free)
-                lower = chordal_cost(graph, moved)
-                if lower < cost:
-                    break
-                if gradient @ way <= ROUNDING * cost:
-                    return poses, step
-            if damping > MAX_DAMPING:
-                return poses, step
-            damping = max(10.0 * damping, 1e-6)
-        poses, cost, damping = moved, lower, damping / 100.0 if damping > 1e-5 else 0.0
-    return poses, MAX_NEWTON_STEPS
+    problem = _Chordal(graph, B, poses)
+
+    def converged(attempt: Attempt) -> bool:
+        return not attempt.accepted and attempt.predicted <= _ROUNDING * attempt.before
+
+    damping = TenfoldDamping(
+        _FIRST_DAMPING, _MAX_DAMPING, relief=0.01, negligible=10.0 * _FIRST_DAMPING
+    )
+    steps = levenberg_marquardt(problem, StepSettings(_MAX_ATTEMPTS, converged), damping)
+    return problem.poses, steps.accepted
 
 
-def dual(B: csr_matrix, poses: Poses) -> tuple[csc_matrix, float]:
+class _Chordal:
+    """SE-Sync's objective as `levenberg_marquardt` takes it (see `DampedProblem`).
+
+    Attributes:
+        poses: the current estimates.
+    """
+
+    def __init__(self, graph: PoseGraph, B: csr_matrix, poses: Poses) -> None:
+        self.poses = self._before = poses
+        self._graph, self._B, self._free = graph, B, _free_tangents(graph)
+
+    def value(self) -> float:
+        return chordal_cost(self._graph, self.poses)
+
+    def linearize(self) -> None:
+        self._gradient, self._hessian = _derivatives(self._B, self.poses, self._free)
+
+    def solve(self, damping: float) -> float:
+        scale = self._hessian.diagonal().mean()
+        lu = _positive_factors(
+            self._hessian + damping * scale * identity(len(self._free), format="csc")
+        )
+        if lu is None:
+            return np.inf
+        self._step = -lu.solve(self._gradient)
+        return float(-self._gradient @ self._step)
+
+    def apply(self) -> None:
+        self._before = self.poses
+        self.poses = _retracted(self.poses, self._step, self._free)
+
+    def undo(self) -> None:
+        self.poses = self._before
+
+
+def _dual(B: csr_matrix, poses: Poses) -> tuple[csc_matrix, float]:
     """S = M - Λ for given poses, and the trace of Λ; M = Bᵀ B."""
     n = len(poses)
     slopes = unstacked(_slope(B, poses)).rotations
@@ -156,20 +190,20 @@ def dual(B: csr_matrix, poses: Poses) -> tuple[csc_matrix, float]:
 
 
 def _slope(B: csr_matrix, poses: Poses) -> FloatArray:
-    """X M, (d, n + dn), by way of the residuals X Bᵀ, which keeps small ones exact."""
+    """X M, (d, n + dn), computed from the residuals X Bᵀ, so that small ones stay exact."""
     slope: FloatArray = ((B @ stacked(poses).T).T) @ B
     return slope
 
 
-def smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
-    """λ: the smallest eigenvalue of S over rotations, translations being what fits them best.
+def _smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
+    """λ: the smallest eigenvalue of S over the rotations, with the translations eliminated.
 
-    S with η on the diagonal of its rotations is factorised; the signs of its pivots tell whether λ
-    is above -η (Sylvester's law of inertia). From the first η that is enough, Lanczos' method on
-    the inverse finds λ itself.
+    S with η added to the diagonal of its rotations is factorised; the signs of its pivots tell
+    whether λ > -η (Sylvester's law of inertia). With the first η for which this holds, Lanczos'
+    method on the inverse finds λ itself.
 
     Raises:
-        EstimationError: if no η is enough.
+        EstimationError: if it holds for no η.
     """
     n = len(graph.keys)
     kept = np.setdiff1d(np.arange(S.shape[0]), graph.anchors)
@@ -198,7 +232,7 @@ def smallest_eigenvalue(S: csc_matrix, graph: PoseGraph) -> float:
 
 
 def _positive_factors(matrix: csc_matrix) -> SuperLU | None:
-    """The factors of a symmetric matrix, or None if it is not positive definite.
+    """The LU factors of a symmetric matrix, or None if it is not positive definite.
 
     With pivots on the diagonal their signs are those of the eigenvalues (Sylvester's law of
     inertia).
@@ -212,7 +246,7 @@ def _positive_factors(matrix: csc_matrix) -> SuperLU | None:
 
 
 def _free_tangents(graph: PoseGraph) -> IntArray:
-    """Columns of the tangents that are not held: all but those of the anchors."""
+    """Columns of the tangents that are not fixed: all but those of the anchors."""
     d, n = graph.dimension, len(graph.keys)
     p = d * (d - 1) // 2
     held = np.concatenate(
@@ -225,8 +259,8 @@ def _free_tangents(graph: PoseGraph) -> IntArray:
 
 
 def _derivatives(B: csr_matrix, poses: Poses, free: IntArray) -> tuple[FloatArray, csc_matrix]:
-    """Half the gradient and half the Hessian of F by the free tangents."""
-    S, _ = dual(B, poses)
+    """Half the gradient and half the Hessian of F in the free tangents."""
+    S, _ = _dual(B, poses)
     slope = _slope(B, poses)
     gradient, hessian = 0.0, 0.0
     for row, tangents in enumerate(_tangents(poses)):
@@ -237,9 +271,9 @@ def _derivatives(B: csr_matrix, poses: Poses, free: IntArray) -> tuple[FloatArra
 
 
 def _tangents(poses: Poses) -> list[csc_matrix]:
-    """For each row of X its derivative by (δt, ω), R_i ← R_i exp(ω): d of (n + dn, dn + pn)."""
+    """Derivatives of the d rows of X by (δt, ω), with R_i ← R_i exp(ω): each (n + dn, dn + pn)."""
     n, d = len(poses), poses.dimension
-    turned = np.einsum("nij,ajk->nika", poses.rotations, GENERATORS[d])
+    turned = np.einsum("nij,ajk->nika", poses.rotations, _GENERATORS[d])
     p = turned.shape[-1]
     of_t = np.arange(n)
     rows = n + d * of_t[:, None, None] + np.arange(d)[:, None] + np.zeros(p, int)
@@ -256,7 +290,7 @@ def _tangents(poses: Poses) -> list[csc_matrix]:
 
 
 def _retracted(poses: Poses, step: FloatArray, free: IntArray) -> Poses:
-    """Poses moved by free tangents."""
+    """Poses moved by an increment of the free tangents."""
     n, d = len(poses), poses.dimension
     p = d * (d - 1) // 2
     full = np.zeros((d + p) * n)

@@ -4,10 +4,10 @@
 
     F(t, R) = Σ κ ‖R_j - R_i R_ij‖² + τ ‖t_j - t_i - R_i t_ij‖²  =  tr(X M Xᵀ),   X = [t | R]
 
-with X of shape d × (n + dn): the n translations, then the n rotations side by side. κ and τ are the
-isotropic noise that fits an information matrix best, as SE-Sync reads g2o files (Rosen, Carlone,
-Bandeira and Leonard 2019). With isotropic information F is about χ² in 3D; in 2D its rotations
-count twice.
+with X of shape d × (n + dn): the n translations, then the n rotations side by side. κ and τ are
+the isotropic precisions that fit an information matrix best, as SE-Sync reads g2o files (Rosen,
+Carlone, Bandeira and Leonard 2019). With isotropic information F approximates χ² in 3D; in 2D its
+rotations count twice.
 """
 
 from __future__ import annotations
@@ -18,6 +18,17 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
+
+__all__ = [
+    "chordal_cost",
+    "factorized",
+    "nearest_rotations",
+    "rotation_rows",
+    "stacked",
+    "translation_rows",
+    "unstacked",
+    "whitened_rows",
+]
 
 
 def translation_rows(graph: PoseGraph, τ: FloatArray) -> csr_matrix:
@@ -51,7 +62,7 @@ def rotation_rows(graph: PoseGraph, κ: FloatArray) -> csr_matrix:
 
 
 def _rotation_columns(index: IntArray, n: int, d: int) -> IntArray:
-    """(M, d) columns of the rotations of some poses."""
+    """(M, d) columns of X that hold the rotations of some poses."""
     columns: IntArray = n + d * index[:, None] + np.arange(d)
     return columns
 
@@ -88,7 +99,7 @@ def chordal_cost(graph: PoseGraph, poses: Poses) -> float:
 
 
 def nearest_rotations(matrices: FloatArray) -> FloatArray:
-    """(N, d, d) rotations next to matrices in the Frobenius norm."""
+    """(N, d, d) rotations nearest to given matrices in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(matrices)
     U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]
     rotations: FloatArray = U @ Vt
@@ -96,7 +107,7 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
 
 
 def factorized(matrix: csc_matrix) -> SuperLU:
-    """A symmetric sparse matrix in factors L U, with pivots on the diagonal."""
+    """LU factors of a symmetric sparse matrix, with pivots on the diagonal."""
     return splu(
         csc_matrix(matrix),
         permc_spec="MMD_AT_PLUS_A",

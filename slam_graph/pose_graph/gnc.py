@@ -1,14 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Graduated non-convexity: which loop closures are false, decided while the poses are estimated.
+"""Graduated non-convexity (GNC): loop closures are classified while the poses are estimated.
 
-Yang, Antonante, Tzoumas and Carlone 2020, with truncated least squares: weights of the edges and
-poses take turns. With μ small all edges count a little, whatever their residual; as μ grows,
-weights part into 0 and 1 at the χ² bound. Two things are done otherwise. Between two updates of the
-weights there is one Gauss-Newton step, and edges without weight are not in it, which keeps the
-problem sparse. And where loop closures confirm each other (`loop_consistency.py`) the first poses
-are the optimum of these alone, and μ starts larger: from odometry, hundreds of false loop closures
-lead into wrong minima.
+Yang, Antonante, Tzoumas and Carlone 2020, with truncated least squares: updates of the edge weights
+and of the poses alternate. With small μ all edges have some weight, whatever their residual; as μ
+grows, the weights separate into 0 and 1 at the χ² bound. There are two differences to the paper:
+
+- There is one Gauss-Newton step between two updates of the weights, and edges of zero weight are
+  left out of it, which keeps the problem sparse.
+- Where loop closures confirm each other (`loop_consistency.py`), the first poses are the optimum of
+  these alone, and μ starts larger. From odometry, hundreds of false loop closures would lead into
+  wrong minima.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.pose_graph.graph import PoseGraph, Poses
-from slam_graph.pose_graph.graph_cost import suspected, true_bound
+from slam_graph.pose_graph.graph_cost import inlier_bound, uncertain_edges
 from slam_graph.pose_graph.graph_initialization import along_tree, initialize, tree_edges
 from slam_graph.pose_graph.gtsam_graph import (
     anchor_factors,
@@ -35,43 +37,47 @@ from slam_graph.pose_graph.gtsam_graph import (
 from slam_graph.pose_graph.loop_consistency import confirmed_loops
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
-CONTROL_FACTOR = 1.4
+__all__ = ["graduated_nonconvexity", "truncated_weights"]
+
+_CONTROL_FACTOR = 1.4
 """Growth of μ from one update of the weights to the next, as in the paper."""
 
-CONTROL_AFTER_CONFIRMATION = 0.1
-"""First μ if there are confirmed loop closures: residuals of up to 3.3 times the bound count."""
+_CONTROL_AFTER_CONFIRMATION = 0.1
+"""First μ with confirmed loop closures: residuals of up to 3.3 times the bound have weight."""
 
-MAX_UPDATES = 100
+_MAX_UPDATES = 100
 
-LEAST_TREE_WEIGHT = 1e-6
-"""What a suspected edge keeps that holds the graph together."""
+_MIN_TREE_WEIGHT = 1e-6
+"""Least weight of an uncertain edge without which the graph would not be connected."""
 
 
 def graduated_nonconvexity(
     graph: PoseGraph, policy: PoseGraphCostPolicy, diagnostics: Diagnostics
 ) -> tuple[Poses, FloatArray]:
-    """Poses, and weights (M,) of the edges: 1 if it is true and 0 if it is false.
+    """Poses, and weights (M,) of the edges: 1 for inliers, 0 for outliers.
 
     Raises:
         RuntimeError: if a step has no solution.
     """
-    bound = true_bound(graph, policy)
-    suspects = suspected(graph, policy)
+    bound = inlier_bound(graph, policy)
+    uncertain = uncertain_edges(graph, policy)
     weights, least = np.ones(len(graph.edges)), np.zeros(len(graph.edges))
-    least[tree_edges(graph)] = LEAST_TREE_WEIGHT
+    least[tree_edges(graph)] = _MIN_TREE_WEIGHT
     plain, anchors = edge_factors(graph, range(len(graph.edges))), anchor_factors(graph)
     values, control = _start(graph, policy, anchors, diagnostics)
-    for _ in range(MAX_UPDATES):
-        squared = edge_chi2(plain, values)[suspects]
+    for _ in range(_MAX_UPDATES):
+        squared = edge_chi2(plain, values)[uncertain]
         if control is None:
             control = bound / max(2.0 * squared.max(initial=0.0) - bound, 1e-3 * bound)
-        weights[suspects] = truncated_weights(squared, bound, control)
+        weights[uncertain] = truncated_weights(squared, bound, control)
         if np.isin(weights, (0.0, 1.0)).all():
             break
-        control *= CONTROL_FACTOR
+        control *= _CONTROL_FACTOR
         values = _step(graph, np.maximum(weights, least), anchors, values)
     else:
-        diagnostics.warn("pose_graph_gnc_undecided", f"{graph.name}: some weights are not 0 or 1")
+        diagnostics.warn(
+            "pose_graph_gnc_undecided", f"{graph.name}: gnc ended with weights other than 0 and 1"
+        )
     rejected = int(np.count_nonzero(weights < 0.5))
     if rejected:
         diagnostics.counts["pose_graph_edge_rejected"] += rejected
@@ -83,7 +89,7 @@ def truncated_weights(squared: FloatArray, bound: float, control: float) -> Floa
 
     Args:
         squared: squared whitened residuals.
-        bound: the square of the largest residual of a true edge.
+        bound: the largest squared residual of an inlier.
         control: μ.
     """
     between = np.sqrt(bound * control * (control + 1.0) / np.maximum(squared, 1e-300)) - control
@@ -99,19 +105,19 @@ def _start(
     anchors: list[gtsam.NonlinearFactor],
     diagnostics: Diagnostics,
 ) -> tuple[gtsam.Values, float | None]:
-    """First poses, and the first μ if it does not depend on residuals."""
+    """Initial poses, and the first μ, or None where it follows from the residuals."""
     if policy.initialization != "auto":
         return values_of(initialize(graph, policy.initialization, diagnostics)), None
     if not policy.trust_odometry:
         return values_of(initialize(graph, "chordal", diagnostics)), None
     along = along_tree(graph)
-    confirmed = confirmed_loops(graph, along, true_bound(graph, policy))
+    confirmed = confirmed_loops(graph, along, inlier_bound(graph, policy))
     if len(confirmed) == 0:
         return values_of(along), None
     weights = graph.is_odometry.astype(float)
     weights[np.concatenate([confirmed, tree_edges(graph)])] = 1.0
     poses = initialize(graph.keep_edges(weights > 0), "chordal", diagnostics)
-    return _step(graph, weights, anchors, values_of(poses)), CONTROL_AFTER_CONFIRMATION
+    return _step(graph, weights, anchors, values_of(poses)), _CONTROL_AFTER_CONFIRMATION
 
 
 def _step(
@@ -120,25 +126,25 @@ def _step(
     anchors: list[gtsam.NonlinearFactor],
     values: gtsam.Values,
 ) -> gtsam.Values:
-    """One step on the edges that have a weight."""
+    """One Gauss-Newton step on the edges of positive weight; damped if the problem is singular."""
     rows = np.flatnonzero(weights > 0)
     weighted = graph.keep_edges(rows).weighted(weights[rows])
     factors = factor_graph([*edge_factors(weighted, range(len(rows))), *anchors])
     try:
-        return _iterated(gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams(), factors, values)
+        return _one_step(gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams(), factors, values)
     except RuntimeError:  # too poorly conditioned without damping
-        return _iterated(
+        return _one_step(
             gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), factors, values
         )
 
 
-def _iterated(
+def _one_step(
     optimizer_of: Callable[..., Any],
     parameters: Any,
     factors: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
 ) -> gtsam.Values:
-    """One step of one of GTSAM's optimizers."""
+    """The values after one step of an optimizer of GTSAM."""
     parameters.setOrderingType("COLAMD")
     optimizer = optimizer_of(factors, values, parameters)
     optimizer.iterate()

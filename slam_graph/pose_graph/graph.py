@@ -3,30 +3,33 @@
 """A pose graph as arrays: poses, and measured relative poses between them, in 2D or 3D.
 
 Conventions: a pose is world_T_pose. An edge (i, j) measures i_T_j = world_T_i⁻¹ world_T_j.
-Information matrices are in the order of files, translation before rotation. g2o means that of a 3D
-rotation for the vector part of the quaternion, about half the angle; GTSAM and most programs that
-read these files take it for the angle. Which one is meant goes with the graph.
+Information matrices have the order of the files, translation before rotation. In g2o that of a 3D
+rotation belongs to the vector part of the quaternion, about half the angle; GTSAM and most programs
+that read these files take it as that of the angle. `PoseGraph.rotation_information` says which.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
+import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry.trajectory import Trajectory
+
+__all__ = ["PoseGraph", "Poses", "RotationInformation"]
 
 RotationInformation = Literal["angle", "quaternion"]
 
-MAX_STAMP_S = 9_000_000_000
-"""Ids of poses beyond this do not fit into nanoseconds as seconds."""
+_MAX_STAMP_S = 9_000_000_000
+"""Larger ids, taken as seconds, do not fit into nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,12 +52,12 @@ class Poses:
         """2 or 3."""
         return int(self.translations.shape[1])
 
-    def select(self, index: IntArray) -> Poses:
+    def select(self, index: IntArray | BoolArray) -> Poses:
         """Some of the poses."""
         return Poses(self.rotations[index], self.translations[index])
 
     def compose(self, other: Poses) -> Poses:
-        """Each pose times that of the same row."""
+        """Each pose composed with the pose of the same row."""
         moved = np.einsum("nij,nj->ni", self.rotations, other.translations)
         return Poses(self.rotations @ other.rotations, self.translations + moved)
 
@@ -65,18 +68,35 @@ class Poses:
 
     @staticmethod
     def identity(count: int, dimension: int) -> Poses:
-        """So many poses at the origin."""
+        """Identity poses."""
         return Poses(np.tile(np.eye(dimension), (count, 1, 1)), np.zeros((count, dimension)))
 
+    @staticmethod
+    def from_gtsam(poses: Sequence[gtsam.Pose3]) -> Poses:
+        """Poses of GTSAM as arrays."""
+        matrices = np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4)
+        return Poses(matrices[:, :3, :3], matrices[:, :3, 3])
+
+    def pose3(self, row: int) -> gtsam.Pose3:
+        """One of the poses (in 3D) for GTSAM."""
+        return gtsam.Pose3(gtsam.Rot3(self.rotations[row]), self.translations[row])
+
+    def concatenated(self, other: Poses) -> Poses:
+        """These poses, followed by others."""
+        return Poses(
+            np.concatenate([self.rotations, other.rotations]),
+            np.concatenate([self.translations, other.translations]),
+        )
+
     def angles(self) -> FloatArray:
-        """(N,) angle of each rotation in radians; in 2D with its sign."""
+        """(N,) angle of each rotation in radians, in 2D with its sign."""
         if self.dimension == 2:
             return np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
         angles: FloatArray = Rotation.from_matrix(self.rotations).magnitude()
         return angles
 
     def in_space(self) -> Poses:
-        """The same poses in 3D, on the plane z = 0 if they are in 2D."""
+        """The same poses in 3D; 2D poses lie on the plane z = 0."""
         if self.dimension == 3:
             return self
         rotations = np.tile(np.eye(3), (len(self), 1, 1))
@@ -90,12 +110,12 @@ class PoseGraph:
 
     Attributes:
         keys: (N,) ids of the poses in the file, increasing.
-        estimates: poses that came with the graph, or None.
+        estimates: initial estimates of the file, or None.
         edges: (M, 2) rows of the two poses of each edge.
         measured: M relative poses i_T_j.
         information: (M, k, k), k = 3 in 2D and 6 in 3D: translation, then rotation.
-        rotation_information: what that of a 3D rotation belongs to: the angle (GTSAM), or the
-            vector part of the quaternion (g2o).
+        rotation_information: whether the information of a 3D rotation belongs to the angle (GTSAM)
+            or to the vector part of the quaternion (g2o).
         name: of the graph.
     """
 
@@ -119,7 +139,7 @@ class PoseGraph:
 
     @property
     def angle_information(self) -> FloatArray:
-        """(M, k, k) information of the translation and the angle, to first order."""
+        """(M, k, k) information of the translation and the rotation angle, to first order."""
         if self.dimension == 2 or self.rotation_information == "angle":
             return self.information
         half = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
@@ -128,9 +148,9 @@ class PoseGraph:
 
     @cached_property
     def precisions(self) -> tuple[FloatArray, FloatArray]:
-        """Isotropic precisions that fit the information best: κ of rotations, τ of translations.
+        """Isotropic precisions (M,) that fit the information best, as in SE-Sync (`chordal.py`).
 
-        Each (M,), as SE-Sync has them (`chordal_objective.py`).
+        κ of the rotations and τ of the translations.
         """
         d, information = self.dimension, self.angle_information
         τ = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)
@@ -140,14 +160,14 @@ class PoseGraph:
         return κ, τ
 
     @property
-    def is_odometry(self) -> NDArray[np.bool_]:
-        """(M,) whether an edge joins a pose to the next one; all others are loop closures."""
-        consecutive: NDArray[np.bool_] = np.abs(np.diff(self.edges, axis=1))[:, 0] == 1
+    def is_odometry(self) -> BoolArray:
+        """(M,) whether an edge joins consecutive poses; all others are loop closures."""
+        consecutive: BoolArray = np.abs(np.diff(self.edges, axis=1))[:, 0] == 1
         return consecutive
 
     @cached_property
     def components(self) -> IntArray:
-        """(N,) number of the connected part that each pose belongs to."""
+        """(N,) number of the connected component of each pose."""
         n, (i, j) = len(self.keys), self.edges.T
         links = coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
         labels: IntArray = connected_components(links, directed=False)[1].astype(np.int64)
@@ -155,43 +175,40 @@ class PoseGraph:
 
     @cached_property
     def anchors(self) -> IntArray:
-        """Row of the first pose of each connected part: it defines the part's frame."""
+        """Row of the first pose of each connected component: it defines the frame."""
         return np.unique(self.components, return_index=True)[1].astype(np.int64)
 
     def anchor_poses(self) -> Poses:
-        """Where the first pose of each connected part is held."""
+        """The fixed poses of the anchors."""
         if self.estimates is None:
             return Poses.identity(len(self.anchors), self.dimension)
         return self.estimates.select(self.anchors)
 
-    def keep_edges(self, kept: NDArray[np.bool_] | IntArray) -> PoseGraph:
-        """The graph with all poses and only some of its edges."""
+    def keep_edges(self, kept: BoolArray | IntArray) -> PoseGraph:
+        """The graph with all poses and some of its edges."""
         return replace(
             self,
             edges=self.edges[kept],
-            measured=Poses(self.measured.rotations[kept], self.measured.translations[kept]),
+            measured=self.measured.select(kept),
             information=self.information[kept],
         )
 
     def weighted(self, weights: FloatArray) -> PoseGraph:
-        """The graph with factors (M,) on the information of its edges."""
+        """The graph with the information of its edges multiplied by weights (M,)."""
         return replace(self, information=self.information * weights[:, None, None])
 
     def add_edges(self, edges: IntArray, measured: Poses, information: FloatArray) -> PoseGraph:
-        """The graph with further edges behind its own."""
+        """The graph with edges appended."""
         return replace(
             self,
             edges=np.concatenate([self.edges, edges]),
-            measured=Poses(
-                np.concatenate([self.measured.rotations, measured.rotations]),
-                np.concatenate([self.measured.translations, measured.translations]),
-            ),
+            measured=self.measured.concatenated(measured),
             information=np.concatenate([self.information, information]),
         )
 
     def trajectory(self, poses: Poses) -> Trajectory:
-        """Poses as a trajectory: the id of a pose (or its row, if ids are too large) in seconds."""
-        fits = np.abs(self.keys).max(initial=0) <= MAX_STAMP_S
+        """Poses as a trajectory; times are ids (or rows, if ids are too large) in seconds."""
+        fits = np.abs(self.keys).max(initial=0) <= _MAX_STAMP_S
         seconds = self.keys if fits else np.arange(len(self.keys))
         space = poses.in_space()
         quaternions = Rotation.from_matrix(space.rotations).as_quat()

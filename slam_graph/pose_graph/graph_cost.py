@@ -4,8 +4,8 @@
 
     c = ½ Σ ρ(‖Log(i_T_j⁻¹ T_i⁻¹ T_j)‖²_Ω)
 
-over all edges, with a robust loss ρ on loop closures if one is asked for. The first pose of each
-connected part is held by a prior, which defines the frame and costs nothing at a minimum.
+over all edges, with a robust loss ρ on loop closures if one is chosen. A prior on the first pose of
+each connected component fixes the gauge; it is zero at a minimum.
 """
 
 from __future__ import annotations
@@ -30,17 +30,26 @@ from slam_graph.pose_graph.gtsam_graph import (
 )
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
+__all__ = [
+    "PoseGraphCost",
+    "chi2_table",
+    "construct",
+    "inlier_bound",
+    "loss_weights",
+    "uncertain_edges",
+]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraphCost:
-    """A cost over all poses of a graph.
+    """The cost of a pose graph.
 
     Attributes:
         graph: the pose graph.
-        policy: what is robust about it.
+        policy: the robust loss.
         rows: (K,) rows of the edges that are in the cost.
         edges: their K factors.
-        anchors: priors that define the frame.
+        anchors: priors that fix the gauge.
     """
 
     graph: PoseGraph
@@ -59,50 +68,50 @@ def construct(graph: PoseGraph, policy: PoseGraphCostPolicy, weights: FloatArray
 
     Args:
         graph: the pose graph.
-        policy: a robust loss, or none.
-        weights: (M,) factors on the information of the edges; those with none are left out.
+        policy: the robust loss.
+        weights: (M,) factors on the information of the edges; edges of weight 0 are left out.
     """
     rows = np.flatnonzero(weights > 0)
     scaled = graph.keep_edges(rows).weighted(weights[rows])
     factors = edge_factors(scaled, range(len(rows)))
     if policy.robust not in ("none", "gnc"):
-        suspects = suspected(scaled, policy)
-        width = robust_width(graph, policy)
-        robust = edge_factors(scaled, suspects.tolist(), policy.robust, width)
-        for row, factor in zip(suspects.tolist(), robust, strict=True):
+        uncertain = uncertain_edges(scaled, policy)
+        width = _robust_width(graph, policy)
+        robust = edge_factors(scaled, uncertain.tolist(), policy.robust, width)
+        for row, factor in zip(uncertain.tolist(), robust, strict=True):
             factors[row] = factor
     return PoseGraphCost(graph, policy, rows, factors, anchor_factors(graph))
 
 
-def suspected(graph: PoseGraph, policy: PoseGraphCostPolicy) -> IntArray:
-    """Rows of the edges that may be false."""
+def uncertain_edges(graph: PoseGraph, policy: PoseGraphCostPolicy) -> IntArray:
+    """Rows of the edges that may be outliers."""
     return np.flatnonzero(~graph.is_odometry | (not policy.trust_odometry))
 
 
-def robust_width(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
-    """The width of the robust loss: as said, or what true edges stay within."""
+def _robust_width(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
+    """The width of the robust loss: as set, or the bound of inliers."""
     if policy.robust_width is not None:
         return policy.robust_width
-    squared = true_bound(graph, policy)
+    squared = inlier_bound(graph, policy)
     return squared if policy.robust == "dcs" else float(np.sqrt(squared))
 
 
-def true_bound(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
-    """The χ² quantile below which squared residuals of true edges stay."""
+def inlier_bound(graph: PoseGraph, policy: PoseGraphCostPolicy) -> float:
+    """The χ² quantile of the squared residual of an inlier."""
     return float(2.0 * gammaincinv(0.5 * graph.tangent_size, policy.confidence))
 
 
 def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
-    """(K,) weights that the robust loss gives to the edges of a cost, from 0 to 1."""
+    """(K,) weights of the edges of a cost under its robust loss, from 0 to 1."""
     weights = np.ones(len(cost.rows))
     policy = cost.policy
     if policy.robust in ("none", "gnc"):
         return weights
-    estimator = robust_estimator(policy.robust, robust_width(cost.graph, policy))
-    suspects = cost.rows[suspected(cost.graph.keep_edges(cost.rows), policy)]
-    plain = edge_factors(cost.graph, suspects.tolist())
+    estimator = robust_estimator(policy.robust, _robust_width(cost.graph, policy))
+    uncertain = cost.rows[uncertain_edges(cost.graph.keep_edges(cost.rows), policy)]
+    plain = edge_factors(cost.graph, uncertain.tolist())
     lengths = np.sqrt(edge_chi2(plain, values_of(poses)))
-    at = np.searchsorted(cost.rows, suspects)
+    at = np.searchsorted(cost.rows, uncertain)
     weights[at] = [estimator.weight(length) for length in lengths.tolist()]
     return weights
 
@@ -110,12 +119,12 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
 def chi2_table(
     graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
 ) -> dict[str, float]:
-    """What some poses cost in the conventions of three programs.
+    """χ² of some poses in the conventions of three programs.
 
     Args:
         graph: the pose graph.
-        poses: to judge.
-        weights: (M,) of the edges; all 1 if not said.
+        poses: to evaluate.
+        weights: (M,) of the edges; all 1 if not given.
 
     Returns:
         `gtsam_error` ½ Σ ‖Log‖²_Ω and `gtsam_chi2`, twice that; `g2o_chi2`, in 3D with the vector
@@ -128,12 +137,12 @@ def chi2_table(
     return {
         "gtsam_error": 0.5 * float(squared.sum()),
         "gtsam_chi2": float(squared.sum()),
-        "g2o_chi2": g2o_chi2(graph, poses),
+        "g2o_chi2": _g2o_chi2(graph, poses),
         "sesync_objective": chordal_cost(graph, poses),
     }
 
 
-def g2o_chi2(graph: PoseGraph, poses: Poses) -> float:
+def _g2o_chi2(graph: PoseGraph, poses: Poses) -> float:
     """χ² with g2o's residuals: translation, and the angle or the vector part of a quaternion."""
     i, j = graph.edges.T
     error = graph.measured.inverse().compose(poses.select(i).inverse().compose(poses.select(j)))

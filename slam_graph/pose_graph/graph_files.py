@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading and writing pose graphs: g2o files, 2D and 3D, and TORO's.
 
-| line | values behind the ids |
+| line | values after the ids |
 |---|---|
 | `VERTEX_SE2`, `VERTEX2` | x y θ |
 | `VERTEX_SE3:QUAT` | x y z qx qy qz qw |
@@ -12,7 +12,7 @@
 | `EDGE_SE3:QUAT` | x y z qx qy qz qw, upper triangle of the information by rows |
 | `EDGE3` | x y z roll pitch yaw, upper triangle of the information by rows |
 
-What can be wrong with the lines of a pose graph: refused with file and line, or counted.
+Faults that change the problem are refused with file and line; repairs are counted in `Diagnostics`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,92 +29,22 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, parse
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
+from slam_graph.settings.tree import closest
 
-
-def check_numbers(rows: Rows, numbers: FloatArray) -> None:
-    """Make sure that all numbers are finite.
-
-    Raises:
-        DataError: naming the first line where one is not.
-    """
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    if len(bad):
-        raise DataError(f"{rows.where(bad[0])}: a number is not finite")
-
-
-def drop_repeated(rows: Rows, ids: IntArray, diagnostics: Diagnostics) -> IntArray:
-    """The rows of vertices by increasing id, only the first of each id; others are counted."""
-    _, first = np.unique(ids, return_index=True)
-    for row in np.setdiff1d(np.arange(len(ids)), first):
-        diagnostics.warn(
-            "pose_graph_repeated_vertex",
-            f"{rows.where(row)}: vertex {ids[row]} again; its first estimate is used",
-        )
-    return first.astype(np.int64)
-
-
-def rows_of_keys(keys: IntArray, ids: IntArray, rows: Rows) -> IntArray:
-    """(M, 2) rows of the poses that edges refer to by their ids.
-
-    Raises:
-        DataError: naming the line of the first edge to a vertex that is not there.
-    """
-    found = np.minimum(np.searchsorted(keys, ids), len(keys) - 1)
-    missing = np.argwhere(keys[found] != ids)
-    if len(missing):
-        edge, end = missing[0]
-        raise DataError(f"{rows.where(edge)}: edge to vertex {ids[edge, end]}, which is not there")
-    return found.astype(np.int64)
-
-
-def connected(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGraph:
-    """The graph without edges from a pose to itself, checked; parts without a link are counted.
-
-    Raises:
-        DataError: if an information matrix is not positive definite, or no edge is left.
-    """
-    _check_information(graph.information, rows)
-    loops = graph.edges[:, 0] == graph.edges[:, 1]
-    for row in np.flatnonzero(loops).tolist():
-        diagnostics.warn("pose_graph_edge_to_itself", f"{rows.where(row)}: left out")
-    graph = graph.keep_edges(~loops) if loops.any() else graph
-    if len(graph.edges) == 0:
-        raise DataError(f"{rows.path}: no edges between two poses")
-    for part in range(1, len(graph.anchors)):
-        size, key = np.count_nonzero(graph.components == part), graph.keys[graph.anchors[part]]
-        diagnostics.warn(
-            "pose_graph_not_connected",
-            f"{rows.path}: {size} poses from {key} on have no link to the first; "
-            f"pose {key} is held where it is",
-        )
-    return graph
-
-
-def _check_information(information: FloatArray, rows: Rows) -> None:
-    """Make sure that all information matrices are positive definite."""
-    try:
-        np.linalg.cholesky(information)
-    except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(information)[:, 0]
-        edge = int(np.argmin(smallest))
-        raise DataError(
-            f"{rows.where(edge)}: the information matrix is not positive definite "
-            f"(smallest eigenvalue {smallest[edge]:.3g})"
-        ) from None
+__all__ = ["g2o_lines", "read_pose_graph"]
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """What a kind of line holds.
+class _Line:
+    """The format of one kind of line.
 
     Attributes:
         dimension: 2 or 3.
-        ids: 1 of a vertex, 2 of an edge.
-        rotation: how the rotation is written.
-        order: for each entry of the upper triangle of the information, by rows, its place in the
-            file.
+        ids: number of ids: 1 of a vertex, 2 of an edge.
+        rotation: its parametrisation.
+        order: column in the file of each entry of the upper triangle of the information, by rows.
     """
 
     dimension: int
@@ -124,45 +54,45 @@ class Line:
 
     @property
     def pose_size(self) -> int:
-        """How many numbers a pose has."""
+        """Number of values of a pose."""
         return self.dimension + {"angle": 1, "quaternion": 4, "rpy": 3}[self.rotation]
 
     def expected(self) -> str:
-        """The line in words."""
+        """The expected values, for messages."""
         ids = "two ids" if self.ids == 2 else "an id"
         information = f", {len(self.order)} of the information" if self.order else ""
         return f"{ids}, {self.pose_size} numbers of the pose{information}"
 
 
-BY_ROWS_2D = tuple(range(6))
-TORO_2D = (0, 1, 4, 2, 5, 3)
-BY_ROWS_3D = tuple(range(21))
+_BY_ROWS_2D = tuple(range(6))
+_TORO_2D = (0, 1, 4, 2, 5, 3)
+_BY_ROWS_3D = tuple(range(21))
 
-LINES = {
-    "VERTEX_SE2": Line(2, 1, "angle"),
-    "VERTEX2": Line(2, 1, "angle"),
-    "VERTEX_SE3:QUAT": Line(3, 1, "quaternion"),
-    "VERTEX3": Line(3, 1, "rpy"),
-    "EDGE_SE2": Line(2, 2, "angle", BY_ROWS_2D),
-    "EDGE2": Line(2, 2, "angle", TORO_2D),
-    "ODOMETRY": Line(2, 2, "angle", TORO_2D),
-    "EDGE_SE3:QUAT": Line(3, 2, "quaternion", BY_ROWS_3D),
-    "EDGE3": Line(3, 2, "rpy", BY_ROWS_3D),
+_LINES = {
+    "VERTEX_SE2": _Line(2, 1, "angle"),
+    "VERTEX2": _Line(2, 1, "angle"),
+    "VERTEX_SE3:QUAT": _Line(3, 1, "quaternion"),
+    "VERTEX3": _Line(3, 1, "rpy"),
+    "EDGE_SE2": _Line(2, 2, "angle", _BY_ROWS_2D),
+    "EDGE2": _Line(2, 2, "angle", _TORO_2D),
+    "ODOMETRY": _Line(2, 2, "angle", _TORO_2D),
+    "EDGE_SE3:QUAT": _Line(3, 2, "quaternion", _BY_ROWS_3D),
+    "EDGE3": _Line(3, 2, "rpy", _BY_ROWS_3D),
 }
 
 
-QUATERNION_TOLERANCE = 0.1
-"""How far the length of a quaternion may be from 1: files have few digits."""
+_QUATERNION_TOLERANCE = 0.1
+"""Largest deviation of the norm of a quaternion from 1: files have few digits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """All lines of a file that begin with one word.
+class _Block:
+    """All lines of a file of one kind.
 
     Attributes:
-        rows: the lines and their numbers.
+        rows: the lines and their line numbers.
         ids: (L, 1 or 2).
-        poses: of the vertices, or measured.
+        poses: of the vertices, or measurements of the edges.
         information: (L, k, k) of edges; (0, k, k) of vertices.
     """
 
@@ -179,37 +109,47 @@ def read_pose_graph(
 ) -> PoseGraph:
     """Read a pose graph.
 
-    What does not change the problem is repaired and counted in `diagnostics`; lines of unknown
-    kinds are left out and counted.
+    Args:
+        path: of a g2o or TORO file.
+        diagnostics: counts repairs.
+        rotation_information: whether the information of 3D rotations belongs to the angle (GTSAM)
+            or to the vector part of the quaternion (g2o).
+
+    Faults that do not change the problem are repaired and counted in `diagnostics`, and so are
+    lines of unknown kinds, which are skipped.
 
     Raises:
         DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
             has an edge to a missing vertex, numbers that are not finite, or an information matrix
             that is not positive definite.
+        ConfigError: if `rotation_information` is unknown.
     """
+    if rotation_information not in get_args(RotationInformation):
+        hint = closest(str(rotation_information), get_args(RotationInformation))
+        raise ConfigError(f"unknown rotation_information '{rotation_information}'; {hint}")
     path, diagnostics = Path(path), diagnostics or Diagnostics()
     blocks = [_parse(rows, tag) for tag, rows in _by_kind(path, diagnostics).items()]
     vertices = [block for block in blocks if block.ids.shape[1] == 1]
     between = [block for block in blocks if block.ids.shape[1] == 2]
     if not between:
-        raise DataError(f"{path}: no edges; known are lines that begin with {', '.join(LINES)}")
+        raise DataError(f"{path}: no edges; lines may begin with {', '.join(_LINES)}")
     if len({block.poses.dimension for block in blocks}) > 1:
         raise DataError(f"{path}: 2D and 3D poses in one file")
     rows, ids, measured, information = _joined(between)
     keys, estimates = np.unique(ids), None
     if vertices:
         vertex_rows, vertex_ids, poses, _ = _joined(vertices)
-        kept = drop_repeated(vertex_rows, vertex_ids[:, 0], diagnostics)
+        kept = _first_of_each_id(vertex_rows, vertex_ids[:, 0], diagnostics)
         keys, estimates = vertex_ids[kept, 0], poses.select(kept)
-    edges = rows_of_keys(keys, ids, rows)
+    edges = _rows_of_keys(keys, ids, rows)
     graph = PoseGraph(
         keys, estimates, edges, measured, information, rotation_information, path.stem
     )
-    return connected(graph, rows, diagnostics)
+    return _checked(graph, rows, diagnostics)
 
 
 def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
-    """The lines of a file by their first word; unknown ones are counted."""
+    """The lines of a file by their first word; unknown kinds are counted."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
@@ -217,7 +157,7 @@ def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
     kinds: dict[str, Rows] = {}
     for number, line in enumerate(lines, 1):
         tag = line.split(None, 1)[0] if line and not line.isspace() else "#"
-        if tag in LINES:
+        if tag in _LINES:
             rows = kinds.get(tag)
             if rows is None:
                 rows = kinds[tag] = Rows(path, [], [])
@@ -225,36 +165,37 @@ def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
             rows.numbers.append(number)
         elif not tag.startswith("#"):
             diagnostics.warn(
-                "pose_graph_line_ignored", f"{path}:{number}: '{tag[:40]}' is left out"
+                "pose_graph_line_ignored",
+                f"{path}:{number}: '{tag[:40]}' is not a known kind of line; left out",
             )
     return kinds
 
 
-def _parse(rows: Rows, tag: str) -> Block:
-    """Numbers of all lines of one kind."""
-    line = LINES[tag]
+def _parse(rows: Rows, tag: str) -> _Block:
+    """Parse all lines of one kind."""
+    line = _LINES[tag]
     size, entries = line.pose_size, len(line.order)
     if tag in ("EDGE2", "EDGE3") and len(rows.lines[0].split()) == 1 + line.ids + size:
-        entries = 0  # TORO lets the information be left out: it is the identity then
+        entries = 0  # TORO files may omit the information: it is the identity then
     dtype = [("tag", "S16"), ("ids", np.int64, (line.ids,)), ("numbers", float, (size + entries,))]
     table = parse(rows, dtype, f"{tag}, {line.expected()}", delimiter=None)
     ids, numbers = table["ids"], table["numbers"]
-    check_numbers(rows, numbers)
+    _check_numbers(rows, numbers)
     k = 3 * (line.dimension - 1)
     information = np.tile(np.eye(k), (len(ids) if line.ids == 2 else 0, 1, 1))
     if entries:
         information = _information(numbers[:, size:], line.order)
-    return Block(rows, ids, _poses(rows, numbers[:, :size], line), information)
+    return _Block(rows, ids, _poses(rows, numbers[:, :size], line), information)
 
 
 def _information(entries: FloatArray, order: tuple[int, ...]) -> FloatArray:
     """(L, k, k) symmetric matrices from their upper triangles.
 
-    Some writers put the triangle of a 2D edge by rows behind TORO's `EDGE2`: where TORO's order
-    would say that nothing is known of y or θ, it is meant by rows.
+    Some writers use the order by rows in TORO's `EDGE2` too: it is taken where TORO's order would
+    give no information on y or θ.
     """
-    if order == TORO_2D and not (entries[:, 2:4] > 0).any(axis=0).all():
-        order = BY_ROWS_2D
+    if order == _TORO_2D and not (entries[:, 2:4] > 0).any(axis=0).all():
+        order = _BY_ROWS_2D
     k = 3 if len(order) == 6 else 6
     full = np.zeros((len(entries), k, k))
     above = np.triu_indices(k)
@@ -263,8 +204,8 @@ def _information(entries: FloatArray, order: tuple[int, ...]) -> FloatArray:
     return full
 
 
-def _poses(rows: Rows, numbers: FloatArray, line: Line) -> Poses:
-    """Poses from the numbers of a file."""
+def _poses(rows: Rows, numbers: FloatArray, line: _Line) -> Poses:
+    """Poses from the values of a file."""
     translations, angles = numbers[:, : line.dimension], numbers[:, line.dimension :]
     if line.rotation == "angle":
         cos, sin = np.cos(angles[:, 0]), np.sin(angles[:, 0])
@@ -272,14 +213,14 @@ def _poses(rows: Rows, numbers: FloatArray, line: Line) -> Poses:
     if line.rotation == "rpy":
         return Poses(Rotation.from_euler("xyz", angles).as_matrix(), translations)
     length = np.linalg.norm(np.clip(angles, -2.0, 2.0), axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    bad = np.flatnonzero(np.abs(length - 1.0) > _QUATERNION_TOLERANCE)
     if len(bad):
         raise DataError(f"{rows.where(int(bad[0]))}: the quaternion is not of unit length")
     return Poses(Rotation.from_quat(angles).as_matrix(), translations)
 
 
-def _joined(blocks: list[Block]) -> tuple[Rows, IntArray, Poses, FloatArray]:
-    """Blocks as one, in the order of the file."""
+def _joined(blocks: list[_Block]) -> tuple[Rows, IntArray, Poses, FloatArray]:
+    """All blocks as one, in the order of the file."""
     path = blocks[0].rows.path
     numbers = np.concatenate([block.rows.numbers for block in blocks])
     order = np.argsort(numbers, kind="stable")
@@ -295,6 +236,78 @@ def _joined(blocks: list[Block]) -> tuple[Rows, IntArray, Poses, FloatArray]:
         poses.select(order),
         information[order] if len(information) else information,
     )
+
+
+def _check_numbers(rows: Rows, numbers: FloatArray) -> None:
+    """Check that all numbers are finite.
+
+    Raises:
+        DataError: naming the first line where one is not.
+    """
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if len(bad):
+        raise DataError(f"{rows.where(bad[0])}: a number is not finite")
+
+
+def _first_of_each_id(rows: Rows, ids: IntArray, diagnostics: Diagnostics) -> IntArray:
+    """The rows of the vertices, by increasing id; repeated ids are counted."""
+    _, first = np.unique(ids, return_index=True)
+    for row in np.setdiff1d(np.arange(len(ids)), first):
+        diagnostics.warn(
+            "pose_graph_repeated_vertex",
+            f"{rows.where(row)}: vertex {ids[row]} is repeated; its first estimate is used",
+        )
+    return first.astype(np.int64)
+
+
+def _rows_of_keys(keys: IntArray, ids: IntArray, rows: Rows) -> IntArray:
+    """(M, 2) rows of the poses that edges refer to by id.
+
+    Raises:
+        DataError: naming the line of the first edge to a missing vertex.
+    """
+    found = np.minimum(np.searchsorted(keys, ids), len(keys) - 1)
+    missing = np.argwhere(keys[found] != ids)
+    if len(missing):
+        edge, end = missing[0]
+        raise DataError(f"{rows.where(edge)}: edge to vertex {ids[edge, end]}, which is missing")
+    return found.astype(np.int64)
+
+
+def _checked(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGraph:
+    """The graph without edges from a pose to itself; unconnected components are counted.
+
+    Raises:
+        DataError: if an information matrix is not positive definite, or no edge is left.
+    """
+    _check_information(graph.information, rows)
+    loops = graph.edges[:, 0] == graph.edges[:, 1]
+    for row in np.flatnonzero(loops).tolist():
+        diagnostics.warn("pose_graph_edge_to_itself", f"{rows.where(row)}: left out")
+    graph = graph.keep_edges(~loops) if loops.any() else graph
+    if len(graph.edges) == 0:
+        raise DataError(f"{rows.path}: no edges between two poses")
+    for part in range(1, len(graph.anchors)):
+        size, key = np.count_nonzero(graph.components == part), graph.keys[graph.anchors[part]]
+        diagnostics.warn(
+            "pose_graph_not_connected",
+            f"{rows.path}: {size} poses from {key} on are not connected to the first; "
+            f"pose {key} is fixed",
+        )
+    return graph
+
+
+def _check_information(information: FloatArray, rows: Rows) -> None:
+    """Check that all information matrices are positive definite."""
+    try:
+        np.linalg.cholesky(information)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(information)[:, 0]
+        edge = int(np.argmin(smallest))
+        raise DataError(
+            f"{rows.where(edge)}: the information matrix is not positive definite "
+            f"(smallest eigenvalue {smallest[edge]:.3g})"
+        ) from None
 
 
 def g2o_lines(graph: PoseGraph, poses: Poses) -> Iterator[str]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""First estimates of the poses of a graph, from its edges alone or as the file has them."""
+"""Initial estimates of the poses of a graph, from its edges or from the file."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 Initialization = Literal["chordal", "lago", "odometry", "file"]
 
-LOOP_CLOSURE_LENGTH = 1e6
-"""Length of a loop closure in the tree of `odometry`, where a step of odometry has 1."""
+__all__ = ["Initialization", "along_tree", "initialize", "tree_edges"]
+
+_LOOP_CLOSURE_LENGTH = 1e6
+"""Length of a loop closure in the spanning tree, where an edge of odometry has 1."""
 
 
 def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) -> Poses:
-    """First estimates.
+    """Initial estimates of all poses.
 
     Args:
         graph: the pose graph.
-        how: chordal: rotations without their constraint, projected, then translations (Carlone,
-            Tron, Daniilidis and Dellaert 2015). lago: angles first, in 2D (Carlone, Aragues,
-            Castellanos and Bona 2014). odometry: along a tree, of consecutive poses where there are
-            any. file: as the file has them.
-        diagnostics: counts where odometry had to do.
+        how: chordal: relaxed rotations, projected on SO(d), then translations (Carlone, Tron,
+            Daniilidis and Dellaert 2015). lago: angles first, in 2D (Carlone, Aragues, Castellanos
+            and Bona 2014). odometry: composed along a spanning tree that prefers consecutive poses.
+            file: those of the file.
+        diagnostics: counts if the method fails and odometry is used instead.
 
     Raises:
         DataError: if the file has no estimates, or `lago` is asked for in 3D.
@@ -51,8 +53,8 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
     if how == "lago" and graph.dimension == 3:
         raise DataError(f"{graph.name}: lago is for 2D; use the chordal initialization")
     try:
-        rotations = chordal_rotations(graph) if how == "chordal" else lago_rotations(graph)
-        return Poses(rotations, translations_given(graph, rotations))
+        rotations = _chordal_rotations(graph) if how == "chordal" else _lago_rotations(graph)
+        return Poses(rotations, _translations_given(graph, rotations))
     except (RuntimeError, np.linalg.LinAlgError) as error:
         diagnostics.warn(
             "pose_graph_not_initialized", f"{how}: {str(error).strip()}; odometry is used"
@@ -60,8 +62,8 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
         return along_tree(graph)
 
 
-def chordal_rotations(graph: PoseGraph) -> FloatArray:
-    """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on rotations."""
+def _chordal_rotations(graph: PoseGraph) -> FloatArray:
+    """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on SO(d)."""
     d, n = graph.dimension, len(graph.keys)
     rows = rotation_rows(graph, graph.precisions[0])[:, n:]
     held = (d * graph.anchors[:, None] + np.arange(d)).ravel()
@@ -70,8 +72,8 @@ def chordal_rotations(graph: PoseGraph) -> FloatArray:
     return nearest_rotations(transposed.transpose(0, 2, 1))
 
 
-def lago_rotations(graph: PoseGraph) -> FloatArray:
-    """(N, 2, 2) rotations by LAGO: angles as a linear problem after unwrapping along a tree."""
+def _lago_rotations(graph: PoseGraph) -> FloatArray:
+    """(N, 2, 2) rotations by LAGO: a linear problem in the angles, unwrapped along a tree."""
     problem, first = gtsam.NonlinearFactorGraph(), graph.anchor_poses().rotations
     angles = np.arctan2(graph.measured.rotations[:, 1, 0], graph.measured.rotations[:, 0, 0])
     sigmas = 1.0 / np.sqrt(graph.information[:, 2, 2])
@@ -92,18 +94,18 @@ def lago_rotations(graph: PoseGraph) -> FloatArray:
 
 
 def _lago_applies(graph: PoseGraph) -> None:
-    """LAGO walks from pose 0 along consecutive poses, and does not return if a link is missing.
+    """GTSAM's LAGO does not return if an edge between consecutive poses is missing.
 
     Raises:
-        RuntimeError: if one is.
+        RuntimeError: if one is missing.
     """
     steps = np.unique(graph.edges[graph.is_odometry].min(axis=1))
     if len(steps) != len(graph.keys) - 1:
         raise RuntimeError("not every pose has an edge to the next one")
 
 
-def translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
-    """(N, d) translations that fit given rotations best, a linear problem."""
+def _translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
+    """(N, d) translations that fit given rotations best: a linear problem."""
     n, d = len(graph.keys), graph.dimension
     rows = translation_rows(graph, graph.precisions[1])
     side_by_side = rotations.transpose(1, 0, 2).reshape(d, -1)
@@ -114,7 +116,7 @@ def translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
 def _solved(
     rows: csr_matrix, held: IntArray, values: FloatArray, right: FloatArray | None = None
 ) -> FloatArray:
-    """Least-squares solution x (n, c) of rows · x = right, some entries of x held at values."""
+    """Least-squares solution x (n, c) of rows · x = right with some entries of x fixed."""
     count = rows.shape[1]
     free = np.setdiff1d(np.arange(count), held)
     x = np.zeros((count, values.shape[1]))
@@ -145,14 +147,14 @@ def along_tree(graph: PoseGraph) -> Poses:
 
 
 def tree_edges(graph: PoseGraph) -> IntArray:
-    """Rows of the edges of that tree, which hold the graph together."""
+    """Rows of the edges of that spanning tree."""
     return np.array([row for _, _, row in _tree(graph)], dtype=np.int64)
 
 
 def _tree(graph: PoseGraph) -> list[tuple[int, int, int]]:
-    """Triples (pose, the one before it in the tree, edge), each after that of the one before."""
+    """Triples (pose, parent in the tree, edge), parents first."""
     n = len(graph.keys)
-    lengths = np.where(graph.is_odometry, 1.0, LOOP_CLOSURE_LENGTH)
+    lengths = np.where(graph.is_odometry, 1.0, _LOOP_CLOSURE_LENGTH)
     ends, first = np.unique(np.sort(graph.edges, axis=1), axis=0, return_index=True)
     links = coo_matrix((lengths[first], tuple(ends.T)), shape=(n, n))
     tree = minimum_spanning_tree(links.tocsr())

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Module 2 of pose-graph optimisation: steps until the cost no longer falls, taken by GTSAM.
 
-Orderings are COLAMD's: METIS, GTSAM's default elsewhere, crashes on poses that no edge touches.
-
-A pose graph solved pose by pose with iSAM2, as if it were being recorded.
-
-Kaess, Johannsson, Roberts, Ila, Leonard and Dellaert 2012.
+`gauss_newton` (the default), `levenberg_marquardt` and `dogleg` are GTSAM's batch optimizers;
+`isam2` adds the poses one by one, as if they were being recorded (Kaess, Johannsson, Roberts, Ila,
+Leonard and Dellaert 2012), and ends with Gauss-Newton. Orderings are COLAMD's: METIS, GTSAM's
+default elsewhere, crashes on poses without edges.
 """
 
 from __future__ import annotations
@@ -24,20 +23,138 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_cost import PoseGraphCost
-from slam_graph.pose_graph.gtsam_graph import factor_graph, native, poses_of, values_of
+from slam_graph.pose_graph.gtsam_graph import factor_graph, gtsam_poses, poses_of, values_of
 from slam_graph.pose_graph.pose_graph_policy import Minimum, PoseGraphStepsPolicy
 
+__all__ = ["minimize"]
 
-def incremental(
+_NEGLIGIBLE_COST = 1e-14
+"""A cost of less than this for each edge is rounding: all edges agree."""
+
+_ROUNDING = 1e-9
+"""A relative increase of the cost up to this is rounding."""
+
+
+def minimize(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """Take steps on a cost until it no longer falls.
+
+    Raises:
+        EstimationError: if the linear problem of a step has no solution, damped or not.
+    """
+    try:
+        minimum = _METHODS[policy.method](cost, start, policy, diagnostics)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split(".")[0].split())
+        raise EstimationError(f"{cost.graph.name}: {policy.method} failed: {reason}") from error
+    if not np.isfinite(minimum.cost):
+        raise EstimationError(f"{cost.graph.name}: {policy.method} failed: the cost is not finite")
+    if not minimum.converged:
+        diagnostics.warn(
+            "pose_graph_not_converged",
+            f"{cost.graph.name}: the cost still falls after {minimum.steps} steps",
+        )
+    return minimum
+
+
+def _gauss_newton(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """Gauss-Newton, and Levenberg-Marquardt after a step that fails or does not lower the cost."""
+    optimizer = gtsam.GaussNewtonOptimizer(
+        cost.factors(),
+        values_of(start),
+        _parameters(gtsam.GaussNewtonParams(), policy.tolerance, policy.max_steps),
+    )
+    negligible = _NEGLIGIBLE_COST * len(cost.edges)
+    for step in range(1, policy.max_steps + 1):
+        values, error = gtsam.Values(optimizer.values()), optimizer.error()  # a view otherwise
+        lower = _iterated(optimizer)
+        if lower <= negligible or -_ROUNDING * error <= error - lower <= policy.tolerance * error:
+            return Minimum(poses_of(optimizer.values(), start.dimension), lower, step, True)
+        if not lower < error:
+            diagnostics.warn(
+                "pose_graph_step_damped",
+                f"{cost.graph.name}: Gauss-Newton step {step} does not lower the cost; "
+                "Levenberg-Marquardt continues",
+            )
+            before = poses_of(values, start.dimension)
+            damped = _optimized(_LM, cost, before, policy, max(policy.max_steps - step, 1))
+            return replace(damped, steps=step + damped.steps)
+    last = poses_of(optimizer.values(), start.dimension)
+    return Minimum(last, optimizer.error(), policy.max_steps, False)
+
+
+def _iterated(optimizer: gtsam.GaussNewtonOptimizer) -> float:
+    """The cost after one more step; infinite if the step has no solution."""
+    try:
+        optimizer.iterate()
+    except RuntimeError:
+        return float("inf")
+    return float(optimizer.error())
+
+
+def _levenberg_marquardt(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """Levenberg-Marquardt."""
+    return _optimized(_LM, cost, start, policy, policy.max_steps)
+
+
+def _isam2(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """iSAM2 pose by pose, then Gauss-Newton, which removes its approximations."""
+    last = _incremental(cost, start, policy, diagnostics)
+    settled = _gauss_newton(cost, last, policy, diagnostics)
+    return replace(settled, steps=len(start) + settled.steps)
+
+
+def _dogleg(
+    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
+) -> Minimum:
+    """Powell's dogleg."""
+    dogleg = (gtsam.DoglegOptimizer, gtsam.DoglegParams)
+    return _optimized(dogleg, cost, start, policy, policy.max_steps)
+
+
+def _optimized(
+    kind: tuple[Callable[..., Any], Callable[[], Any]],
+    cost: PoseGraphCost,
+    start: Poses,
+    policy: PoseGraphStepsPolicy,
+    max_steps: int,
+) -> Minimum:
+    """The minimum that an optimizer of GTSAM finds; `kind`: its class and that of its settings."""
+    optimizer_of, parameters_of = kind
+    parameters = _parameters(parameters_of(), policy.tolerance, max_steps)
+    optimizer = optimizer_of(cost.factors(), values_of(start), parameters)
+    values = optimizer.optimize()
+    steps = int(optimizer.iterations())
+    poses = poses_of(values, start.dimension)
+    return Minimum(poses, optimizer.error(), steps, steps < max_steps)
+
+
+def _parameters(parameters: Any, tolerance: float, max_steps: int) -> Any:
+    """Set the parameters of an optimizer of GTSAM."""
+    parameters.setOrderingType("COLAMD")
+    parameters.setMaxIterations(max_steps)
+    parameters.setRelativeErrorTol(tolerance)
+    parameters.setAbsoluteErrorTol(0.0)
+    return parameters
+
+
+def _incremental(
     cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
 ) -> Poses:
-    """Add poses in the order of their ids, each with its edges to those before it.
+    """Estimates of iSAM2 after adding the poses by id, each with its edges to those before it.
 
     Args:
         cost: all factors.
-        start: where the anchors are; all other poses begin where their first edge puts them.
-        policy: when poses are linearised anew.
-        diagnostics: counts if variables had to be eliminated by QR, which is slower and exact.
+        start: estimates of the anchors; every other pose is initialised by its first edge.
+        policy: when poses are relinearised.
+        diagnostics: counts if QR had to be used instead of Cholesky, which is slower.
 
     Raises:
         RuntimeError: if the problem cannot be solved.
@@ -47,7 +164,7 @@ def incremental(
     except RuntimeError:
         diagnostics.warn(
             "pose_graph_eliminated_by_qr",
-            f"{cost.graph.name}: too poorly conditioned for Cholesky; iSAM2 begins anew with QR",
+            f"{cost.graph.name}: too poorly conditioned for Cholesky; iSAM2 starts again with QR",
         )
         return _added_one_by_one(cost, start, policy, "QR")
 
@@ -55,13 +172,13 @@ def incremental(
 def _added_one_by_one(
     cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, factorization: str
 ) -> Poses:
-    """The estimates of iSAM2 when the last pose has come."""
+    """The estimates of iSAM2 after the last pose."""
     isam2 = gtsam.ISAM2(_isam2_parameters(policy, factorization))
     graph = cost.graph.keep_edges(cost.rows)
-    ends, measured = graph.edges.tolist(), native(graph.measured)
+    ends, measured = graph.edges.tolist(), gtsam_poses(graph.measured)
     anchors = graph.anchors.tolist()
     priors = dict(zip(anchors, cost.anchors, strict=True))
-    guesses = dict(zip(anchors, native(start.select(graph.anchors)), strict=True))
+    guesses = dict(zip(anchors, gtsam_poses(start.select(graph.anchors)), strict=True))
     for pose, edges in _arrivals(graph):
         factors = [cost.edges[row] for row in edges]
         if pose in priors:
@@ -94,7 +211,7 @@ def _estimate(isam2: gtsam.ISAM2, key: int, dimension: int) -> gtsam.Pose2 | gts
 
 
 def _arrivals(graph: PoseGraph) -> Iterator[tuple[int, list[int]]]:
-    """Poses by their ids, each as soon as an edge ties it to one before, with these edges."""
+    """Poses by id, each as soon as an edge connects it to an earlier one, with these edges."""
     neighbours: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for row, (i, j) in enumerate(graph.edges.tolist()):
         neighbours[i].append((j, row))
@@ -112,123 +229,9 @@ def _arrivals(graph: PoseGraph) -> Iterator[tuple[int, list[int]]]:
                 heappush(waiting, other)
 
 
-NOTHING_PER_EDGE = 1e-14
-"""A cost of less than this for each edge is rounding: all edges agree."""
+_LM = (gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams)
 
-ROUNDING = 1e-9
-"""A cost that rises by no more than this part of it has not risen."""
-
-
-def minimize(
-    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
-    """Take steps on a cost until it no longer falls.
-
-    Raises:
-        EstimationError: if the linear problem of a step has no solution, damped or not.
-    """
-    try:
-        minimum = METHODS[policy.method](cost, start, policy, diagnostics)
-    except RuntimeError as error:
-        reason = " ".join(str(error).split(".")[0].split())
-        raise EstimationError(f"{cost.graph.name}: {policy.method} failed: {reason}") from error
-    if not np.isfinite(minimum.cost):
-        raise EstimationError(f"{cost.graph.name}: {policy.method} failed: the cost is not finite")
-    if not minimum.converged:
-        diagnostics.warn(
-            "pose_graph_not_converged",
-            f"{cost.graph.name}: the cost still falls after {minimum.steps} steps",
-        )
-    return minimum
-
-
-def _gauss_newton(
-    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
-    """Gauss-Newton; Levenberg-Marquardt from where a step fails or does not lower the cost."""
-    optimizer = gtsam.GaussNewtonOptimizer(
-        cost.factors(), values_of(start), _parameters(gtsam.GaussNewtonParams(), policy)
-    )
-    nothing = NOTHING_PER_EDGE * len(cost.edges)
-    for step in range(1, policy.max_steps + 1):
-        values, error = gtsam.Values(optimizer.values()), optimizer.error()  # a view otherwise
-        lower = _iterated(optimizer)
-        if lower <= nothing or -ROUNDING * error <= error - lower <= policy.tolerance * error:
-            return Minimum(poses_of(optimizer.values(), start.dimension), lower, step, True)
-        if not lower < error:
-            diagnostics.warn(
-                "pose_graph_step_damped",
-                f"{cost.graph.name}: step {step} of Gauss-Newton does not lower the cost; "
-                "Levenberg-Marquardt goes on",
-            )
-            rest = policy.model_copy(update={"max_steps": max(policy.max_steps - step, 1)})
-            damped = _levenberg_marquardt(
-                cost, poses_of(values, start.dimension), rest, diagnostics
-            )
-            return replace(damped, steps=step + damped.steps)
-    last = poses_of(optimizer.values(), start.dimension)
-    return Minimum(last, optimizer.error(), policy.max_steps, False)
-
-
-def _iterated(optimizer: gtsam.GaussNewtonOptimizer) -> float:
-    """The cost after one more step; infinite if the step has no solution."""
-    try:
-        optimizer.iterate()
-    except RuntimeError:
-        return float("inf")
-    return float(optimizer.error())
-
-
-def _levenberg_marquardt(
-    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
-    """Levenberg-Marquardt."""
-    return _optimized(
-        gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), cost, start, policy
-    )
-
-
-def _isam2(
-    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
-    """iSAM2 pose by pose, and then Gauss-Newton, which leaves nothing of its approximations."""
-    last = incremental(cost, start, policy, diagnostics)
-    settled = _gauss_newton(cost, last, policy, diagnostics)
-    return replace(settled, steps=len(start) + settled.steps)
-
-
-def _dogleg(
-    cost: PoseGraphCost, start: Poses, policy: PoseGraphStepsPolicy, diagnostics: Diagnostics
-) -> Minimum:
-    """Powell's dogleg."""
-    return _optimized(gtsam.DoglegOptimizer, gtsam.DoglegParams(), cost, start, policy)
-
-
-def _optimized(
-    optimizer_of: Callable[..., Any],
-    parameters: Any,
-    cost: PoseGraphCost,
-    start: Poses,
-    policy: PoseGraphStepsPolicy,
-) -> Minimum:
-    """What one of GTSAM's optimizers comes to."""
-    optimizer = optimizer_of(cost.factors(), values_of(start), _parameters(parameters, policy))
-    values = optimizer.optimize()
-    steps = int(optimizer.iterations())
-    poses = poses_of(values, start.dimension)
-    return Minimum(poses, optimizer.error(), steps, steps < policy.max_steps)
-
-
-def _parameters(parameters: Any, policy: PoseGraphStepsPolicy) -> Any:
-    """Parameters of one of GTSAM's optimizers, filled in."""
-    parameters.setOrderingType("COLAMD")
-    parameters.setMaxIterations(policy.max_steps)
-    parameters.setRelativeErrorTol(policy.tolerance)
-    parameters.setAbsoluteErrorTol(0.0)
-    return parameters
-
-
-METHODS = {
+_METHODS = {
     "gauss_newton": _gauss_newton,
     "levenberg_marquardt": _levenberg_marquardt,
     "dogleg": _dogleg,

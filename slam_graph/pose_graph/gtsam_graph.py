@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A pose graph as GTSAM has it: factors, values, errors. The key of a pose is its row."""
+"""A pose graph in GTSAM: factors, values, errors. The key of a pose is its row."""
 
 from __future__ import annotations
 
@@ -13,6 +13,18 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
+__all__ = [
+    "ROTATION_FIRST",
+    "anchor_factors",
+    "edge_chi2",
+    "edge_factors",
+    "factor_graph",
+    "gtsam_poses",
+    "poses_of",
+    "robust_estimator",
+    "values_of",
+]
+
 _LOSSES: dict[str, Callable[[float], Any]] = {
     "huber": gtsam.noiseModel.mEstimator.Huber.Create,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
@@ -22,15 +34,15 @@ _LOSSES: dict[str, Callable[[float], Any]] = {
 }
 
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
-"""Entries of a tangent in 3D: GTSAM's order from that of files. In 2D they are the same."""
+"""GTSAM's order of a 3D tangent in terms of the order of files. In 2D they are the same."""
 
 
 def edge_factors(
     graph: PoseGraph, rows: Iterable[int], loss: str = "none", width: float = 1.0
 ) -> list[gtsam.NonlinearFactor]:
-    """Between factors of some edges, under a robust loss of a given width on the whitened length.
+    """Between factors of some edges, with a robust loss on the whitened residual.
 
-    Of `dcs`, width is the Φ of Agarwal et al. 2013, which is compared with the squared length.
+    The width of `dcs` is the Φ of Agarwal et al. 2013, which is compared with the squared residual.
     """
     between: Any = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
     information = graph.angle_information
@@ -38,7 +50,7 @@ def edge_factors(
         information = information[:, ROTATION_FIRST[:, None], ROTATION_FIRST]
     estimator = None if loss == "none" else robust_estimator(loss, width)
     gaussian, robust = gtsam.noiseModel.Gaussian.Information, gtsam.noiseModel.Robust.Create
-    poses, ends = native(graph.measured), graph.edges.tolist()
+    poses, ends = gtsam_poses(graph.measured), graph.edges.tolist()
     factors: list[gtsam.NonlinearFactor] = []
     for row in rows:
         noise: Any = gaussian(information[row], False)
@@ -54,28 +66,28 @@ def robust_estimator(loss: str, width: float) -> Any:
 
 
 def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.NonlinearFactor]:
-    """Priors that take the first pose of each connected part as the definition of its frame.
+    """Priors on the first pose of each connected component, which fix the gauge.
 
-    They cost nothing where edges agree with them, so that they move nothing but the gauge.
+    They are zero at a minimum.
 
     Args:
         graph: the pose graph.
-        held: without any freedom, so that covariances are those relative to the first pose.
+        held: as hard constraints, so that covariances are relative to the first pose.
     """
     prior, k = (gtsam.PriorFactorPose2, 3) if graph.dimension == 2 else (gtsam.PriorFactorPose3, 6)
     noise = (
         gtsam.noiseModel.Constrained.All(k)
         if held
-        else gtsam.noiseModel.Isotropic.Precision(k, typical_information(graph))
+        else gtsam.noiseModel.Isotropic.Precision(k, _typical_information(graph))
     )
-    poses = native(graph.anchor_poses())
+    poses = gtsam_poses(graph.anchor_poses())
     return [
         prior(key, pose, noise) for key, pose in zip(graph.anchors.tolist(), poses, strict=True)
     ]
 
 
-def typical_information(graph: PoseGraph) -> float:
-    """The median of the diagonals of the information, which conditions a gauge well."""
+def _typical_information(graph: PoseGraph) -> float:
+    """The median of the diagonals of the information: a well conditioned gauge prior."""
     return float(np.median(np.diagonal(graph.angle_information, axis1=1, axis2=2)))
 
 
@@ -90,13 +102,13 @@ def factor_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFac
 def values_of(poses: Poses) -> gtsam.Values:
     """Poses as GTSAM's values."""
     values = gtsam.Values()
-    for key, pose in enumerate(native(poses)):
+    for key, pose in enumerate(gtsam_poses(poses)):
         values.insert(key, pose)
     return values
 
 
 def poses_of(values: gtsam.Values, dimension: int) -> Poses:
-    """GTSAM's values, of keys 0 to N - 1, as poses."""
+    """Values of GTSAM with the keys 0 to N - 1 as poses."""
     if dimension == 2:
         x, y, theta = np.asarray(gtsam.utilities.extractPose2(values)).T
         cos, sin = np.cos(theta), np.sin(theta)
@@ -111,7 +123,7 @@ def edge_chi2(factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values) ->
     return np.array([2.0 * factor.error(values) for factor in factors])
 
 
-def native(poses: Poses) -> list[Any]:
+def gtsam_poses(poses: Poses) -> list[Any]:
     """Poses as a list of `Pose2` or `Pose3`."""
     R, t = poses.rotations, poses.translations
     if poses.dimension == 2:

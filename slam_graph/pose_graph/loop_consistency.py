@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which loop closures confirm each other, judged by short ways of odometry between them.
+"""Pairwise consistency of loop closures, from short cycles through the odometry between them.
 
-Two loop closures (a, b) and (c, d) whose ends are near each other close a cycle a → b → d → c → a
-with the odometry between b and d and between c and a. The cycle is the identity up to its noise,
-which is small as long as these ways are short: true loop closures of one revisit confirm each
-other, and false ones agree with their neighbours only by chance. The test is that of pairwise
-consistency (Mangelson, Dominic, Eustice and Vasudevan 2018), between neighbours only.
+Two loop closures (a, b) and (c, d) whose ends are near each other form a cycle a → b → d → c → a
+with the odometry between b and d and between c and a. Composed, a cycle is the identity up to its
+noise, which is small as long as the stretches of odometry are short. True loop closures of one
+revisit are consistent; false ones are consistent with their neighbours only by chance (Mangelson,
+Dominic, Eustice and Vasudevan 2018; here only neighbours are compared).
 """
 
 from __future__ import annotations
@@ -14,86 +14,89 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
-NEIGHBOURHOOD = 10
-"""How many poses apart the ends of two loop closures may be to be compared."""
+__all__ = ["confirmed_loops"]
 
-MIN_GROUP = 5
-"""How many loop closures must be tied together by agreement to confirm each other."""
+_NEIGHBOURHOOD = 10
+"""Two loop closures are compared if their ends are at most this many poses apart."""
+
+_MIN_GROUP = 5
+"""Least size of a connected group of consistent loop closures that confirm each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
-    """Pairs of loop closures, and whether they agree.
+class _Pairs:
+    """Pairs of neighbouring loop closures.
 
     Attributes:
         members: (P, 2) rows among the loop closures.
-        agree: (P,).
+        consistent: (P,) whether the cycle of the pair closes.
     """
 
     members: IntArray
-    agree: NDArray[np.bool_]
+    consistent: BoolArray
 
 
 def confirmed_loops(graph: PoseGraph, along_odometry: Poses, bound: float) -> IntArray:
-    """Rows of the edges that are loop closures and confirmed by others.
+    """Rows of the loop closures that are confirmed by others.
 
-    Such a one belongs to a group of at least `MIN_GROUP` that agreement ties together, and agrees
-    with more of its neighbours than it contradicts.
+    A confirmed loop closure belongs to a connected group of at least `_MIN_GROUP` consistent ones,
+    and is consistent with more of its neighbours than it is inconsistent with.
 
     Args:
         graph: the pose graph.
         along_odometry: poses composed along consecutive edges.
-        bound: χ² of a cycle that still agrees.
+        bound: largest χ² of a consistent cycle.
     """
     loops = np.flatnonzero(~graph.is_odometry)
-    if len(loops) < MIN_GROUP:
+    if len(loops) < _MIN_GROUP:
         return loops[:0]
     pairs, count = _compare(graph, loops, along_odometry, bound), len(loops)
-    agreeing, contrary = pairs.members[pairs.agree], pairs.members[~pairs.agree]
-    links = coo_matrix((np.ones(len(agreeing)), tuple(agreeing.T)), shape=(count, count))
+    consistent, inconsistent = pairs.members[pairs.consistent], pairs.members[~pairs.consistent]
+    links = coo_matrix((np.ones(len(consistent)), tuple(consistent.T)), shape=(count, count))
     group = connected_components(links, directed=False)[1]
-    large = np.bincount(group)[group] >= MIN_GROUP
-    friends, foes = (np.bincount(rows.ravel(), minlength=count) for rows in (agreeing, contrary))
-    confirmed: IntArray = loops[large & (friends > foes)]
+    large = np.bincount(group)[group] >= _MIN_GROUP
+    for_, against = (
+        np.bincount(rows.ravel(), minlength=count) for rows in (consistent, inconsistent)
+    )
+    confirmed: IntArray = loops[large & (for_ > against)]
     return confirmed
 
 
-def _compare(graph: PoseGraph, loops: IntArray, along: Poses, bound: float) -> Pairs:
-    """Cycles of all loop closures that are near each other."""
+def _compare(graph: PoseGraph, loops: IntArray, along: Poses, bound: float) -> _Pairs:
+    """Test the cycles of all pairs of neighbouring loop closures."""
     ends, measured = _ordered(graph.edges[loops], graph.measured.select(loops))
-    members = cKDTree(ends).query_pairs(NEIGHBOURHOOD, p=np.inf, output_type="ndarray")
+    members = cKDTree(ends).query_pairs(_NEIGHBOURHOOD, p=np.inf, output_type="ndarray")
     noise = _Noise.of(graph, loops)
     (a, b), (c, d) = ends[members[:, 0]].T, ends[members[:, 1]].T
     chained = (noise.chain[a] == noise.chain[c]) & (noise.chain[b] == noise.chain[d])
     members, a, b, c, d = members[chained], a[chained], b[chained], c[chained], d[chained]
     first, second = measured.select(members[:, 0]), measured.select(members[:, 1])
-    ways = _between(along, b, d), _between(along, c, a)
-    cycle = first.compose(ways[0]).compose(second.inverse()).compose(ways[1])
-    # A turn anywhere moves the end by at most half of what the way is long.
-    lever = 0.5 * sum(np.linalg.norm(p.translations, axis=1) for p in (first, second, *ways))
+    stretches = _between(along, b, d), _between(along, c, a)
+    cycle = first.compose(stretches[0]).compose(second.inverse()).compose(stretches[1])
+    # a rotation error anywhere moves the end of the cycle by at most half of its length
+    lever = 0.5 * sum(np.linalg.norm(p.translations, axis=1) for p in (first, second, *stretches))
     of_R, of_t = noise.of_cycles(members, a, b, c, d)
     squared = cycle.angles() ** 2 / of_R + np.sum(cycle.translations**2, axis=1) / (
         of_t + of_R * lever**2
     )
-    return Pairs(members, squared < bound)
+    return _Pairs(members, squared < bound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Noise:
-    """Mean variances of an axis, rotation and translation: rad² and m².
+    """Variances, averaged over the axes of rotation (rad²) and translation (m²).
 
     Attributes:
         loops: (2, L) of the loop closures.
-        odometry: (2, N) of all steps of odometry up to a pose.
-        chain: (N,) number of the unbroken chain of odometry that a pose belongs to.
+        odometry: (2, N) summed over the odometry up to each pose.
+        chain: (N,) number of the unbroken chain of odometry of each pose.
     """
 
     loops: FloatArray
@@ -116,15 +119,17 @@ class _Noise:
     def of_cycles(
         self, members: IntArray, a: IntArray, b: IntArray, c: IntArray, d: IntArray
     ) -> FloatArray:
-        """(2, P) variances summed around cycles."""
+        """(2, P) variances summed around each cycle."""
         odometry = self.odometry
-        ways = np.abs(odometry[:, b] - odometry[:, d]) + np.abs(odometry[:, a] - odometry[:, c])
-        summed: FloatArray = self.loops[:, members].sum(axis=2) + ways
+        stretches = np.abs(odometry[:, b] - odometry[:, d]) + np.abs(
+            odometry[:, a] - odometry[:, c]
+        )
+        summed: FloatArray = self.loops[:, members].sum(axis=2) + stretches
         return summed
 
 
 def _ordered(ends: IntArray, measured: Poses) -> tuple[IntArray, Poses]:
-    """Edges turned so that the first end is the earlier pose."""
+    """Edges reversed where needed, so that the first end is the earlier pose."""
     back, inverse = ends[:, 0] > ends[:, 1], measured.inverse()
     return np.sort(ends, axis=1), Poses(
         np.where(back[:, None, None], inverse.rotations, measured.rotations),

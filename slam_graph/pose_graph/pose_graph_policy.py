@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The row of pose-graph optimisation in the table of policies, and what a solution consists of.
+"""Settings of pose-graph optimisation (a row of the table of policies), and its solution.
 
 Cost construction: all poses, no features. Gauss-Newton: until convergence. Marginalization: none.
 """
@@ -15,41 +15,49 @@ from pydantic import Field
 
 from slam_graph.arrays import FloatArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
-from slam_graph.settings.base import Settings
+from slam_graph.settings.base import Settings, expert
 
-Steps = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
+__all__ = [
+    "Minimum",
+    "PoseGraphCostPolicy",
+    "PoseGraphPolicy",
+    "PoseGraphSolution",
+    "PoseGraphStepsPolicy",
+]
 
 
 class PoseGraphCostPolicy(Settings):
-    """Module 1: all poses and all edges. What is open is how far an edge is trusted."""
+    """Module 1: all poses and all edges, and how outliers among the edges are handled."""
 
     initialization: Literal["auto", "chordal", "lago", "odometry", "file"] = "auto"
-    """First estimates. auto: chordal; along odometry under a robust loss."""
+    """Initial estimates. auto: chordal, or odometry with a robust loss. Choose file to stay in the
+    basin of the estimates that the file has, or another one where --certify refuses the result."""
     robust: Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"] = "none"
-    """How false loop closures are held back: by a robust loss, or by graduated non-convexity
-    (`gnc`), which decides for each whether it is one."""
-    robust_width: float | None = Field(None, gt=0)
-    """Width of the robust loss on the whitened length of a residual (of `dcs`: Φ, on its square);
-    null for the χ² quantile of `confidence`."""
-    confidence: float = Field(0.99, gt=0, lt=1)
-    """χ² quantile of the residuals that true edges have."""
-    trust_odometry: bool = True
-    """Whether edges between consecutive poses are above suspicion."""
+    """How false loop closures are handled: none where all are true; gnc (graduated non-convexity)
+    classifies each as inlier or outlier; the others are robust losses, which only weigh down."""
+    robust_width: float | None = expert(None, gt=0)
+    """Width of the robust loss on the whitened residual (of `dcs`: Φ, on its square); null for the
+    χ² quantile of `confidence`."""
+    confidence: float = expert(0.99, gt=0, lt=1)
+    """χ² quantile of the residuals of inliers."""
+    trust_odometry: bool = expert(True)
+    """Whether edges between consecutive poses are never outliers."""
 
 
 class PoseGraphStepsPolicy(Settings):
     """Module 2: how the cost is minimised."""
 
-    method: Steps = "gauss_newton"
-    """Gauss-Newton goes over to Levenberg-Marquardt where a step does not lower the cost."""
-    max_steps: int = Field(100, ge=1)
-    """Number of steps at most."""
+    method: Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"] = "gauss_newton"
+    """Optimizer. gauss_newton is the fastest, and continues with Levenberg-Marquardt where a step
+    does not lower the cost; isam2 adds pose by pose, which is slower and has the same minimum."""
     tolerance: float = Field(1e-6, gt=0)
-    """Steps end when the cost falls by less, relative to its value."""
-    relinearize_threshold: float = Field(0.1, gt=0)
-    """Poses of which the tangent moved by more are linearised anew (isam2)."""
-    relinearize_skip: int = Field(10, ge=1)
-    """How many poses from one such check to the next (isam2)."""
+    """Steps end when the relative decrease of the cost is less; lower it for more digits."""
+    max_steps: int = expert(100, ge=1)
+    """Largest number of steps."""
+    relinearize_threshold: float = expert(0.1, gt=0)
+    """Poses whose tangent has moved by more are relinearised (isam2)."""
+    relinearize_skip: int = expert(10, ge=1)
+    """Number of poses between two such checks (isam2)."""
 
 
 class PoseGraphPolicy(Settings):
@@ -63,11 +71,11 @@ class PoseGraphPolicy(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Where steps have led to.
+    """Where the steps ended.
 
     Attributes:
-        poses: all of them.
-        cost: what they cost in the end.
+        poses: all poses.
+        cost: their cost.
         steps: number of steps.
         converged: whether the cost stopped falling before the number of steps was used up.
     """
@@ -80,12 +88,12 @@ class Minimum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraphSolution:
-    """What came of an optimisation.
+    """The result of an optimisation.
 
     Attributes:
         graph: the problem.
-        start: first estimates.
-        minimum: what the steps have led to.
+        start: initial estimates.
+        minimum: where the steps ended.
         weights: (M,) of the edges, from 0 (rejected) to 1.
     """
 
@@ -100,6 +108,6 @@ class PoseGraphSolution:
         return self.minimum.poses
 
     def weighted_graph(self) -> PoseGraph:
-        """The problem that was solved in the end: with weights, and without rejected edges."""
+        """The problem with the final weights, without rejected edges."""
         rows = np.flatnonzero(self.weights > 0)
         return self.graph.keep_edges(rows).weighted(self.weights[rows])

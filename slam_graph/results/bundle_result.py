@@ -116,16 +116,12 @@ class BalResult:
             The files, in the order in which they were written.
         """
         files = ResultFolder(folder)
-        self.save_estimates(files)
+        files.text("optimized.txt", self.lines())
         files.text("config.yaml", [dump_yaml(self.policy)])
         files.json("metrics.json", self.metrics)
         write_ply(files.path("scene.ply"), self.after.points, self.after.centres())
         self._draw(files.path("bundle_adjustment.png"))
         return files.files
-
-    def save_estimates(self, files: ResultFolder) -> None:
-        """Write the estimates."""
-        files.text("optimized.txt", self.lines())
 
     def lines(self) -> Iterable[str]:
         """The whole problem with its estimates, in BAL's format."""

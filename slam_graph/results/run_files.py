@@ -13,25 +13,26 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
 
 __all__ = [
+    "ACCEL_BIAS",
     "CONFIG",
     "GROUNDTRUTH",
+    "GYRO_BIAS",
     "IN_MAP",
     "LOOP_CLOSED",
     "METRICS",
     "POINTS",
     "RIG",
-    "SIGMA_COLUMNS",
+    "SIGMAS",
     "SMOOTHED",
     "STATES",
-    "STATE_COLUMNS",
     "TRAJECTORY",
+    "VELOCITY",
     "read_states",
     "read_tum",
     "state_lines",
-    "vectors",
 ]
 
 TRAJECTORY = "trajectory.tum"
@@ -45,22 +46,18 @@ CONFIG = "config.yaml"
 RIG = "calibration.yaml"
 METRICS = "metrics.json"
 
-STATE_COLUMNS = ("velocity_{}_m_s", "gyro_bias_{}_rad_s", "accel_bias_{}_m_s2")
-SIGMA_COLUMNS = (
-    "sigma_rotation_body_{}_rad",
-    "sigma_position_body_{}_m",
-    "sigma_velocity_{}_m_s",
-    "sigma_accel_bias_{}_m_s2",
-    "sigma_gyro_bias_{}_rad_s",
-)
-_COLUMNS = tuple(name.format(axis) for name in STATE_COLUMNS + SIGMA_COLUMNS for axis in "xyz")
+VELOCITY = NavState.COMPONENTS[6:9]
+ACCEL_BIAS = NavState.COMPONENTS[9:12]
+GYRO_BIAS = NavState.COMPONENTS[12:15]
+SIGMAS = tuple(f"sigma_{component}" for component in NavState.COMPONENTS)
+_COLUMNS = (*VELOCITY, *ACCEL_BIAS, *GYRO_BIAS, *SIGMAS)
 
 
 def state_lines(history: StateHistory) -> Iterator[str]:
     """Velocities, biases and standard deviations as CSV; sigmas are empty where unknown."""
     yield ",".join(["stamp_ns", *_COLUMNS]) + "\n"
     trajectory = history.trajectory()
-    parts = (trajectory.velocities, trajectory.gyro_biases, trajectory.accel_biases)
+    parts = (trajectory.velocities, trajectory.accel_biases, trajectory.gyro_biases)
     rows = np.hstack([*(part for part in parts if part is not None), history.sigmas()])
     # row by row: lists of all of them would take several times the memory of the arrays
     for stamp_ns, row in zip(trajectory.stamps_ns, rows, strict=True):
@@ -92,11 +89,6 @@ def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
     except ValueError as error:
         raise DataError(f"{path}: not the states of a run ({error})") from error
     return stamps, dict(zip(names, table.T, strict=True))
-
-
-def vectors(states: dict[str, FloatArray], column: str) -> FloatArray:
-    """The values (N, 3) along x, y, z of a column of `STATE_COLUMNS` or `SIGMA_COLUMNS`."""
-    return np.column_stack([states[column.format(axis)] for axis in "xyz"])
 
 
 def read_tum(path: Path) -> Trajectory:

@@ -114,13 +114,17 @@ class SavedRun:
         stamps, states = self._states
         if poses is None or not np.array_equal(stamps, poses.stamps_ns):
             raise DataError(f"{self.folder}: {names.STATES} and {names.TRAJECTORY} differ in time")
-        velocities, gyro, accel = (names.vectors(states, column) for column in names.STATE_COLUMNS)
-        return replace(poses, velocities=velocities, gyro_biases=gyro, accel_biases=accel)
+        return replace(
+            poses,
+            velocities=_columns(states, names.VELOCITY),
+            accel_biases=_columns(states, names.ACCEL_BIAS),
+            gyro_biases=_columns(states, names.GYRO_BIAS),
+        )
 
     @property
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations of the states, in the order of `NavState.covariance`."""
-        return np.hstack([names.vectors(self._states[1], column) for column in names.SIGMA_COLUMNS])
+        return _columns(self._states[1], names.SIGMAS)
 
     @cached_property
     def smoothed(self) -> Trajectory | None:
@@ -172,3 +176,8 @@ def _trajectory(folder: Path, name: str) -> Trajectory | None:
     """A trajectory of a folder, or None if there is none of this name."""
     path = folder / name
     return names.read_tum(path) if path.is_file() else None
+
+
+def _columns(states: dict[str, FloatArray], columns: tuple[str, ...]) -> FloatArray:
+    """Some columns side by side."""
+    return np.column_stack([states[column] for column in columns])

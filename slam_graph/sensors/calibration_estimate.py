@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A calibration that was estimated with the motion: the rig, and how well it is known."""
+"""The result of online calibration: the rig, and the covariances of its parameters."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["CalibrationEstimate"]
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -20,7 +22,7 @@ class Parameter:
 
     Attributes:
         name: with the camera and the unit, e.g. ``cam0_fx_px``.
-        start: value before anything was estimated.
+        start: calibrated value, from which the estimation started.
         value: estimate.
         sigma: standard deviation of the estimate.
     """
@@ -41,7 +43,8 @@ class CalibrationEstimate:
         rig: with the estimated parameters.
         covariances: of each variable that was estimated: `e0` (6, 6) of the pose of camera 0, in
             its tangent (rad and m, camera frame); `k0` (4, 4) of its intrinsics in pixels; `d0`
-            (4, 4) of its distortion; `t0` (1, 1) of the time offset in seconds.
+            (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset in
+            seconds.
     """
 
     stamp_ns: int
@@ -52,8 +55,8 @@ class CalibrationEstimate:
     def parameters(self) -> list[Parameter]:
         """All parameters that were estimated.
 
-        Rotations are those of the camera since the start, as a rotation vector in the camera frame;
-        positions are those of the camera in the body.
+        Rotations are from the calibrated to the estimated camera frame, as a rotation vector in the
+        former; positions are those of the camera in the body.
         """
         table: list[Parameter] = []
         for variable, covariance in self.covariances.items():
@@ -67,7 +70,7 @@ class CalibrationEstimate:
         return table
 
     def _values(self, variable: str) -> tuple[list[str], FloatArray, FloatArray]:
-        """Names of a variable's parameters, their values at the start, and now."""
+        """Names of a variable's parameters, their calibrated values, and their estimates."""
         kind, c = variable[0], int(variable[1:])
         before, now = self.nominal.cameras[c], self.rig.cameras[c]
         if kind == "t":

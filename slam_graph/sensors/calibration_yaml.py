@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""YAML whose values know their line: calibration files with messages that say where."""
+"""YAML values that know their file and line, so that faults of calibration files can be located."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import yaml
 from slam_graph.errors import DataError
 from slam_graph.sensors.rig import pose_from_matrix
 
+__all__ = ["YamlValue", "parse_yaml", "read_yaml"]
+
 
 @dataclass(frozen=True, slots=True)
 class YamlValue:
@@ -23,7 +25,7 @@ class YamlValue:
     Attributes:
         path: of the file.
         node: of the parsed file.
-        key: name under which the value stands.
+        key: of the value.
     """
 
     path: Path
@@ -63,7 +65,7 @@ class YamlValue:
         return str(self.node.value)
 
     def number(self) -> float:
-        """A finite number; also such that YAML 1.1 takes for text, like ``2e-3``."""
+        """A finite number, also in a notation that YAML 1.1 takes for text, like ``2e-3``."""
         try:
             value = float(self.text())
         except ValueError:
@@ -79,7 +81,7 @@ class YamlValue:
         return [YamlValue(self.path, node, self.key) for node in self.node.value]
 
     def numbers(self, count: int | None = None) -> list[float]:
-        """A list of numbers, of a given length if `count` says one."""
+        """A list of numbers; of length `count`, unless that is None."""
         values = [element.number() for element in self.elements()]
         if count is not None and len(values) != count:
             raise DataError(f"{self.where}: expected {count} numbers, got {len(values)}")
@@ -98,12 +100,13 @@ class YamlValue:
         return pose_from_matrix(np.reshape(values, (4, 4)), self.where)
 
 
-def read_yaml(path: Path) -> YamlValue:
+def read_yaml(path: str | Path) -> YamlValue:
     """Read a YAML file, also one that starts with OpenCV's ``%YAML:1.0``.
 
     Raises:
         DataError: if the file is missing, not YAML, or not a mapping.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -112,12 +115,12 @@ def read_yaml(path: Path) -> YamlValue:
     return parse_yaml(text, path)
 
 
-def parse_yaml(text: str, path: Path) -> YamlValue:
+def parse_yaml(text: str, path: str | Path) -> YamlValue:
     """Read the text of a YAML file.
 
     Args:
         text: its content.
-        path: where it stands, for messages.
+        path: of the file, for messages.
 
     Raises:
         DataError: if it is not YAML, or not a mapping.
@@ -133,4 +136,4 @@ def parse_yaml(text: str, path: Path) -> YamlValue:
         raise DataError(f"{path}: not valid YAML") from None
     if not isinstance(node, yaml.MappingNode):
         raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
-    return YamlValue(path, node)
+    return YamlValue(Path(path), node)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of a rig from the files of EuRoC (`sensor.yaml`); Kalibr's are in `kalibr`."""
+"""The calibration of a rig in EuRoC's files (`sensor.yaml`), and what Kalibr's share with them."""
 
 from __future__ import annotations
 
@@ -12,100 +12,111 @@ import gtsam
 
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-from slam_graph.sensors.camera import COEFFICIENTS, Camera, Distortion
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
-DISTORTION_NAMES: dict[str, Distortion] = {
-    "none": "none",
-    "radtan": "radtan",
-    "radial-tangential": "radtan",
-    "equidistant": "equidistant",
-}
-"""The names that calibration files give to distortion models."""
-
-
-@dataclass(frozen=True, slots=True)
-class _CameraModel:
-    """A camera model of a calibration file.
-
-    Attributes:
-        name: under which `Camera` knows it together with its distortion; None if the distortion
-            says all.
-        parameters: how many intrinsics it has before fx, fy, cx, cy.
-        distortions: what it goes with.
-    """
-
-    name: Distortion | None
-    parameters: int
-    distortions: tuple[Distortion, ...]
-
-
-CAMERA_MODELS = {
-    "pinhole": _CameraModel(None, 0, ("none", "radtan", "equidistant")),
-    "omni": _CameraModel("mei", 1, ("radtan", "none")),
-    "ds": _CameraModel("double_sphere", 2, ("none",)),
-}
-"""Kalibr's names."""
+__all__ = [
+    "camera_entry",
+    "has_rolling_shutter",
+    "read_body_T_sensor",
+    "read_camera",
+    "read_euroc_rig",
+    "read_imu_noise",
+]
 
 
 def read_camera(entry: YamlValue) -> Camera:
     """Intrinsics from a mapping with the keys that EuRoC and Kalibr share.
 
     Args:
-        entry: has `camera_model`, `intrinsics` (those of the model in `CAMERA_MODELS`, and then fx,
+        entry: has `camera_model`, `intrinsics` (the leading coefficients of the model, and then fx,
             fy, cx, cy), `distortion_model`, `distortion_coefficients` or `distortion_coeffs`, and
             `resolution` (width, height).
 
     Raises:
         DataError: naming file and line of what is missing or unknown.
     """
-    model = entry.require("camera_model", "model")
-    if model.text() not in CAMERA_MODELS:
-        known = ", ".join(CAMERA_MODELS)
-        raise DataError(f"{model.where}: unknown camera model '{model.text()}'; known: {known}")
-    shape = CAMERA_MODELS[model.text()]
-    name = entry.require("distortion_model", "distortion")
-    if name.text() not in DISTORTION_NAMES:
-        raise DataError(
-            f"{name.where}: unknown distortion model '{name.text()}'; "
-            f"known: {', '.join(DISTORTION_NAMES)}"
-        )
-    distortion = DISTORTION_NAMES[name.text()]
-    if distortion not in shape.distortions:
-        raise DataError(
-            f"{name.where}: distortion '{name.text()}' does not go with camera model "
-            f"'{model.text()}'; it goes with {', '.join(shape.distortions)}"
-        )
+    model, distorted = _read_model(entry)
     intrinsics = entry.require("intrinsics")
-    *extra, fx, fy, cx, cy = intrinsics.numbers(4 + shape.parameters)
+    *leading, fx, fy, cx, cy = intrinsics.numbers(4 + model.leading)
     width, height = entry.require("resolution").numbers(2)
-    coefficients: list[float] = []
-    if distortion != "none":
+    count = len(model.coefficient_names) - model.leading
+    others = [0.0] * count
+    if distorted and count:
         values = entry.require("distortion_coefficients", "distortion_coeffs")
-        coefficients = values.numbers(COEFFICIENTS[distortion])
+        others = values.numbers(count)
+    coefficients = (*leading, *others)
     try:
-        size = (int(width), int(height))
-        if shape.name is None:
-            return Camera(fx, fy, cx, cy, distortion, tuple(coefficients), *size)
-        if shape.name == "double_sphere" and not 0.0 <= extra[1] <= 1.0:
-            raise DataError(f"alpha of a double sphere is in [0, 1], got {extra[1]}")
-        bend = coefficients or [0.0] * (COEFFICIENTS[shape.name] - len(extra))
-        return Camera(fx, fy, cx, cy, shape.name, (*extra, *bend), *size)
+        model.check(coefficients)
+        return Camera(fx, fy, cx, cy, model.name, coefficients, int(width), int(height))
     except DataError as error:
         raise DataError(f"{intrinsics.where}: {error}") from None
 
 
-def camera_entry(camera: Camera) -> tuple[str, list[float], Distortion, list[float]]:
-    """What `read_camera` reads: camera model, intrinsics, distortion model and coefficients."""
-    model, shape = next(
-        (item for item in CAMERA_MODELS.items() if item[1].name == camera.distortion),
-        ("pinhole", CAMERA_MODELS["pinhole"]),
+def _read_model(entry: YamlValue) -> tuple[CameraModel, bool]:
+    """The camera model of an entry, and whether it has a distortion.
+
+    A model with leading coefficients, such as Kalibr's omni, goes with the distortion `none` too.
+    """
+    camera = entry.require("camera_model", "model")
+    known = [part() for _, part in CAMERA_MODELS.working()]
+    models = [model for model in known if model.kalibr_camera == camera.text()]
+    if not models:
+        cameras = ", ".join(dict.fromkeys(model.kalibr_camera for model in known))
+        raise DataError(f"{camera.where}: unknown camera model '{camera.text()}'; known: {cameras}")
+    distortion = entry.require("distortion_model", "distortion")
+    for model in models:
+        if distortion.text() in _distortion_names(model):
+            return model, True
+    if distortion.text() == "none" and models[0].leading:
+        return models[0], False
+    if distortion.text() in CAMERA_MODELS:
+        CAMERA_MODELS[distortion.text()]  # raises the error of a plugin that does not work
+    names = [name for model in known for name in _distortion_names(model)]
+    if distortion.text() not in names:
+        raise DataError(
+            f"{distortion.where}: unknown distortion model '{distortion.text()}'; "
+            f"known: {', '.join(dict.fromkeys(names))}"
+        )
+    fitting = [_distortion_names(model)[0] for model in models]
+    fitting += ["none"] if models[0].leading else []
+    raise DataError(
+        f"{distortion.where}: distortion '{distortion.text()}' does not go with camera model "
+        f"'{camera.text()}'; it goes with {', '.join(dict.fromkeys(fitting))}"
     )
+
+
+def _distortion_names(model: CameraModel) -> tuple[str, ...]:
+    return model.distortion_names or (model.name,)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEntry:
+    """How calibration files describe a camera; `read_camera` reads it.
+
+    Attributes:
+        camera_model: Kalibr's name.
+        intrinsics: the leading coefficients of the model, then fx, fy, cx, cy.
+        kalibr_distortion: Kalibr's name of the distortion.
+        euroc_distortion: EuRoC's name of it.
+        coefficients: the other coefficients.
+    """
+
+    camera_model: str
+    intrinsics: list[float]
+    kalibr_distortion: str
+    euroc_distortion: str
+    coefficients: list[float]
+
+
+def camera_entry(camera: Camera) -> CameraEntry:
+    """The values of a camera in a calibration file."""
+    model, names = camera.model, _distortion_names(camera.model)
     values = [float(value) for value in camera.coefficients]
-    extra, bend = values[: shape.parameters], values[shape.parameters :]
-    intrinsics = [*extra, *map(float, (camera.fx, camera.fy, camera.cx, camera.cy))]
-    distortion = camera.distortion if shape.name is None else shape.distortions[0]
-    return model, intrinsics, distortion, bend
+    intrinsics = [*values[: model.leading], *camera.intrinsics.tolist()]
+    rest = values[model.leading :]
+    return CameraEntry(model.kalibr_camera, intrinsics, names[0], names[-1], rest)
 
 
 def has_rolling_shutter(entry: YamlValue) -> bool:
@@ -135,7 +146,7 @@ def read_imu_noise(entry: YamlValue) -> ImuNoise:
     )
 
 
-def read_body_T_sensor(path: Path) -> gtsam.Pose3:
+def read_body_T_sensor(path: str | Path) -> gtsam.Pose3:
     """`T_BS` of an EuRoC ``sensor.yaml``: the pose of the sensor on the platform.
 
     A file without this key describes a sensor that defines the platform's frame.
@@ -144,7 +155,7 @@ def read_body_T_sensor(path: Path) -> gtsam.Pose3:
     return gtsam.Pose3() if value is None else value.pose()
 
 
-def read_euroc_rig(mav0: Path, cameras: Iterable[str], imu: str = "imu0") -> Rig:
+def read_euroc_rig(mav0: str | Path, cameras: Iterable[str], imu: str = "imu0") -> Rig:
     """The rig of an EuRoC folder, from the ``sensor.yaml`` of each sensor.
 
     Args:
@@ -157,7 +168,7 @@ def read_euroc_rig(mav0: Path, cameras: Iterable[str], imu: str = "imu0") -> Rig
     Raises:
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
-    platform_T_imu, noise = gtsam.Pose3(), ImuNoise()
+    mav0, platform_T_imu, noise = Path(mav0), gtsam.Pose3(), ImuNoise()
     if (mav0 / imu).is_dir():
         noise = read_imu_noise(read_yaml(mav0 / imu / "sensor.yaml"))
         platform_T_imu = read_body_T_sensor(mav0 / imu / "sensor.yaml")

@@ -28,12 +28,14 @@ from slam_graph.sensors.euroc_calibration import (
 )
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
+__all__ = ["IMU_KEY", "chain_cameras", "kalibr_table", "read_kalibr", "write_kalibr"]
+
 IMU_KEY = "imu0"
 
 
 def read_kalibr(
-    path: Path,
-    imu_path: Path | None = None,
+    path: str | Path,
+    imu_path: str | Path | None = None,
     fallback: ImuNoise | None = None,
     needs_imu: bool = True,
 ) -> Rig:
@@ -51,7 +53,7 @@ def read_kalibr(
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
     chain = read_yaml(path)
-    return Rig(chain_cameras(chain, needs_imu), _read_imu(path, chain, imu_path, fallback))
+    return Rig(chain_cameras(chain, needs_imu), _read_imu(chain, imu_path, fallback))
 
 
 def chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
@@ -102,10 +104,8 @@ def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool
     )
 
 
-def _read_imu(
-    path: Path, chain: YamlValue, imu_path: Path | None, fallback: ImuNoise | None
-) -> ImuNoise:
-    beside = path.parent / "imu.yaml"
+def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise | None) -> ImuNoise:
+    beside = chain.path.parent / "imu.yaml"
     entry = chain.get(IMU_KEY) if imu_path is None else None
     if entry is None and imu_path is None and beside.is_file():
         imu_path = beside
@@ -117,14 +117,15 @@ def _read_imu(
     return fallback if fallback is not None else ImuNoise()
 
 
-def write_kalibr(rig: Rig, path: Path) -> None:
+def write_kalibr(rig: Rig, path: str | Path) -> None:
     """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
     text = "# Kalibr camera chain: T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu\n"
-    beside.write_text(
+    partial.write_text(
         text + yaml.safe_dump(kalibr_table(rig), sort_keys=False, default_flow_style=None)
     )
-    beside.replace(path)
+    partial.replace(path)
 
 
 def kalibr_table(rig: Rig) -> dict[str, Any]:
@@ -143,15 +144,14 @@ def kalibr_table(rig: Rig) -> dict[str, Any]:
 
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
-    camera = mounted.camera
-    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    camera, entry = mounted.camera, camera_entry(mounted.camera)
     shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
     return shutter | {
         "name": mounted.name,
-        "camera_model": model,
-        "intrinsics": intrinsics,
-        "distortion_model": distortion,
-        "distortion_coeffs": coefficients,
+        "camera_model": entry.camera_model,
+        "intrinsics": entry.intrinsics,
+        "distortion_model": entry.kalibr_distortion,
+        "distortion_coeffs": entry.coefficients,
         "resolution": [int(camera.width), int(camera.height)],
         "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist(),
         "timeshift_cam_imu": float(mounted.time_offset_s),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What sensors measure: IMU samples, camera frames, and the feature frames of a front end.
+"""Measurements: IMU samples, camera frames, and the feature frames of a front end.
 
 Time is an integer in nanoseconds (`stamp_ns`) on the clock of the IMU.
 """
@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = ["CameraFrame", "FeatureFrame", "FeatureObservations", "ImuData", "Packet"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,8 +77,8 @@ class FeatureObservations:
             same point of the world.
         pixels: (N, 2) raw (distorted) pixel coordinates (u, v).
         normalized: (N, 2) undistorted coordinates on the plane z = 1 of the camera frame.
-        descriptors: (N, B) what each looks like, in B bytes of eight bits that are compared by
-            the number of bits that differ; None where there are none.
+        descriptors: (N, B) binary descriptors of B bytes, compared by their Hamming distance; None
+            where there are none.
     """
 
     ids: IntArray
@@ -92,15 +94,17 @@ class FeatureObservations:
         """No features."""
         return FeatureObservations(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
 
-    def select(self, rows: NDArray[np.bool_]) -> FeatureObservations:
+    def select(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
-        look = None if self.descriptors is None else self.descriptors[rows]
-        return FeatureObservations(self.ids[rows], self.pixels[rows], self.normalized[rows], look)
+        descriptors = None if self.descriptors is None else self.descriptors[rows]
+        return FeatureObservations(
+            self.ids[rows], self.pixels[rows], self.normalized[rows], descriptors
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureFrame:
-    """All that the back end knows of the images taken at one time.
+    """The features of the images taken at one time: all that the back end uses of them.
 
     Attributes:
         stamp_ns: time of the frame.
@@ -112,12 +116,12 @@ class FeatureFrame:
     cameras: tuple[FeatureObservations, ...]
 
     def only(self, ids: IntArray) -> FeatureFrame:
-        """The frame with some features alone."""
+        """The frame with these features only."""
         cameras = (c.select(np.isin(c.ids, ids)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
     def without(self, ids: IntArray) -> FeatureFrame:
-        """The frame without some features."""
+        """The frame without these features."""
         if len(ids) == 0:
             return self
         cameras = (c.select(~np.isin(c.ids, ids)) for c in self.cameras)
@@ -126,13 +130,13 @@ class FeatureFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packet:
-    """What a sequence hands over at a time: a frame and the IMU samples that lead up to it.
+    """An element of a sequence: a frame and the IMU samples up to it.
 
     Attributes:
-        imu: the samples since the previous packet, up to and including the first one at or after
-            `frame.stamp_ns` (where there is one), so that consecutive packets partition the IMU
-            stream and the IMU can be interpolated at the time of the frame.
-        frame: images, or the features that a front end found in them earlier.
+        imu: the samples after those of the previous packet, up to and including the first one at
+            or after `frame.stamp_ns` (if there is one). So consecutive packets partition the IMU
+            stream, and the IMU can be interpolated at the time of the frame.
+        frame: images, or features that were found in them before.
     """
 
     imu: ImuData

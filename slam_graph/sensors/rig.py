@@ -11,18 +11,20 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 
-ROTATION_TOLERANCE = 1e-3
-"""How far R Rᵀ may be from the identity (largest element) for a calibration to be a rotation."""
+__all__ = ["ImuNoise", "Rig", "RigCamera", "pose_from_matrix"]
+
+_ROTATION_TOLERANCE = 1e-3
+"""Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """White noise and random walk of an IMU, continuous-time densities as in Kalibr and EuRoC.
+    """Noise of an IMU, as continuous-time densities like those of Kalibr and EuRoC.
 
     Attributes:
         gyro_noise_density: rad/s/√Hz.
@@ -48,7 +50,8 @@ class RigCamera:
         body_T_camera: pose of the camera in the body (IMU) frame.
         time_offset_s: t_imu = t_camera + time_offset_s (Kalibr's `timeshift_cam_imu`).
         name: of the camera in its data set, e.g. ``cam0``.
-        rolling_shutter: whether its rows are exposed one after the other; they are taken as one.
+        rolling_shutter: whether its rows are exposed one after the other. The estimator takes them
+            as exposed at one time all the same.
     """
 
     camera: Camera
@@ -63,7 +66,7 @@ class Rig:
     """All calibrated sensors of a platform.
 
     Attributes:
-        cameras: in the order in which frames list them.
+        cameras: in the order of the images of a frame.
         imu: noise of the IMU.
     """
 
@@ -77,8 +80,8 @@ class Rig:
         return Rig(self.cameras[:count], self.imu)
 
 
-def pose_from_matrix(matrix: NDArray[np.float64], where: str) -> gtsam.Pose3:
-    """A pose from a 4x4 homogeneous matrix, refusing what is not a rotation.
+def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
+    """A pose from a 4x4 homogeneous matrix.
 
     Args:
         matrix: (4, 4).
@@ -92,7 +95,7 @@ def pose_from_matrix(matrix: NDArray[np.float64], where: str) -> gtsam.Pose3:
         raise DataError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
     R = matrix[:3, :3]
     defect = float(np.max(np.abs(R @ R.T - np.eye(3))))
-    if defect > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    if defect > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise DataError(
             f"{where}: the upper left 3x3 block is not a rotation "
             f"(|R Rᵀ - I| = {defect:.2g}, det = {np.linalg.det(R):.3g})"

@@ -149,6 +149,8 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
         return f"{where}: unknown key '{dotted}'; {closest(key, known)}"
     if fault["type"] == "missing":
         return f"{where}: key '{dotted}' is missing"
+    if fault["type"] == "unused":
+        return f"{where}: '{dotted}' {fault['msg']}"
     message = str(fault["msg"]).removeprefix("Value error, ")
     got = repr(fault["input"])
     message = f"{where}: {dotted}: {message[:1].lower()}{message[1:]}"

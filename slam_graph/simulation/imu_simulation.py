@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The IMU: instantaneous samples of a motion, with white noise and biases that walk.
+"""The simulated IMU: instantaneous samples of a motion, with white noise and bias random walks.
 
-A continuous-time white noise of density σ (e.g. rad/s/√Hz) sampled at intervals Δt has the standard
-deviation σ/√Δt; a bias that walks with density σ_b takes steps of σ_b √Δt. Blocks of samples have
-generators of their own, so the same samples come out wherever reading begins.
+Continuous-time white noise of density σ (e.g. rad/s/√Hz) sampled at intervals Δt has the standard
+deviation σ/√Δt; a bias random walk of density σ_b takes steps of standard deviation σ_b √Δt. Each
+block of samples has its own random generator, so samples do not depend on where reading begins.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
 from slam_graph.simulation.motion import RecordedMotion, SplineMotion
 from slam_graph.simulation.simulation_config import SimulatedImuConfig, random_stream
+
+__all__ = ["ImuSource", "RecordedImu", "SimulatedImu"]
 
 SAMPLES_PER_BLOCK = 2000
 
@@ -49,7 +51,7 @@ class SimulatedImu:
     Attributes:
         motion: of the body.
         noise: continuous-time densities.
-        config: rate, scale of the noise, and the first biases.
+        config: rate, scale of the noise, and the initial biases.
         seed: of the simulation.
     """
 
@@ -85,20 +87,20 @@ class SimulatedImu:
     def biases(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """True biases of gyroscope and accelerometer (N, 3) at increasing times (N,)."""
         found = np.empty((2, len(stamps_ns), 3))
-        held: tuple[IntArray, FloatArray, FloatArray] | None = None
+        previous: tuple[IntArray, FloatArray, FloatArray] | None = None
         done = 0
         for block in self._walk():
-            # the last sample of the block before closes the interval between the blocks
-            stamps, gyro, accel = block if held is None else _join(held, block)
+            # the last sample of the previous block closes the interval between the blocks
+            stamps, gyro, accel = block if previous is None else _join(previous, block)
             until = int(np.searchsorted(stamps_ns, stamps[-1], side="right"))
             wanted = slice(done, until)
             seconds, at = (stamps - stamps[0]) * 1e-9, (stamps_ns[wanted] - stamps[0]) * 1e-9
             for row, values in enumerate((gyro, accel)):
                 for axis in range(3):
                     found[row, wanted, axis] = np.interp(at, seconds, values[:, axis])
-            held, done = (stamps[-1:], gyro[-1:], accel[-1:]), until
-        assert held is not None
-        found[0, done:], found[1, done:] = held[1], held[2]
+            previous, done = (stamps[-1:], gyro[-1:], accel[-1:]), until
+        assert previous is not None
+        found[0, done:], found[1, done:] = previous[1], previous[2]
         return found[0], found[1]
 
     def _walk(self) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
@@ -113,10 +115,10 @@ class SimulatedImu:
             stamps = self.motion.start_ns + np.round(index * (1e9 / self.rate_hz)).astype(np.int64)
             rng = np.random.default_rng(random_stream(self.seed, "imu walk", block))
             steps = rng.normal(size=(2, SAMPLES_PER_BLOCK, 3)) * step[:, None, None]
-            ways = bias[:, None, :] + np.cumsum(steps, axis=1)
-            biases = np.concatenate([bias[:, None, :], ways[:, :-1]], axis=1)[:, : len(index)]
+            walks = bias[:, None, :] + np.cumsum(steps, axis=1)
+            biases = np.concatenate([bias[:, None, :], walks[:, :-1]], axis=1)[:, : len(index)]
             yield stamps, biases[0], biases[1]
-            bias = ways[:, -1]
+            bias = walks[:, -1]
 
     def _white_sigmas(self) -> tuple[float, float]:
         root = self.config.noise_scale * float(np.sqrt(self.rate_hz))
@@ -124,22 +126,23 @@ class SimulatedImu:
 
 
 def _join(
-    held: tuple[IntArray, FloatArray, FloatArray], block: tuple[IntArray, FloatArray, FloatArray]
+    previous: tuple[IntArray, FloatArray, FloatArray],
+    block: tuple[IntArray, FloatArray, FloatArray],
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     return (
-        np.concatenate([held[0], block[0]]),
-        np.concatenate([held[1], block[1]]),
-        np.concatenate([held[2], block[2]]),
+        np.concatenate([previous[0], block[0]]),
+        np.concatenate([previous[1], block[1]]),
+        np.concatenate([previous[2], block[2]]),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedImu:
-    """The IMU that was recorded on a flight; its biases are those of the ground truth.
+    """The recorded IMU of a real flight; its true biases are those of the ground truth.
 
     Attributes:
         data: the samples of the flight.
-        motion: the recorded motion; its biases count as zero where the recording has none.
+        motion: the recorded motion; biases are taken as zero where the recording has none.
     """
 
     data: ImuData
@@ -158,7 +161,7 @@ class RecordedImu:
 
     def biases(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Biases of gyroscope and accelerometer (N, 3) at times (N,) within the motion."""
-        there = self.motion.at(stamps_ns)
-        none = np.zeros((len(stamps_ns), 3))
-        gyro = none if there.gyro_biases is None else there.gyro_biases
-        return gyro, none if there.accel_biases is None else there.accel_biases
+        truth = self.motion.at(stamps_ns)
+        zero = np.zeros((len(stamps_ns), 3))
+        gyro = zero if truth.gyro_biases is None else truth.gyro_biases
+        return gyro, zero if truth.accel_biases is None else truth.accel_biases

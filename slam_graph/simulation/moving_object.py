@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A board that moves through the world before the cameras: an object to mislead an estimator."""
+"""A textured board that moves in front of the cameras: a dynamic object in rendered images."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import MovingObjectConfig, random_stream
 from slam_graph.simulation.world import Panel
 
+__all__ = ["MovingBoard"]
+
 SMOOTHING_NS = 1_000_000_000
-"""The path is that of the cameras, averaged over so long before and after."""
+"""The path of the board is that of the camera, averaged over this time before and after."""
 SMOOTHING_SAMPLES = 21
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBoard:
-    """A rectangle on a path of its own, facing where the cameras come from.
+    """A rectangle that faces the cameras and moves in the world.
 
-    Its middle is `distance_m` ahead of the smoothed path of a camera, and on top of that it goes to
-    and fro across the view as a sine. Like a vehicle that drives ahead it keeps in view, and its
-    motion in the world is as large as that of the cameras.
+    Its centre is `distance_m` ahead of the smoothed path of a camera, plus a sinusoidal motion to
+    either side. Like a vehicle that drives ahead it stays in view, and it moves as far in the world
+    as the cameras do.
 
     Attributes:
-        config: size, distance and path.
+        config: size, distance and motion.
         motion: of the platform.
         body_R_camera: (3, 3) of the camera in whose view it stays.
-        body_p_camera: (3,) of the same.
+        body_p_camera: (3,) of the same camera.
         began_ns: time of the first frame.
-        phase_rad: of the sine, at the first frame.
+        phase_rad: of the sinusoid, at the first frame.
     """
 
     config: MovingObjectConfig
@@ -50,7 +52,7 @@ class MovingBoard:
         began_ns: int,
         seed: int,
     ) -> MovingBoard:
-        """A board before a camera that is mounted at `body_T_camera` (4, 4)."""
+        """A board in front of the camera mounted at `body_T_camera` (4, 4)."""
         rng = np.random.default_rng(random_stream(seed, "object"))
         phase_rad = float(rng.uniform(0.0, 2.0 * np.pi))
         R, p = body_T_camera[:3, :3], body_T_camera[:3, 3]
@@ -62,7 +64,7 @@ class MovingBoard:
         return self.config.width_m, self.config.height_m
 
     def at(self, stamp_ns: int) -> Panel:
-        """Where the board is at a time on the clock of the IMU."""
+        """The board at a time on the clock of the IMU."""
         eye, right, ahead = self._smooth_view(stamp_ns)
         up = np.cross(right, ahead)
         middle = eye + self.config.distance_m * ahead + self._sideways_m(stamp_ns) * right
@@ -81,7 +83,7 @@ class MovingBoard:
         return eye, right / np.linalg.norm(right), ahead
 
     def _sideways_m(self, stamp_ns: int) -> float:
-        """How far right of the middle it is; until `since_s` it comes in from outside the view."""
+        """Displacement to the right, m; until `since_s` it moves in from outside the view."""
         config, t_s = self.config, (stamp_ns - self.began_ns) * 1e-9
         turn = config.speed / config.sway_m * t_s + self.phase_rad
         coming = config.speed * max(config.since_s - t_s, 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights that were recorded: the path to fly along, the rig, and the IMU that flew."""
+"""A recorded flight to simulate along: its ground truth, rig and IMU samples."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ import numpy as np
 
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import DataError, closest
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
-from slam_graph.simulation.simulation_config import SimulationConfig
+from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
+
+__all__ = ["LEAD_NS", "RecordedFlight"]
 
 LEAD_NS = 100_000_000
-"""How long before the first frame and after the last one a motion and its IMU go on."""
+"""Time by which motion and IMU extend beyond the first and last frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedFlight:
-    """A recorded flight, or the part of it that is asked for.
+    """A recorded flight, or the requested part of it.
 
     Attributes:
-        path: where it is from.
-        truth: its poses.
-        rig: its sensors, if it says.
-        sequence: the recording itself, if the path is of one.
+        path: where it was read from.
+        truth: its ground truth.
+        rig: its sensors, or None for a bare ground-truth file.
+        sequence: the recording, or None for a bare ground-truth file.
     """
 
     path: Path
@@ -42,15 +45,13 @@ class RecordedFlight:
 
     @staticmethod
     def read(path: Path, config: SimulationConfig, diagnostics: Diagnostics) -> RecordedFlight:
-        """The part of the recording at `path` that the settings ask for.
+        """Read the part of the recording at `path` that the settings ask for.
 
         Raises:
-            DataError: if there is none, or no IMU where the settings ask for the recorded one.
+            DataError: if there is no such file, or no IMU although `real_imu` is set.
         """
         if not path.exists():
-            raise DataError(
-                f"{path}: no such trajectory; give figure8, rooms, random, or an existing path"
-            )
+            raise DataError(f"{path}: no such trajectory; {closest(str(path), TRAJECTORIES)}")
         truth = read_groundtruth(path, diagnostics)
         start_ns = int(truth.stamps_ns[0]) + round(config.start_s * 1e9)
         end_ns = int(truth.stamps_ns[-1])
@@ -59,14 +60,14 @@ class RecordedFlight:
         folder = path / "mav0" if (path / "mav0").is_dir() else path
         sequence = None
         if (folder / "imu0" / "data.csv").is_file() and any(folder.glob("cam[0-9]*")):
-            sequence = EurocSequence(path, diagnostics=diagnostics)
+            sequence = EurocSequence(path, ReaderOptions(diagnostics=diagnostics))
         elif config.real_imu:
             raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
         rig = None if sequence is None else sequence.rig
         return RecordedFlight(path, _part(truth, start_ns, end_ns, path), rig, sequence)
 
     def motion(self, smooth: SplineMotion) -> RecordedMotion:
-        """The recorded poses themselves; velocities of a smooth fit where none were recorded."""
+        """The recorded poses; velocities are those of a smooth fit if none were recorded."""
         truth = self.truth
         if truth.velocities is None:
             truth = Trajectory(
@@ -78,7 +79,7 @@ class RecordedFlight:
         return RecordedMotion(int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]), truth)
 
     def samples(self, motion: Motion) -> ImuData:
-        """The recorded IMU over a motion."""
+        """The recorded IMU samples during a motion."""
         assert self.sequence is not None
         data = ImuData.concatenate(list(self.sequence.imu_blocks(motion.start_ns - LEAD_NS)))
         data = data[: int(np.searchsorted(data.stamps_ns, motion.end_ns + LEAD_NS))]
@@ -93,7 +94,7 @@ def _part(truth: Trajectory, start_ns: int, end_ns: int, path: Path) -> Trajecto
         int(np.searchsorted(truth.stamps_ns, end_ns)) + 1,  # so that the end is covered
     )
     if min(rows.stop, len(truth)) - rows.start < 2:
-        raise DataError(f"{path}: the trajectory is over before start_s and duration_s begin")
+        raise DataError(f"{path}: the trajectory ends before start_s")
     columns: dict[str, Any] = {
         name: values[rows]
         for name in Trajectory.__dataclass_fields__

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered images: for every pixel a ray to the nearest wall, and the texture that it hits.
+"""Ray-casting renderer: for every pixel the nearest wall along its ray, and the texture there.
 
-Rays are those of the camera model itself, so distortion is exact; textures are interpolated at
-floating-point places (OpenCV's warps round to 1/32 of a pixel and more).
+Rays are those of the camera model, so distortion is exact. Textures are interpolated in floating
+point (OpenCV's warps round coordinates to 1/32 of a pixel or more).
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
 
+__all__ = ["Renderer"]
+
 NEAREST_M = 1e-3
 LIGHT = np.array([0.25, 0.45, 0.86])
-"""Where the light comes from: walls of different direction differ in brightness."""
+"""Direction of the light: walls of different orientation differ in brightness."""
+
+BLUR_SAMPLES = 5
+"""Sharp images that are averaged to one with motion blur; each costs a whole rendering."""
 
 
 class Renderer:
-    """Takes images of a world; every image depends on its time and the seed alone.
+    """Renders images of a world; an image depends on its time and the seed only.
 
     Args:
         rig: the cameras.
@@ -34,7 +39,7 @@ class Renderer:
         atlas: their textures.
         config: noise, exposure, blur.
         seed: of the simulation.
-        board: what moves before the cameras; its texture is the last one of the atlas.
+        board: moving object, whose texture is the last one of the atlas; or None.
     """
 
     def __init__(
@@ -61,7 +66,7 @@ class Renderer:
         Args:
             motion: of the platform.
             exposure_ns: middle of the exposure on the clock of the IMU.
-            offset_ns: what the clock of the IMU shows more than that of the cameras.
+            offset_ns: time of the IMU clock minus time of the camera clock.
         """
         stamps = self._instants(motion, exposure_ns)
         rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
@@ -84,29 +89,29 @@ class Renderer:
     def radiance(
         self, camera: int, world: World, world_R_body: FloatArray, position: FloatArray
     ) -> Grey:
-        """What each pixel of a camera sees, (height · width,), for a pose of the body."""
+        """Noise-free grey values of a camera, (height · width,), for a pose of the body."""
         lens = self._cameras[camera]
         R = world_R_body @ lens.body_R_camera
         eye = position + world_R_body @ lens.position
         rays = lens.rays @ R.T.astype(np.float32)
         hit = cast(world, eye, rays)
-        # a pixel covers distance / focal length, and more on a wall that is seen at an angle
+        # a pixel covers distance / focal length, and more on a wall at a slant
         footprint = hit.distance * lens.stretch / (lens.focal_px * np.sqrt(hit.slant))
         shade = np.array([_shade(panel) for panel in world.panels], np.float32)
         grey = shade[hit.panel] * self._atlas.sample(hit.panel, footprint, hit.a, hit.b)
         return np.where(lens.lit, grey, np.float32(0.0))
 
     def _world_at(self, stamp_ns: int) -> World:
-        """The walls, and where the board is at a time."""
+        """The walls, and the board at a time."""
         if self._board is None:
             return self._world
         return World((*self._world.panels, self._board.at(stamp_ns)))
 
     def _instants(self, motion: Motion, exposure_ns: int) -> NDArray[np.int64]:
-        """Times of the sharp images of which a blurred one is the mean."""
+        """Times of the sharp images whose mean is the blurred one."""
         if self._config.exposure_s == 0.0:
             return np.array([exposure_ns], np.int64)
-        count = self._config.blur_samples
+        count = BLUR_SAMPLES
         parts = (np.arange(count) + 0.5) / count - 0.5
         shifts = np.round(parts * self._config.exposure_s * 1e9).astype(np.int64)
         return np.clip(exposure_ns + shifts, motion.start_ns, motion.end_ns)
@@ -122,9 +127,9 @@ class _RayCamera:
 
     Attributes:
         rays: (H W, 3) unit vectors in the camera frame.
-        stretch: (H W,) how much more of the view a pixel takes in than one in the middle.
+        stretch: (H W,) angle that a pixel covers, relative to one at the centre.
         focal_px: mean focal length.
-        lit: (H W,) which pixels see anything; not those beyond what the camera model reaches.
+        lit: (H W,) pixels inside the valid field of view of the camera model.
     """
 
     def __init__(self, mounted: RigCamera) -> None:
@@ -140,19 +145,19 @@ class _RayCamera:
         grid = rays.reshape(self.height, self.width, 3)
         sides = [np.linalg.norm(np.gradient(grid, axis=axis), axis=2) for axis in (0, 1)]
         stretch = (np.sqrt(sides[0] * sides[1]) * self.focal_px).ravel().astype(np.float32)
-        self.stretch = np.maximum(stretch, np.float32(1e-3))  # pixels that are not lit have none
+        self.stretch = np.maximum(stretch, np.float32(1e-3))  # it is 0 outside the field of view
         self.body_R_camera = pose.rotation().matrix()
         self.position = np.asarray(pose.translation())
 
 
-class Hits:
-    """Where N rays hit.
+class _Hits:
+    """Intersections of N rays with the panels.
 
     Attributes:
         panel: (N,) numbers of the panels; 0 where nothing is hit.
         distance: (N,) m, along the ray.
         slant: (N,) cosine of the angle between ray and normal.
-        a, b: (N,) place on the panel, across and along, m.
+        a, b: (N,) coordinates on the panel, across and along, m.
     """
 
     def __init__(self, count: int) -> None:
@@ -163,15 +168,15 @@ class Hits:
         self.b: Grey = np.zeros(count, np.float32)
 
 
-def cast(world: World, eye: FloatArray, rays: Grey) -> Hits:
-    """The nearest panel that each ray hits.
+def cast(world: World, eye: FloatArray, rays: Grey) -> _Hits:
+    """The nearest panel along each ray.
 
     Args:
-        world: the panels; those seen from behind let rays through.
-        eye: (3,) where the rays begin.
+        world: the panels; from behind they are transparent.
+        eye: (3,) origin of the rays.
         rays: (N, 3) unit vectors.
     """
-    hits = Hits(len(rays))
+    hits = _Hits(len(rays))
     for index, panel in enumerate(world.panels):
         away = panel.corner - eye
         height = float(away @ panel.normal)

@@ -1,22 +1,33 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulation as a sequence: everything that runs on a recording runs on it."""
+"""A simulation as a sequence: read and run like any recording, or written to a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import gtsam
 import numpy as np
+import yaml
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.formats.euroc_writer import EurocWriter
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks
@@ -28,15 +39,22 @@ from slam_graph.simulation.textures import paint
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
+__all__ = ["Flight", "SimulatedImages", "SimulatedSequence", "SimulatedTracks"]
+
+SETTINGS_FILE = "simulation.yaml"
+
+Progress = Callable[[int], None]
+"""Called with the time of every frame that has been written, ns."""
+
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """All that is known of a simulated flight before anything is measured.
+    """The ground truth of a simulated flight.
 
     Attributes:
         rig: cameras and noise of the IMU.
         motion: of the platform.
-        imu: the IMU stream with its true biases.
+        imu: the IMU samples and their true biases.
         world: the walls.
         exposures_ns: (N,) times of the frames on the clock of the IMU.
     """
@@ -49,13 +67,13 @@ class Flight:
 
 
 class SimulatedSequence(RecordedSequence):
-    """What a rig measures on a flight that is known exactly; nothing is stored, all is streamed.
+    """The measurements of a simulated flight, generated while they are read.
 
     Where the rig has a time offset, frames are stamped by the clock of its first camera.
 
     Attributes:
         config: all settings.
-        flight: what is true.
+        flight: the ground truth.
     """
 
     format: ClassVar[str] = "simulation"
@@ -67,27 +85,27 @@ class SimulatedSequence(RecordedSequence):
         flight: Flight,
         diagnostics: Diagnostics | None = None,
     ) -> None:
-        super().__init__(name, flight.rig, None, diagnostics)
+        super().__init__(name, flight.rig, ReaderOptions(diagnostics=diagnostics or Diagnostics()))
         self.config = config
         self.flight = flight
         self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)
 
     @property
     def has_groundtruth(self) -> bool:
-        """It always has one."""
+        """Always true."""
         return True
 
     def measure(self) -> Extent:
-        """How much will be simulated."""
+        """Number of frames and IMU samples, and the time of the first and last frame."""
         stamps = self.flight.exposures_ns - self._offset_ns
         return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self.flight.imu.samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """The IMU stream from `after_ns` on."""
+        """The IMU samples from `after_ns` on."""
         return self.flight.imu.blocks(after_ns)
 
     def groundtruth(self) -> Trajectory:
-        """The truth at the times of the frames, on the clock of the IMU."""
+        """The ground truth at the times of the frames, on the clock of the IMU."""
         stamps, motion = self.flight.exposures_ns, self.flight.motion
         gyro_biases, accel_biases = self.flight.imu.biases(stamps)
         return Trajectory(
@@ -95,12 +113,12 @@ class SimulatedSequence(RecordedSequence):
             motion.positions(stamps),
             motion.rotations(stamps).as_quat(),
             motion.velocities(stamps),
-            gyro_biases,
-            accel_biases,
+            accel_biases=accel_biases,
+            gyro_biases=gyro_biases,
         )
 
     def initial_state(self) -> NavState:
-        """The state at the first frame: the truth, or with an error as its covariance says."""
+        """The state at the first frame: the truth, or with an error drawn from its covariance."""
         start, first = self.config.known_start, self.flight.exposures_ns[:1]
         sigmas = (
             start.rotation_rad,
@@ -109,10 +127,10 @@ class SimulatedSequence(RecordedSequence):
             start.accel_bias,
             start.gyro_bias,
         )
-        spread, error = np.repeat(sigmas, 3), np.zeros(15)
+        standard_deviations, error = np.repeat(sigmas, 3), np.zeros(15)
         if start.error:
             rng = np.random.default_rng(random_stream(self.config.seed, "start"))
-            error = rng.normal(size=15) * spread
+            error = rng.normal(size=15) * standard_deviations
         motion = self.flight.motion
         R = gtsam.Rot3(motion.rotations(first).as_matrix()[0])
         gyro_biases, accel_biases = self.flight.imu.biases(first)
@@ -120,10 +138,29 @@ class SimulatedSequence(RecordedSequence):
             int(first[0]),
             gtsam.Pose3(R, motion.positions(first)[0]).retract(error[:6]),
             motion.velocities(first)[0] + error[6:9],
-            gyro_biases[0] + error[12:],
-            accel_biases[0] + error[9:12],
-            np.diag(spread**2),
+            accel_bias=accel_biases[0] + error[9:12],
+            gyro_bias=gyro_biases[0] + error[12:],
+            covariance=np.diag(standard_deviations**2),
         )
+
+    def save(self, path: str | Path, progress: Progress | None = None) -> None:
+        """Write the simulation to a new folder, completely or not at all, with its settings.
+
+        Args:
+            path: the folder. Tracks become a recording (`datasets/formats/track_format.py`),
+                images an EuRoC (ASL) folder with the calibration in Kalibr's format beside it.
+            progress: called after every frame.
+
+        Raises:
+            DataError: if the folder exists already.
+        """
+        self._write(Path(path), progress if progress is not None else _ignore)
+        settings = self.config.model_dump(mode="json")
+        (Path(path) / SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+
+    @abstractmethod
+    def _write(self, path: Path, progress: Progress) -> None:
+        """Write measurements, calibration and ground truth."""
 
 
 class SimulatedTracks(SimulatedSequence):
@@ -143,7 +180,7 @@ class SimulatedTracks(SimulatedSequence):
         self.landmarks = landmarks
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
-        """Frames of features; those before `start_ns` are simulated too, and left out."""
+        """Frames of features; those before `start_ns` are simulated too, but left out."""
         flight, config = self.flight, self.config
         simulator = TrackSimulator(
             flight.rig, flight.world, self.landmarks, config.tracks, config.seed
@@ -154,6 +191,14 @@ class SimulatedTracks(SimulatedSequence):
             if start_ns is None or frame.stamp_ns >= start_ns:
                 yield frame
 
+    def _write(self, path: Path, progress: Progress) -> None:
+        truth, start = self.groundtruth(), self.initial_state()
+        with TrackRecorder(path, self.rig, self.name, truth, start) as recorder:
+            for packet in self.packets():
+                assert isinstance(packet.frame, FeatureFrame)
+                recorder.write(packet.imu, packet.frame)
+                progress(packet.frame.stamp_ns)
+
 
 class SimulatedImages(SimulatedSequence):
     """Rendered images of a textured world."""
@@ -162,7 +207,7 @@ class SimulatedImages(SimulatedSequence):
 
     @cached_property
     def renderer(self) -> Renderer:
-        """Takes the images; the walls are painted when it is first asked for."""
+        """The renderer; textures are generated on first use."""
         flight, config = self.flight, self.config
         board = self.board
         sizes = [panel.size for panel in flight.world.panels]
@@ -175,7 +220,7 @@ class SimulatedImages(SimulatedSequence):
 
     @cached_property
     def board(self) -> MovingBoard | None:
-        """What moves before the cameras, if anything."""
+        """The moving object, if there is one."""
         flight, config = self.flight, self.config.moving_object
         if config is None:
             return None
@@ -189,3 +234,16 @@ class SimulatedImages(SimulatedSequence):
         wanted = exposures[within(exposures - self._offset_ns, start_ns, end_ns)]
         for exposure_ns in wanted.tolist():
             yield self.renderer.frame(self.flight.motion, exposure_ns, self._offset_ns)
+
+    def _write(self, path: Path, progress: Progress) -> None:
+        truth, rate_hz = self.groundtruth(), self.config.rate_hz
+        with EurocWriter(path, self.rig, truth, "simulated", rate_hz) as writer:
+            for packet in self.packets():
+                assert isinstance(packet.frame, CameraFrame)
+                writer.write_imu(packet.imu)
+                writer.write_frame(packet.frame)
+                progress(packet.frame.stamp_ns)
+
+
+def _ignore(stamp_ns: int) -> None:
+    """No progress is shown."""

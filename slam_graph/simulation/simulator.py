@@ -1,56 +1,116 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""From settings to a simulated sequence."""
+"""`simulate`: from settings to a simulated sequence.
+
+A simulation needs a rig (EuRoC's stereo rig unless given), a motion (generated or recorded), an
+IMU, and a world with landmarks or textures.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera, pose_from_matrix
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.recorded_flight import LEAD_NS, RecordedFlight
-from slam_graph.simulation.rigs import euroc_rig
 from slam_graph.simulation.simulated_sequence import (
     Flight,
     SimulatedImages,
     SimulatedSequence,
     SimulatedTracks,
 )
-from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
+from slam_graph.simulation.simulation_config import (
+    SimulationConfig,
+    load_simulation_config,
+    random_stream,
+)
 from slam_graph.simulation.splines import fit, stamps_between
 from slam_graph.simulation.trajectories import fly
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import room_around, three_rooms
 
+__all__ = ["euroc_rig", "simulate"]
+
 DEFAULT_DURATION_S = 60.0
-LOOK_PERIOD_NS = 100_000_000
+
+POSITION_PERIOD_NS = 100_000_000
+"""Spacing of the positions around which a room is built."""
+
+SIZE = (752, 480)
+LEFT = Camera(
+    *(458.654, 457.296, 367.215, 248.375),
+    "radtan",
+    (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+    *SIZE,
+)
+RIGHT = Camera(
+    *(457.587, 456.134, 379.999, 255.238),
+    "radtan",
+    (-0.28368365, 0.07451284, -0.00010473, -3.55590700e-05),
+    *SIZE,
+)
+BODY_T_LEFT = (
+    (0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975),
+    (0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768),
+    (-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949),
+    (0.0, 0.0, 0.0, 1.0),
+)
+BODY_T_RIGHT = (
+    (0.0125552670891, -0.999755099723, 0.0182237714554, -0.0198435579556),
+    (0.999598781151, 0.0130119051815, 0.0251588363115, 0.0453689425024),
+    (-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038),
+    (0.0, 0.0, 0.0, 1.0),
+)
 
 
-def simulate(config: SimulationConfig, diagnostics: Diagnostics | None = None) -> SimulatedSequence:
-    """A sequence that is simulated while it is read.
+def simulate(
+    config: SimulationConfig | str | Path | None = None,
+    overrides: Iterable[str] = (),
+    *,
+    diagnostics: Diagnostics | None = None,
+    **settings: Any,
+) -> SimulatedSequence:
+    """A simulated sequence, generated while it is read.
+
+        sequence = simulate(trajectory="rooms", duration_s=60, seed=1, tracks={"loss": 0.02})
+        result = run(sequence)
+        sequence.save("flight")
 
     Args:
-        config: all settings; the same ones give the same bytes.
-        diagnostics: where faults are counted.
+        config: settings, or the path of a YAML file with settings; the defaults if None.
+        overrides: `a.b=value`, as `--set` takes them.
+        diagnostics: counts the faults of a recorded trajectory.
+        settings: top-level settings by name, laid over `config`.
+
+    Returns:
+        The sequence; the same settings give the same bytes.
 
     Raises:
-        ConfigError: if settings contradict one another.
+        ConfigError: if settings are unknown or contradict one another.
         DataError: if a recorded trajectory or calibration is missing or cannot be used.
     """
+    config = load_simulation_config(config, overrides, **settings)
     if config.recorded is None and (config.real_imu or config.start_s > 0):
         raise ConfigError(
-            f"real_imu and start_s are for recorded trajectories, '{config.trajectory}' is made up"
+            "real_imu and start_s are for recorded trajectories, "
+            f"'{config.trajectory}' is a generated one"
         )
     if config.moving_object is not None and config.kind != "images":
-        raise ConfigError("moving_object is for images; tracks have landmarks.moving_points")
+        raise ConfigError(
+            "moving_object is for images; for tracks set landmarks.moving_points instead"
+        )
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
     flight = _flight(config, diagnostics)
     source = config.trajectory if config.recorded is None else _name(config.recorded)
@@ -60,9 +120,22 @@ def simulate(config: SimulationConfig, diagnostics: Diagnostics | None = None) -
     return SimulatedTracks(name, config, flight, _landmarks(config, flight), diagnostics)
 
 
+def euroc_rig() -> Rig:
+    """EuRoC's calibrated rig: two cameras 11 cm apart, and an IMU at 200 Hz."""
+    cameras = (
+        RigCamera(LEFT, _pose(BODY_T_LEFT), 0.0, "cam0"),
+        RigCamera(RIGHT, _pose(BODY_T_RIGHT), 0.0, "cam1"),
+    )
+    return Rig(cameras, ImuNoise())
+
+
+def _pose(rows: tuple[tuple[float, ...], ...]) -> gtsam.Pose3:
+    return pose_from_matrix(np.array(rows), "body_T_camera")
+
+
 def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
     if config.recorded is None:
-        return _made_up(config)
+        return _generated(config)
     recording = RecordedFlight.read(config.recorded, config, diagnostics)
     rig = _rig(config, recording.rig)
     smooth = fit(recording.truth)
@@ -75,12 +148,12 @@ def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
     return Flight(rig, motion, imu, world, _exposures(motion, config))
 
 
-def _made_up(config: SimulationConfig) -> Flight:
+def _generated(config: SimulationConfig) -> Flight:
     rig = _rig(config, None)
     duration_s = config.duration_s if config.duration_s is not None else DEFAULT_DURATION_S
     rng = np.random.default_rng(random_stream(config.seed, "trajectory"))
-    whole_s = duration_s + 2e-9 * LEAD_NS
-    motion = fly(config.trajectory, whole_s, rig.cameras[0].body_T_camera, config.flight, rng)
+    total_s = duration_s + 2e-9 * LEAD_NS
+    motion = fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flight, rng)
     imu = SimulatedImu(motion, rig.imu, config.imu, config.seed)
     world = three_rooms()
     if config.trajectory != "rooms":
@@ -92,19 +165,19 @@ def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:
     rng = np.random.default_rng(random_stream(config.seed, "landmarks"))
     settings = config.landmarks
     if settings.kind == "ahead":
-        views = [View.of(mounted, config.tracks) for mounted in flight.rig.cameras]
+        views = [View.of(mounted) for mounted in flight.rig.cameras]
         leaders = [views[group[0]] for group in camera_groups(flight.rig, views)]
-        still = ahead(flight.motion, leaders, config.tracks.features, settings, rng)
+        static = ahead(flight.motion, leaders, config.tracks.features, rng)
     else:
-        still = on_walls(flight.world, settings.density, rng)
+        static = on_walls(flight.world, settings.density, rng)
     if settings.moving_points == 0:
-        return still
+        return static
     box = moving_box(_positions(flight.motion), flight.motion.start_ns, settings.moving_points, rng)
-    return Landmarks(still.points, still.normals, box)
+    return Landmarks(static.points, static.normals, box)
 
 
 def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
-    """The rig that is asked for, or that of the recording, or EuRoC's."""
+    """The rig of the settings, or that of the recording, or EuRoC's."""
     if config.calibration is not None:
         rig = read_kalibr(config.calibration)
     else:
@@ -113,7 +186,7 @@ def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
 
 
 def _positions(motion: Motion) -> FloatArray:
-    stamps = np.arange(motion.start_ns, motion.end_ns, LOOK_PERIOD_NS, dtype=np.int64)
+    stamps = np.arange(motion.start_ns, motion.end_ns, POSITION_PERIOD_NS, dtype=np.int64)
     return motion.positions(stamps)
 
 

@@ -13,9 +13,11 @@ from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.simulation.motion import SplineMotion
 
+__all__ = ["continuous", "fit", "stamps_between", "through_waypoints"]
+
 KNOT_SPACING_S = 0.1
-"""Distance of the knots of a fitted spline: it follows motions of up to some 4 Hz, and smooths what
-is faster (noise of the recording)."""
+"""Distance of the knots of a fitted spline: it follows motions of up to about 4 Hz and smooths
+faster ones (noise of the recording)."""
 
 DEGREE = 5
 LONGEST_GAP_S = 0.5
@@ -24,19 +26,19 @@ LONGEST_GAP_S = 0.5
 def through_waypoints(times_s: FloatArray, poses: FloatArray) -> BPoly:
     """A spline through waypoints with continuous velocity and acceleration.
 
-    Between equal neighbours it stands perfectly still; it comes there and leaves with zero velocity
-    and acceleration.
+    Between equal neighbours it is constant; it arrives and leaves there with zero velocity and
+    acceleration.
 
     Args:
         times_s: (N,) strictly increasing, N ≥ 2.
-        poses: (N, 7) position and quaternion, neighbouring quaternions on the same half of the
-            sphere.
+        poses: (N, 7) position and quaternion, neighbouring quaternions in the same
+            hemisphere.
 
     Returns:
-        A quintic Hermite spline: position, velocity and acceleration at each waypoint fix each
-        segment by itself.
+        A quintic Hermite spline: position, velocity and acceleration at its two ends determine
+        each segment.
     """
-    slopes, bends = np.zeros_like(poses), np.zeros_like(poses)
+    slopes, curvatures = np.zeros_like(poses), np.zeros_like(poses)
     held = np.all(poses[1:] == poses[:-1], axis=1)
     for first, last in _stretches(~held):
         ends = (
@@ -45,11 +47,11 @@ def through_waypoints(times_s: FloatArray, poses: FloatArray) -> BPoly:
         )
         rows = slice(first, last + 1)
         moving = CubicSpline(times_s[rows], poses[rows], bc_type=ends)
-        slopes[rows], bends[rows] = moving(times_s[rows], 1), moving(times_s[rows], 2)
+        slopes[rows], curvatures[rows] = moving(times_s[rows], 1), moving(times_s[rows], 2)
         for end, clamped in ((first, first > 0), (last, last < len(poses) - 1)):
             if clamped:
-                slopes[end] = bends[end] = 0.0
-    return BPoly.from_derivatives(times_s, np.stack([poses, slopes, bends], axis=1))
+                slopes[end] = curvatures[end] = 0.0
+    return BPoly.from_derivatives(times_s, np.stack([poses, slopes, curvatures], axis=1))
 
 
 def _stretches(moving: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -59,10 +61,10 @@ def _stretches(moving: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def fit(trajectory: Trajectory, spacing_s: float = KNOT_SPACING_S) -> SplineMotion:
-    """A smooth motion along a recorded trajectory (least squares).
+    """A smooth motion along a recorded trajectory, by least squares.
 
     Args:
-        trajectory: of some tens of poses a second at least.
+        trajectory: with at least some tens of poses per second.
         spacing_s: distance of the knots.
 
     Raises:
@@ -96,7 +98,7 @@ def _knots(times_s: FloatArray, spacing_s: float) -> FloatArray:
 
 
 def continuous(quaternions: FloatArray) -> FloatArray:
-    """The same rotations (N, 4), each with the sign that is nearest to the one before."""
+    """The same rotations (N, 4), with signs such that neighbours are in the same hemisphere."""
     turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turned])) % 2 == 1, -1.0, 1.0)
     smooth: FloatArray = quaternions * signs[:, None]
@@ -104,7 +106,7 @@ def continuous(quaternions: FloatArray) -> FloatArray:
 
 
 def stamps_between(start_ns: int, end_ns: int, rate_hz: float) -> IntArray:
-    """Times from `start_ns` to at most `end_ns` at a rate, each rounded by itself."""
+    """Times from `start_ns` to at most `end_ns` at a rate; rounding errors do not add up."""
     count = int((end_ns - start_ns) * 1e-9 * rate_hz + 1e-6) + 1
     steps = np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     return start_ns + steps

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Textures of walls: band-limited noise in pyramids of resolutions, packed into one array."""
+"""Textures: band-limited noise in image pyramids, packed into one array."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from slam_graph.simulation.simulation_config import random_stream
 
+__all__ = ["Atlas", "Grey", "paint"]
+
 Grey = NDArray[np.float32]
+"""Grey values, or other single-precision numbers per pixel."""
 
 LEVELS = 7
-"""Of a pyramid: each has half the resolution of the one before, the last one 1/64."""
+"""Levels of a pyramid: each has half the resolution of the previous one, the last 1/64."""
 
 FINEST_WAVE_TEXELS = 4
 """Distance of the nodes of the finest noise; linear interpolation of texels is accurate then."""
@@ -34,7 +37,7 @@ class Atlas:
 
     Attributes:
         texels: (T,) uint8, all levels of all panels, row by row.
-        offsets: (P * LEVELS,) where each level of each panel begins.
+        offsets: (P * LEVELS,) index of the first texel of each level of each panel.
         widths, heights: (P * LEVELS,) of each level, in texels.
         texels_m: (P,) sizes of a texel of the finest level of each panel, m.
     """
@@ -46,12 +49,12 @@ class Atlas:
     texels_m: Grey
 
     def sample(self, panel: NDArray[np.intp], footprint: Grey, a: Grey, b: Grey) -> Grey:
-        """Grey values, interpolated linearly between texels and between levels.
+        """Grey values (N,), interpolated linearly between texels and between levels (trilinear).
 
         Args:
             panel: (N,) numbers of the panels.
-            footprint: (N,) what a pixel covers there, m.
-            a: (N,) places on the panel, across, m.
+            footprint: (N,) length on the panel that a pixel covers, m.
+            a: (N,) coordinates on the panel, across, m.
             b: (N,) along, m.
         """
         texel_m = self.texels_m[panel]
@@ -64,10 +67,10 @@ class Atlas:
         return mixed
 
     def _within(self, row: NDArray[np.intp], level: NDArray[np.intp], x: Grey, y: Grey) -> Grey:
-        """Grey values within levels, at places counted in texels of the finest one.
+        """Grey values (N,) of single levels, at coordinates in texels of the finest level.
 
-        The middle of texel i of a level is at that of texel i · 2^level of the finest one, because
-        `cv2.pyrDown` keeps every other one.
+        The centre of texel i of a level is that of texel i · 2^level of the finest level, because
+        `cv2.pyrDown` keeps every other texel.
         """
         scale = np.ldexp(np.float32(1.0), -level)
         width = self.widths[row]
@@ -88,7 +91,7 @@ def _mix(a: NDArray[np.uint8] | Grey, b: NDArray[np.uint8] | Grey, weight: Grey)
 
 
 def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed: int) -> Atlas:
-    """Textures for all panels of a world, so different that places can be told apart.
+    """Textures of all panels of a world, all different, so that places can be recognised.
 
     Args:
         sizes: of P panels, m.
@@ -112,7 +115,7 @@ def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed:
 
 
 def _noise(width: int, height: int, texel_m: float, rng: np.random.Generator) -> Grey:
-    """Noise of many wavelengths (height, width), its contrast evened out."""
+    """Sum of noise of several wavelengths (height, width), with limited contrast."""
     total: Grey = np.zeros((height, width), np.float32)
     wave, amplitude = COARSEST_WAVE_M / texel_m, 1.0
     while wave >= FINEST_WAVE_TEXELS:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated front end: landmarks followed from frame to frame by the cameras of a rig."""
+"""The simulated front end: tracks of landmarks, with noise, losses, outliers and descriptors."""
 
 from __future__ import annotations
 
@@ -14,31 +14,39 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
-from slam_graph.simulation.appearance import Appearance
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import TrackConfig, random_stream
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import World
 
-GRID = (8, 5)
-"""Cells of the image, across and down, that new features are spread over."""
+__all__ = ["TrackSimulator"]
 
-POINTS_PER_LOOK = 2048
-"""Landmarks that are searched for new features at a time."""
+GRID = (8, 5)
+"""Columns and rows of the grid over which new features are distributed."""
+
+LANDMARKS_AT_ONCE = 2048
+"""Landmarks that are projected at a time in the search for new features."""
 
 POSES_AT_ONCE = 256
+"""Poses that are evaluated at a time; it bounds memory."""
+
+DESCRIPTOR_BYTES = 32
+
+BIT_FLIP_PROBABILITY = 0.08
+"""Of each bit of an observed descriptor. Two observations of a landmark then differ in 38 of 256
+bits on average, below the matching threshold of ORB-SLAM (50)."""
 
 
 @dataclass(eq=False)
 class _Tracks:
-    """The tracks that go on, of one group of cameras.
+    """The active tracks of one group of cameras.
 
     Attributes:
-        landmarks: (T,) their landmarks.
-        ids: (T,) of the features.
+        landmarks: (T,) numbers of their landmarks.
+        ids: (T,) feature ids.
         ages: (T,) in frames.
-        pixels: (T, 2) where the leading camera sees them, without noise.
+        pixels: (T, 2) in the leading camera, without noise.
     """
 
     landmarks: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -47,12 +55,12 @@ class _Tracks:
     pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def keep(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> None:
-        """Only some of them go on."""
+        """Keep some of them, in place."""
         for name in ("landmarks", "ids", "ages", "pixels"):
             setattr(self, name, getattr(self, name)[chosen])
 
     def add(self, landmarks: IntArray, ids: IntArray, pixels: FloatArray) -> None:
-        """New ones begin."""
+        """Append new tracks."""
         self.landmarks = np.concatenate([self.landmarks, landmarks])
         self.ids = np.concatenate([self.ids, ids])
         self.ages = np.concatenate([self.ages, np.ones(len(ids), np.int64)])
@@ -61,7 +69,7 @@ class _Tracks:
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """Where the platform is while a frame is taken."""
+    """Pose of the platform at a frame."""
 
     stamp_ns: int
     rotation: FloatArray
@@ -69,15 +77,15 @@ class _Pose:
 
 
 class TrackSimulator:
-    """Follows landmarks; memory does not grow with time.
+    """Tracks landmarks; memory does not grow with time.
 
-    Cameras that see much the same (a stereo pair) form a group: its first camera leads, finds
-    features and follows them while it sees them; the others observe those of them that they see.
+    Cameras with overlapping views (a stereo pair) form a group. Its first camera finds features and
+    tracks them while they are visible; the others observe those of them that they see.
 
     Args:
         rig: the cameras.
-        world: hides landmarks.
-        landmarks: what is seen.
+        world: its inner walls hide landmarks.
+        landmarks: all landmarks.
         config: number of features, noise, losses, outliers.
         seed: of the simulation.
     """
@@ -85,26 +93,28 @@ class TrackSimulator:
     def __init__(
         self, rig: Rig, world: World, landmarks: Landmarks, config: TrackConfig, seed: int
     ) -> None:
-        self.views = [View.of(mounted, config) for mounted in rig.cameras]
+        self.views = [View.of(mounted) for mounted in rig.cameras]
         self.groups = camera_groups(rig, self.views)
         self._world = world
         self._landmarks = landmarks
         self._config = config
         self._rng = np.random.default_rng(random_stream(seed, "tracks"))
-        self._appearance = Appearance(len(landmarks), config, seed) if config.descriptors else None
+        self._descriptors = (
+            _Descriptors(len(landmarks), config, seed) if config.descriptors else None
+        )
         self._tracks = [_Tracks() for _ in self.groups]
         self._next_id = 0
-        self._next_look = 0
+        self._next_landmark = 0
 
     def frames(
         self, motion: Motion, exposures_ns: IntArray, offset_ns: int = 0
     ) -> Iterator[FeatureFrame]:
-        """Frames in the order of time; to be gone through once.
+        """Frames in order of time; to be iterated once.
 
         Args:
             motion: of the platform.
             exposures_ns: (N,) times of exposure on the clock of the IMU.
-            offset_ns: what the clock of the IMU shows more than that of the cameras.
+            offset_ns: time of the IMU clock minus time of the camera clock.
         """
         for first in range(0, len(exposures_ns), POSES_AT_ONCE):
             stamps = exposures_ns[first : first + POSES_AT_ONCE]
@@ -114,14 +124,15 @@ class TrackSimulator:
                 yield FeatureFrame(stamp_ns - offset_ns, tuple(seen))
 
     def _observe(self, pose: _Pose) -> list[FeatureObservations]:
-        """One frame: tracks go on or end, new ones begin, and every camera observes them."""
+        """One frame: tracks continue or end, new ones begin, and every camera observes them."""
         seen = [FeatureObservations.empty()] * len(self.views)
         for group, tracks in zip(self.groups, self._tracks, strict=True):
             self._follow(tracks, self.views[group[0]], pose)
             self._begin(tracks, self.views[group[0]], pose)
             leading = self._measure(self.views[group[0]].camera, tracks.ids, tracks.pixels)
-            if self._appearance is not None:
-                leading = replace(leading, descriptors=self._appearance.of(tracks.landmarks))
+            if self._descriptors is not None:
+                observed = self._descriptors.observe(tracks.landmarks)
+                leading = replace(leading, descriptors=observed)
             seen[group[0]] = leading
             for camera in group[1:]:
                 index, pixels = self._see(self.views[camera], pose, tracks.landmarks)
@@ -129,12 +140,12 @@ class TrackSimulator:
         return seen
 
     def _see(self, view: View, pose: _Pose, landmarks: IntArray) -> tuple[IntArray, FloatArray]:
-        """Which of some landmarks a camera sees (indices), and where."""
+        """Which of some landmarks a camera sees (indices), and their pixels."""
         points, normals = self._landmarks.at(landmarks, pose.stamp_ns)
         return view.see(pose.rotation, pose.position, points, normals, self._world)
 
     def _follow(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
-        """Keep the tracks that are still in sight and not lost."""
+        """Keep the tracks that are still visible and not lost."""
         config = self._config
         index, pixels = self._see(leader, pose, tracks.landmarks)
         held = self._rng.random(len(index)) >= config.loss
@@ -145,16 +156,16 @@ class TrackSimulator:
         tracks.ages += 1
 
     def _begin(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
-        """Fill up with landmarks that are not followed, where the image is emptiest."""
-        total, looked = len(self._landmarks), 0
+        """Start tracks of landmarks without one, in the cells with the fewest features."""
+        total, searched = len(self._landmarks), 0
         taken = [t.landmarks for t in self._tracks]
-        while looked < total and len(tracks.ids) < self._config.features:
-            count = min(POINTS_PER_LOOK, total - looked)
-            block = (self._next_look + np.arange(count)) % total
-            self._next_look, looked = (self._next_look + count) % total, looked + count
+        while searched < total and len(tracks.ids) < self._config.features:
+            count = min(LANDMARKS_AT_ONCE, total - searched)
+            block = (self._next_landmark + np.arange(count)) % total
+            self._next_landmark, searched = (self._next_landmark + count) % total, searched + count
             block = block[~np.isin(block, np.concatenate(taken))]
             index, pixels = self._see(leader, pose, block)
-            chosen = self._spread(leader.camera, tracks.pixels, pixels)
+            chosen = self._select(leader.camera, tracks.pixels, pixels)
             landmarks = block[index[chosen]]
             tracks.add(landmarks, self._new_ids(landmarks), pixels[chosen])
 
@@ -164,10 +175,10 @@ class TrackSimulator:
         self._next_id += len(landmarks)
         return np.arange(self._next_id - len(landmarks), self._next_id)
 
-    def _spread(
+    def _select(
         self, camera: Camera, present: FloatArray, candidates: FloatArray
     ) -> NDArray[np.intp]:
-        """Which candidates (indices) to take: those first whose cells have the fewest features."""
+        """Candidates to take (indices): those in the cells with the fewest features first."""
         wanted = self._config.features - len(present)
         if len(candidates) == 0:
             return np.zeros(0, np.intp)
@@ -195,7 +206,29 @@ class TrackSimulator:
 
 
 def _cells(camera: Camera, pixels: FloatArray) -> IntArray:
-    """Numbers of the cells (N,) of pixels (N, 2)."""
+    """Index of the grid cell (N,) of each pixel (N, 2)."""
     scale = np.array([GRID[0] / camera.width, GRID[1] / camera.height])
     cells = (pixels * scale).astype(np.int64)
     return np.asarray(cells[:, 1] * GRID[0] + cells[:, 0])
+
+
+class _Descriptors:
+    """Binary descriptors of landmarks, some of which share one.
+
+    Args:
+        landmarks: their number.
+        config: number of distinct descriptors.
+        seed: of the simulation.
+    """
+
+    def __init__(self, landmarks: int, config: TrackConfig, seed: int) -> None:
+        rng = np.random.default_rng(random_stream(seed, "looks"))  # the name is part of the seed
+        shape = (config.distinct_descriptors, DESCRIPTOR_BYTES)
+        self._distinct = rng.integers(0, 256, shape, dtype=np.uint8)
+        self._of_landmark = rng.integers(0, config.distinct_descriptors, landmarks)
+        self._rng = np.random.default_rng(random_stream(seed, "descriptors"))
+
+    def observe(self, landmarks: IntArray) -> NDArray[np.uint8]:
+        """Descriptors (N, 32) of landmarks (N,), with wrong bits that differ between calls."""
+        flipped = self._rng.random((len(landmarks), 8 * DESCRIPTOR_BYTES)) < BIT_FLIP_PROBABILITY
+        return self._distinct[self._of_landmark[landmarks]] ^ np.packbits(flipped, axis=1)

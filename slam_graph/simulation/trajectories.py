@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories that are made up: a path through a room, flown with rests, the camera ahead.
+"""Generated trajectories: a path through a room, flown with stops, the camera looking ahead.
 
-A shape gives control points of a path; the path is a cubic spline through them over the way. How
-far the flight has come along it is a smooth function of time that stands still while hovering, and
-position and attitude depend on the way alone, so the platform hovers perfectly still.
+Each shape gives control points. The path is a cubic spline through them, parameterised by arc
+length. The distance flown is a smooth function of time that is constant while hovering. Position
+and attitude depend on that distance only, so the platform hovers without any motion.
 """
 
 from __future__ import annotations
@@ -22,27 +22,31 @@ from slam_graph.simulation.motion import SplineMotion
 from slam_graph.simulation.simulation_config import FlightConfig
 from slam_graph.simulation.splines import continuous, through_waypoints
 
+__all__ = ["ROOM_PITCH_M", "fly"]
+
 WAYPOINT_PERIOD_S = 0.25
 RAMP_S = 1.5
 """Time from standing still to full speed."""
 SPEED_CHANGE, SPEED_CHANGE_PERIOD_S = 0.3, 9.0
-"""The speed goes up and down by this share, so that the accelerometer has something to feel."""
+"""Relative amplitude and period of the changes of speed, which excite the accelerometer."""
 HEADING_SMOOTHING_M = 0.35
-WAY_STEP_M = 0.02
+PATH_STEP_M = 0.02
+WOBBLE_RAD = 0.1
+"""Amplitude of roll and pitch: enough to excite all axes of the gyroscope."""
 WOBBLE_LENGTHS_M = ((1.3, 3.7), (1.7, 2.9))
-"""Wavelengths of roll and pitch on the way."""
+"""Wavelengths of pitch and of roll, along the path."""
 
 MIN_LEG_M, SHARPEST_TURN = 2.0, 0.0
-"""Shortest way to the next random point, and the smallest cosine of the turn to get there."""
+"""Shortest distance to the next random point, and the smallest cosine of the turn towards it."""
 
 START_NS = 1_000_000_000
-"""Time at which made-up motions begin."""
+"""Time at which generated motions begin."""
 
 ROOM_PITCH_M = 7.0
 """Distance between the middles of neighbouring rooms of `rooms`."""
 
 
-def figure8(length_m: float, rng: np.random.Generator) -> FloatArray:
+def _figure8(length_m: float, rng: np.random.Generator) -> FloatArray:
     """Control points (M, 3) of figures of eight, 6 m long and 3.6 m wide."""
     lap = 16
     theta = np.arange(lap * (int(length_m / 12.0) + 2)) * (2 * np.pi / lap)
@@ -50,8 +54,8 @@ def figure8(length_m: float, rng: np.random.Generator) -> FloatArray:
     return np.column_stack([3.0 * np.sin(theta), 1.8 * np.sin(2.0 * theta), height])
 
 
-def rooms(length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Control points (M, 3) of tours through three rooms and back, with a round in each."""
+def _rooms(length_m: float, rng: np.random.Generator) -> FloatArray:
+    """Control points (M, 3) of tours through three rooms and back, with a loop in each."""
     eastward = [(-3.5, 0.0), (-2.0, -0.4), (0.0, -1.6), (1.6, 0.0), (0.0, 1.6), (-1.6, 0.2)]
     eastward += [(-0.4, -1.3), (1.6, -0.7)]
     turn = [(-3.5, 0.0), (-2.0, -0.5), (0.0, -1.8), (1.8, 0.0), (0.0, 1.8), (-2.0, 0.5)]
@@ -65,29 +69,29 @@ def rooms(length_m: float, rng: np.random.Generator) -> FloatArray:
     return np.column_stack([plane, height])
 
 
-def random(length_m: float, rng: np.random.Generator) -> FloatArray:
+def _random(length_m: float, rng: np.random.Generator) -> FloatArray:
     """Control points (M, 3) anywhere in a box of 7 x 6 x 2 m, without turning on the spot."""
     low, high = np.array([-3.5, -3.0, 0.7]), np.array([3.5, 3.0, 2.7])
-    points, way = [rng.uniform(low, high)], 0.0
+    points, length = [rng.uniform(low, high)], 0.0
     direction = np.zeros(3)
-    while way < length_m + 10.0 or len(points) < 4:
+    while length < length_m + 10.0 or len(points) < 4:
         candidates = rng.uniform(low, high, (64, 3))
         steps = candidates - points[-1]
         lengths = np.linalg.norm(steps, axis=1)
         turns = (steps @ direction) / lengths
         chosen = int(np.argmax((lengths > MIN_LEG_M) & (turns >= SHARPEST_TURN)))
         points.append(candidates[chosen])
-        way += float(lengths[chosen])
+        length += float(lengths[chosen])
         direction = steps[chosen] / lengths[chosen]
     return np.array(points)
 
 
-SHAPES: dict[str, Callable[[float, np.random.Generator], FloatArray]] = {
-    "figure8": figure8,
-    "rooms": rooms,
-    "random": random,
+_SHAPES: dict[str, Callable[[float, np.random.Generator], FloatArray]] = {
+    "figure8": _figure8,
+    "rooms": _rooms,
+    "random": _random,
 }
-"""Each gives control points of a path of at least so many metres."""
+"""By name, a function that gives control points (M, 3) of a path of at least that many metres."""
 
 
 def fly(
@@ -97,39 +101,39 @@ def fly(
     config: FlightConfig,
     rng: np.random.Generator,
 ) -> SplineMotion:
-    """A flight along a shape.
+    """A flight along a generated path.
 
     Args:
-        shape: name in `SHAPES`.
+        shape: figure8, rooms or random.
         duration_s: of the flight.
         body_T_camera: the camera that looks ahead, with its image upright.
-        config: speed and rests.
-        rng: draws heights, waypoints and phases.
+        config: speed and stops.
+        rng: random heights, waypoints and phases.
     """
     waypoints = int(np.ceil(duration_s / WAYPOINT_PERIOD_S)) + 1
     times_s = np.arange(waypoints, dtype=np.float64) * WAYPOINT_PERIOD_S
-    way_m = way_flown(times_s, config)
-    path = _over_the_way(SHAPES[shape](float(way_m[-1]) + 2.0, rng))
-    view = _view_angles(path, way_m, config.wobble_rad, rng)
+    flown_m = distance_flown(times_s, config)
+    path = _by_arc_length(_SHAPES[shape](float(flown_m[-1]) + 2.0, rng))
+    view = _view_angles(path, flown_m, rng)
     # the view frame (x ahead, y left, z up) seen from a camera (x right, y down, z ahead)
     camera_R_view = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     view_R_body = Rotation.from_matrix(camera_R_view.T @ body_T_camera.rotation().matrix().T)
     attitude = Rotation.from_euler("ZYX", view) * view_R_body
-    poses = np.column_stack([path(way_m), continuous(attitude.as_quat())])
+    poses = np.column_stack([path(flown_m), continuous(attitude.as_quat())])
     end_ns = START_NS + round(duration_s * 1e9)
     return SplineMotion(START_NS, end_ns, through_waypoints(times_s, poses))
 
 
-def way_flown(times_s: FloatArray, config: FlightConfig) -> FloatArray:
-    """How far a flight has come at times (N,), in metres; constant while hovering."""
+def distance_flown(times_s: FloatArray, config: FlightConfig) -> FloatArray:
+    """Distance flown (N,) at times (N,), in metres; constant while hovering."""
     fine = np.arange(0.0, times_s[-1] + 0.01, 0.01)
     speed = config.speed * (1.0 + SPEED_CHANGE * np.sin(2 * np.pi * fine / SPEED_CHANGE_PERIOD_S))
     if config.hover_s > 0:
         since = np.mod(fine, config.hover_s + config.hover_every_s)
         left = config.hover_s + config.hover_every_s - since
         speed *= _smooth_step((since - config.hover_s) / RAMP_S) * _smooth_step(left / RAMP_S)
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * 0.01])
-    return np.asarray(np.interp(times_s, fine, way))
+    distance = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * 0.01])
+    return np.asarray(np.interp(times_s, fine, distance))
 
 
 def _smooth_step(x: FloatArray) -> FloatArray:
@@ -138,8 +142,8 @@ def _smooth_step(x: FloatArray) -> FloatArray:
     return np.asarray(x * x * (3.0 - 2.0 * x))
 
 
-def _over_the_way(points: FloatArray) -> CubicSpline:
-    """A path through points (M, 3) as a function of the way along it, in metres."""
+def _by_arc_length(points: FloatArray) -> CubicSpline:
+    """A path through points (M, 3) as a function of arc length, in metres."""
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
     rough = CubicSpline(np.concatenate([[0.0], np.cumsum(chords)]), points)
     dense = rough(np.arange(rough.x[0], rough.x[-1], 0.2))
@@ -147,16 +151,14 @@ def _over_the_way(points: FloatArray) -> CubicSpline:
     return CubicSpline(np.concatenate([[0.0], np.cumsum(steps)]), dense)
 
 
-def _view_angles(
-    path: CubicSpline, way_m: FloatArray, wobble_rad: float, rng: np.random.Generator
-) -> FloatArray:
-    """Yaw, pitch and roll (N, 3) at the given ways: ahead along the path, rolling and pitching."""
-    dense = np.arange(0.0, way_m[-1] + 2.0 * HEADING_SMOOTHING_M, WAY_STEP_M)
+def _view_angles(path: CubicSpline, flown_m: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Yaw along the path, and oscillating pitch and roll (N, 3), at distances `flown_m` (N,)."""
+    dense = np.arange(0.0, flown_m[-1] + 2.0 * HEADING_SMOOTHING_M, PATH_STEP_M)
     tangent = path(dense, 1)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    heading = gaussian_filter1d(heading, HEADING_SMOOTHING_M / WAY_STEP_M, mode="nearest")
-    angles = [np.interp(way_m, dense, heading)]
+    heading = gaussian_filter1d(heading, HEADING_SMOOTHING_M / PATH_STEP_M, mode="nearest")
+    angles = [np.interp(flown_m, dense, heading)]
     for lengths in WOBBLE_LENGTHS_M:
-        waves = [np.sin(2 * np.pi * way_m / x + rng.uniform(0, 2 * np.pi)) for x in lengths]
-        angles.append(wobble_rad * np.mean(waves, axis=0))
+        waves = [np.sin(2 * np.pi * flown_m / x + rng.uniform(0, 2 * np.pi)) for x in lengths]
+        angles.append(WOBBLE_RAD * np.mean(waves, axis=0))
     return np.column_stack(angles)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera sees of points: projection, and what is out of sight."""
+"""Visibility: which points a camera of the rig sees, and at which pixels."""
 
 from __future__ import annotations
 
@@ -9,43 +9,48 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import WIDEST, Camera
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig, RigCamera
-from slam_graph.simulation.simulation_config import TrackConfig
 from slam_graph.simulation.world import World
 
+__all__ = ["View", "camera_groups"]
+
 OVERLAP_DEPTH_M = 4.0
-"""At this depth it is looked whether two cameras see the same."""
+"""Depth at which the overlap of two cameras is determined."""
+
+MIN_DEPTH_M, MAX_DEPTH_M = 0.3, 40.0
+"""Depths between which a point is visible: the range of an indoor front end."""
+
+BORDER_PX = 8.0
+"""Nothing is seen closer to the border of the image: a patch of a tracker would not fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera where it is mounted, and what it can see.
+    """A mounted camera and its visible region.
 
     Attributes:
         camera: intrinsics.
         body_R_camera: (3, 3).
         position: (3,) of the camera in the body.
-        reach: largest length of a normalised point in the image; beyond it the polynomial of the
-            distortion may fold points back into the image.
-        config: depth and border limits.
+        reach: largest norm of a normalised point in the image; beyond it the distortion polynomial
+            may fold points back into the image.
     """
 
     camera: Camera
     body_R_camera: FloatArray
     position: FloatArray
     reach: float
-    config: TrackConfig
 
     @staticmethod
-    def of(mounted: RigCamera, config: TrackConfig) -> View:
+    def of(mounted: RigCamera) -> View:
         """The view of a camera of a rig."""
         camera, pose = mounted.camera, mounted.body_T_camera
         plane, valid = camera.visible(_border(camera))
         reach = float(np.max(np.linalg.norm(plane[valid], axis=1), initial=0.0))
-        reach = reach if valid.all() else WIDEST
+        reach = reach if valid.all() else camera.max_tangent
         R, p = pose.rotation().matrix(), np.asarray(pose.translation())
-        return View(camera, R, p, 1.001 * reach, config)
+        return View(camera, R, p, 1.001 * reach)
 
     def pose(self, world_R_body: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """world_R_camera (3, 3) and position (3,) of the camera, for a pose of the body."""
@@ -59,29 +64,29 @@ class View:
         normals: FloatArray,
         world: World,
     ) -> tuple[IntArray, FloatArray]:
-        """Project points.
+        """Project the visible ones of some points.
 
         Args:
             world_R_body: (3, 3).
             position: (3,) of the body in the world.
             points: (N, 3) in the world.
-            normals: (N, 3) of the surfaces that they are on; zero for points seen from anywhere.
-            world: hides points.
+            normals: (N, 3) of the surfaces that they are on; zero for points visible from anywhere.
+            world: its inner walls hide points.
 
         Returns:
-            indices (K,) of the points in sight, and their pixels (K, 2) without noise.
+            indices (K,) of the visible points, and their pixels (K, 2) without noise.
         """
         R, eye = self.pose(world_R_body, position)
         from_eye = points - eye
         depth = from_eye @ R[:, 2]
-        near = np.flatnonzero((depth > self.config.min_depth_m) & (depth < self.config.max_depth_m))
+        near = np.flatnonzero((depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M))
         plane = (from_eye[near] @ R[:, :2]) / depth[near, None]
         inside = np.einsum("ij,ij->i", plane, plane) < self.reach**2
         near, plane = near[inside], plane[inside]
         facing = np.einsum("ij,ij->i", from_eye[near], normals[near]) <= 0.0
         near, plane = near[facing], plane[facing]
         pixels = self.camera.distort(plane)[0]
-        low = self.config.border_px
+        low = BORDER_PX
         high = np.array([self.camera.width - 1 - low, self.camera.height - 1 - low])
         inside = np.all((pixels >= low) & (pixels <= high), axis=1)
         near, pixels = near[inside], pixels[inside]
@@ -98,16 +103,16 @@ def _border(camera: Camera) -> FloatArray:
 
 
 def camera_groups(rig: Rig, views: list[View]) -> list[list[int]]:
-    """Cameras that look at the same: each group is led by its first camera.
+    """Groups of cameras with overlapping views (a stereo pair); the first of a group leads it.
 
-    A camera joins the first group whose leader's image it sees more than half of.
+    A camera joins the first group of whose leader's image it sees more than half.
     """
     everywhere = World(())
     groups: list[list[int]] = []
     for index, view in enumerate(views):
         for group in groups:
             leader = views[group[0]]
-            points = _points_before(leader)
+            points = _points_in_view(leader)
             none = np.zeros_like(points)
             seen, _ = view.see(np.eye(3), np.zeros(3), points, none, everywhere)
             if len(seen) > 0.5 * len(points):
@@ -118,14 +123,14 @@ def camera_groups(rig: Rig, views: list[View]) -> list[list[int]]:
     return groups
 
 
-def _points_before(view: View) -> FloatArray:
-    """Points (N, 3) in the body that fill the image of a camera at some depth."""
+def _points_in_view(view: View) -> FloatArray:
+    """Points (N, 3) in the body frame that fill the image of a camera at `OVERLAP_DEPTH_M`."""
     camera = view.camera
     u, v = np.meshgrid(
         np.linspace(20, camera.width - 21, 9), np.linspace(20, camera.height - 21, 7)
     )
     plane, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
     rays = plane[usable]
-    depth = min(OVERLAP_DEPTH_M, 0.9 * view.config.max_depth_m)
+    depth = min(OVERLAP_DEPTH_M, 0.9 * MAX_DEPTH_M)
     in_camera = np.column_stack([rays, np.ones(len(rays))]) * depth
     return in_camera @ view.body_R_camera.T + view.position

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The world: textured rectangles, each seen from one side."""
+"""The simulated world: rooms made of rectangles (panels), each visible from one side."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.simulation.trajectories import ROOM_PITCH_M
 
+__all__ = ["Panel", "World", "box", "room_around", "three_rooms"]
+
 HEADROOM_M = 1.2
 """Distance of floor and ceiling from a trajectory."""
 
@@ -21,13 +23,13 @@ DOOR_WIDTH_M, DOOR_HEIGHT_M = 1.8, 2.4
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A rectangle that is seen from the side that its normal points to.
+    """A rectangle, visible from the side that its normal points to.
 
     Attributes:
         corner: (3,) in the world.
         across, along: (3,) orthogonal unit vectors of its sides.
         size: lengths of the sides, m.
-        inner: whether it can hide other panels.
+        inner: whether it can hide other panels (a wall between rooms).
     """
 
     corner: FloatArray
@@ -38,7 +40,7 @@ class Panel:
 
     @property
     def normal(self) -> FloatArray:
-        """(3,) unit vector towards the side from which it is seen."""
+        """(3,) unit vector towards the visible side."""
         return np.cross(self.across, self.along)
 
     @property
@@ -49,16 +51,16 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Everything that stands still.
+    """The static panels.
 
     Attributes:
-        panels: of which the world is made.
+        panels: outer and inner walls.
     """
 
     panels: tuple[Panel, ...]
 
     def hidden(self, eye: FloatArray, points: FloatArray) -> BoolArray:
-        """Which points (N, 3) an inner panel hides from `eye` (3,)."""
+        """Which points (N, 3) are hidden from `eye` (3,) by an inner panel: (N,)."""
         hidden = np.zeros(len(points), bool)
         if len(self._inner_normals) == 0:
             return hidden
@@ -66,7 +68,7 @@ class World:
         height = np.sum(self._inner_normals * (self._inner_corners - eye), axis=1)
         slope = rays @ self._inner_normals.T
         slope = np.where(np.abs(slope) < 1e-12, 1e-12, slope)
-        part = height / slope  # (N, K): how far along the ray the plane of each panel is
+        part = height / slope  # (N, K): fraction of the ray at which it meets the plane of a panel
         for k, panel in enumerate(p for p in self.panels if p.inner):
             crossed = np.flatnonzero((part[:, k] > 1e-9) & (part[:, k] < 1.0 - 1e-6))
             place = eye + part[crossed, k, None] * rays[crossed] - panel.corner
@@ -111,7 +113,7 @@ def three_rooms() -> World:
 
 
 def _wall_with_door(x: float) -> list[Panel]:
-    """A thin wall across x, seen from both sides: left and right of the door, and above it."""
+    """A thin wall across x, visible from both sides: left and right of the door, and above it."""
     half, door = ROOM_WIDTH_M / 2, DOOR_WIDTH_M / 2
     parts = [
         (-half, -door, 0.0, ROOM_HEIGHT_M),

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A whole recording as one bundle adjustment, or as several that overlap where it is long.
+"""Smoothing of a whole recording: one bundle adjustment, or several overlapping ones if it is long.
 
-Without loop closures what a piece says of its inside hardly depends on what is far outside. So a
-long recording is solved in pieces, and each is laid on the one before, at a keyframe in the middle
-of what both share: position and yaw, which no piece knows of itself, are taken over from there.
+Without loop closures the estimate inside a segment hardly depends on what is far outside of it. So
+a long recording is solved in overlapping segments. Each is aligned with the one before at a
+keyframe in the middle of their overlap, in position and yaw, which no segment can observe.
 """
 
 from __future__ import annotations
@@ -20,56 +20,60 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.imu_factor import preintegration_params
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
+from slam_graph.sensors.imu_buffer import preintegration_params
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.keyframe_states import states_at
-from slam_graph.smoothing.recording_keyframes import Piece, read_piece
-from slam_graph.smoothing.recording_problem import Adjustment, BundleAdjustment
+from slam_graph.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
+from slam_graph.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.smoothing.track_fusion import with_fused_features
 
 logger = logging.getLogger(__name__)
 
 
-STRIDE, SUPPORT = 10, 40
-"""Keyframes that the estimate is led back over at a time, and how many more help with it."""
-MIN_KEYFRAMES = 3
-MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
+__all__ = ["FinalBa", "FinalBaSummary", "Report", "UndeterminedError", "adjust_recording"]
+
+OVERLAP = 50
+"""Keyframes that consecutive segments share (10 s at the default spacing); half of a short one."""
+_STRIDE, _CONTEXT = 10, 40
+"""Backward extension: keyframes per stride, and later keyframes that are adjusted with them."""
+_MIN_KEYFRAMES = 3
+_MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
 MAX_PIXEL_RESIDUAL = 3.0
-"""Root mean square of what is left of the observations, in σ, beyond which they do not fit."""
+"""Root mean square of the reprojection residuals in σ beyond which a minimum is refused."""
 
 Report = Callable[[int, int, int], None]
-"""Is told after each step: keyframes that are done, all keyframes, steps so far."""
+"""Is given after each step: keyframes that are done, all keyframes, steps so far."""
 
 
 class UndeterminedError(EstimationError):
-    """Images say too little to improve on the causal estimate: nothing moves, or is seen."""
+    """There are too few observations to improve on the causal estimate."""
 
 
 @dataclass(frozen=True, slots=True)
 class FinalBaSummary:
-    """What the bundle adjustment over a whole recording took.
+    """Figures of the bundle adjustment over a whole recording.
 
     Attributes:
-        pieces: in which the recording was solved.
+        segments: number of segments.
         frames: number of poses.
-        keyframes: number of keyframes, counted once for each piece.
-        features: number of features in the costs.
-        observations: number of observations in the costs.
+        keyframes: number of keyframes, summed over the segments.
+        features: number of features, likewise.
+        observations: number of observations, likewise.
         iterations: Levenberg-Marquardt steps.
-        cost_before: of all observations, where the adjustment of all keyframes began.
-        cost_after: without outliers, at the minimum.
-        imu_residual: root mean square of the whitened residuals of the IMU.
-        pixel_residual: of the observations.
-        pixel_sigma: standard deviation of these that was assumed at the end.
+        cost_before: initial cost, of all observations.
+        cost_after: cost at the minimum, without outliers.
+        imu_residual: root mean square of the whitened IMU residuals.
+        pixel_residual: root mean square of the whitened reprojection residuals.
+        pixel_sigma: assumed standard deviation of the observations at the end, pixels.
         seconds: wall time.
-        cpu_seconds: time of this process on its processors.
+        cpu_seconds: processor time.
     """
 
-    pieces: int
+    segments: int
     frames: int
     keyframes: int
     features: int
@@ -86,11 +90,11 @@ class FinalBaSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinalBa:
-    """The best trajectory of a recording.
+    """The smoothed trajectory of a recording.
 
     Attributes:
-        trajectory: of all its frames, with velocities and biases.
-        summary: what it took.
+        trajectory: of all frames, with velocities and biases.
+        summary: figures.
     """
 
     trajectory: Trajectory
@@ -109,68 +113,68 @@ def adjust_recording(
 
     Args:
         log: all its frames.
-        causal: the estimate to begin with, with velocities and biases, on the clock of the IMU. Its
-            first pose keeps its position and yaw, so that both live in one world.
-        rig: the best calibration there is.
+        causal: the initial estimate, with velocities and biases, on the clock of the IMU. Its first
+            pose keeps its position and yaw, so that both trajectories are in the same world.
+        rig: the best calibration available.
         backend: noise and triangulation.
-        config: how to solve.
-        report: is told of each step.
+        config: settings.
+        report: is given the progress after each step.
 
     Raises:
-        UndeterminedError: if there is nothing to gain.
-        EstimationError: if the minimum does not fit the images.
+        UndeterminedError: if there are too few observations.
+        EstimationError: if the minimum does not fit the observations.
     """
     began = (time.perf_counter(), time.process_time())
     keyframes = log.keyframes
-    if len(keyframes) < MIN_KEYFRAMES or len(causal) == 0:
+    if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
         raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
     params = preintegration_params(rig.imu, backend.noise.gravity)
-    causal = led_back(log, causal, rig, backend, config, report)
+    causal = _extended_backward(log, causal, rig, backend, config, report)
     parts: list[Trajectory] = []  # final, as compact arrays
-    states: list[NavState] = []  # of the last piece, from its anchor on
-    solved: list[Adjustment] = []
-    for first, stop in pieces(len(keyframes), config):
-        piece = read_piece(log, keyframes[first:stop], rig, backend.zero_velocity)
-        stamps_ns = piece.keyframe_stamps_ns
-        if not _reaches(causal, stamps_ns):
+    states: list[NavState] = []  # of the last segment, from its anchor on
+    solved: list[AdjustedSegment] = []
+    for first, stop in segments(len(keyframes), config.max_keyframes):
+        segment = read_segment(log, keyframes[first:stop], rig, backend.zero_velocity)
+        stamps_ns = segment.keyframe_stamps_ns
+        if not _overlaps(causal, stamps_ns):
             continue
-        start = states_at(causal, stamps_ns, piece.imu, params)
+        start = states_at(causal, stamps_ns, segment.imu, params)
         anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
         begin = 0
         if states:
-            anchor = min(config.overlap_keyframes // 2, len(stamps_ns) - 1)
-            begin = int(piece.keyframes[anchor])
+            anchor = min(_overlap(config.max_keyframes) // 2, len(stamps_ns) - 1)
+            begin = int(segment.keyframes[anchor])
             joint = bisect_left(states, stamps_ns[anchor], key=_stamp_ns)
             parts.append(_trajectory(states[:joint]))
-            start = laid_on(start, start[anchor], states[joint])
+            start = _aligned(start, start[anchor], states[joint])
         steps = sum(part.iterations for part in solved)
-        told = _told_of_all(report, first, len(keyframes), steps)
-        adjusted = _adjusted(piece, start, anchor, rig, backend, config, told)
+        progress = _progress(report, first, len(keyframes), steps)
+        adjusted = _adjusted(segment, start, anchor, rig, backend, config, progress)
         states = adjusted.states[begin:]
         solved.append(replace(adjusted, states=[]))
     if not solved:
-        raise EstimationError("the causal estimate reaches none of the keyframes")
-    trajectory = _joined([*parts, _trajectory(states)])
+        raise EstimationError("the causal estimate covers none of the keyframes")
+    trajectory = _concatenated([*parts, _trajectory(states)])
     return FinalBa(trajectory, _summary(solved, len(trajectory), began))
 
 
 def _adjusted(
-    piece: Piece,
+    segment: RecordingSegment,
     start: list[NavState],
     anchor: int,
     rig: Rig,
     backend: BackendConfig,
     config: FinalBaConfig,
-    told: Callable[[int], None],
-) -> Adjustment:
-    """The minimum of a piece: with fused features, or if there is none, with those that it has."""
+    report: Callable[[int], None],
+) -> AdjustedSegment:
+    """The minimum of a segment with fused features; if fusion fails, with the original tracks."""
     if config.fuse_features:
         try:
             fused, states, steps = with_fused_features(
-                piece, start, anchor, rig, backend, config, told
+                segment, start, anchor, rig, backend, config, report
             )
             further = BundleAdjustment(
-                fused, states, anchor, rig, backend, config, lambda step: told(steps + step)
+                fused, states, anchor, rig, backend, config, lambda step: report(steps + step)
             )
             solved = further.solve()
             _check(solved)
@@ -178,13 +182,13 @@ def _adjusted(
         except UndeterminedError:
             raise
         except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
-            logger.warning("no features are fused: %s", " ".join(str(error).split())[:200])
-    solved = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+            logger.warning("features are not fused: %s", " ".join(str(error).split())[:200])
+    solved = BundleAdjustment(segment, start, anchor, rig, backend, config, report).solve()
     _check(solved)
     return solved
 
 
-def led_back(
+def _extended_backward(
     log: FrameLog,
     causal: Trajectory,
     rig: Rig,
@@ -192,43 +196,55 @@ def led_back(
     config: FinalBaConfig,
     report: Report,
 ) -> Trajectory:
-    """A trajectory with an estimate of the time before it began.
+    """A trajectory extended backward to (less than a stride after) the first frame.
 
-    The IMU alone leads back a few seconds, no more. So that is done in strides, each with a bundle
-    adjustment of the frames around it, up to a stride from the first frame.
+    Backward IMU prediction alone holds for a few seconds only. So it is done in strides, each
+    followed by a bundle adjustment of the frames around it.
     """
     keyframes, params = log.keyframes, preintegration_params(rig.imu, backend.noise.gravity)
     stamps_ns = log.frames_ns[keyframes] + round(rig.cameras[0].time_offset_s * 1e9)
-    while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > STRIDE:
-        first = before - STRIDE
-        piece = read_piece(log, keyframes[first : before + SUPPORT], rig, backend.zero_velocity)
-        known = piece.keyframe_stamps_ns
-        if not _reaches(causal, known):
+    while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > _STRIDE:
+        first = before - _STRIDE
+        segment = read_segment(
+            log, keyframes[first : before + _CONTEXT], rig, backend.zero_velocity
+        )
+        known = segment.keyframe_stamps_ns
+        if not _overlaps(causal, known):
             break
-        start = states_at(causal, known, piece.imu, params)
-        anchor = min(STRIDE, len(known) - 1)
-        told = _told_of_all(report, 0, len(keyframes), 0)
-        solved = BundleAdjustment(piece, start, anchor, rig, backend, config, told).solve()
+        start = states_at(causal, known, segment.imu, params)
+        anchor = min(_STRIDE, len(known) - 1)
+        progress = _progress(report, 0, len(keyframes), 0)
+        solved = BundleAdjustment(segment, start, anchor, rig, backend, config, progress).solve()
         _check(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
-        causal = _joined([_trajectory(earlier), causal])
+        causal = _concatenated([_trajectory(earlier), causal])
     return causal
 
 
-def pieces(keyframes: int, config: FinalBaConfig) -> Iterator[tuple[int, int]]:
-    """First keyframe of each piece, and the one behind its last."""
-    step = max(config.max_keyframes - config.overlap_keyframes, 1)
+def segments(keyframes: int, longest: int) -> Iterator[tuple[int, int]]:
+    """First keyframe of each segment, and the one after its last.
+
+    Args:
+        keyframes: number of all keyframes.
+        longest: most keyframes of a segment.
+    """
+    step = longest - _overlap(longest)
     first = 0
     while True:
-        stop = min(first + config.max_keyframes, keyframes)
+        stop = min(first + longest, keyframes)
         yield first, stop
         if stop == keyframes:
             return
         first += step
 
 
-def laid_on(states: list[NavState], moving: NavState, fixed: NavState) -> list[NavState]:
-    """States moved by the translation and yaw that take `moving` to `fixed`."""
+def _overlap(longest: int) -> int:
+    """Keyframes that consecutive segments share."""
+    return min(OVERLAP, longest // 2)
+
+
+def _aligned(states: list[NavState], moving: NavState, fixed: NavState) -> list[NavState]:
+    """States moved by the translation and yaw that align `moving` with `fixed`."""
     turn = fixed.world_T_body.rotation().compose(moving.world_T_body.rotation().inverse())
     yaw = gtsam.Rot3.Yaw(turn.yaw())
     shift = fixed.world_T_body.translation() - yaw.rotate(moving.world_T_body.translation())
@@ -243,8 +259,8 @@ def laid_on(states: list[NavState], moving: NavState, fixed: NavState) -> list[N
     ]
 
 
-def _told_of_all(report: Report, done: int, keyframes: int, steps: int) -> Callable[[int], None]:
-    """Tells of the steps of a piece as of those of the whole."""
+def _progress(report: Report, done: int, keyframes: int, steps: int) -> Callable[[int], None]:
+    """A report of the steps of a segment as those of the whole recording."""
     return lambda step: report(done, keyframes, steps + step)
 
 
@@ -252,19 +268,19 @@ def _stamp_ns(state: NavState) -> int:
     return state.stamp_ns
 
 
-def _reaches(causal: Trajectory, stamps_ns: IntArray) -> bool:
-    """Whether there is a causal estimate at any of some times."""
+def _overlaps(causal: Trajectory, stamps_ns: IntArray) -> bool:
+    """Whether any of some times is within the causal estimate."""
     return bool(np.any((stamps_ns >= causal.stamps_ns[0]) & (stamps_ns <= causal.stamps_ns[-1])))
 
 
-def _check(solved: Adjustment) -> None:
-    """Refuse what the images do not confirm."""
-    if solved.observations < MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
+def _check(solved: AdjustedSegment) -> None:
+    """Refuse a minimum that does not fit the observations."""
+    if solved.observations < _MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
         raise UndeterminedError(
             f"{solved.observations} observations in {solved.keyframes} keyframes are too few"
         )
     if not solved.pixel_residual < MAX_PIXEL_RESIDUAL:
-        raise EstimationError(f"images do not fit: {solved.pixel_residual:.1f} σ are left")
+        raise EstimationError(f"images do not fit: residuals of {solved.pixel_residual:.1f} σ")
     if not all(np.isfinite(state.world_T_body.matrix()).all() for state in solved.states):
         raise EstimationError("a pose is not finite")
 
@@ -276,14 +292,18 @@ def _trajectory(states: list[NavState]) -> Trajectory:
     return history.trajectory()
 
 
-def _joined(parts: list[Trajectory]) -> Trajectory:
-    """Trajectories with velocities and biases, one after the other."""
+def _concatenated(parts: list[Trajectory]) -> Trajectory:
+    """Trajectories with velocities and biases, concatenated in time."""
     names = ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases", "accel_biases")
-    return Trajectory(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Trajectory(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
 
 
-def _summary(solved: list[Adjustment], frames: int, began: tuple[float, float]) -> FinalBaSummary:
-    """The sum of all pieces."""
+def _summary(
+    solved: list[AdjustedSegment], frames: int, began: tuple[float, float]
+) -> FinalBaSummary:
+    """Figures of all segments together."""
 
     def total(name: str) -> int:
         return sum(getattr(part, name) for part in solved)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a run keeps for the bundle adjustment over the whole recording: all its frames, on disk.
+"""The log of all frames of a run, on disk, for the bundle adjustment over the whole recording.
 
-In memory stay the times of the frames, the noise of the IMU, and which frames are keyframes: some
-30 bytes a frame. Observations and IMU samples go into a track recording in a temporary folder, from
-which any part is read back.
+Times, noise factors of the IMU and the keyframe flags stay in memory, about 30 bytes a frame.
+Observations and IMU samples go into a track recording in a temporary folder, of which any part can
+be read back.
 """
 
 from __future__ import annotations
@@ -19,32 +19,35 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
-MAX_BEYOND_NS = 100_000_000
-"""Frames that the first or last IMU sample is farther from than this have no motion."""
-JITTER = 0.95
-"""A keyframe may come this much earlier than the spacing says: stamps jitter."""
+__all__ = ["FrameLog"]
+
+_MAX_BEYOND_NS = 100_000_000
+"""Frames farther outside of the IMU samples than this are left out."""
+_JITTER = 0.95
+"""Part of the keyframe spacing that is enough, because time stamps jitter."""
 
 
 class _Silent(Diagnostics):
-    """Faults of the data have been counted when they were read for the first time."""
+    """Counts nothing: faults of the data were counted when they were read for the first time."""
 
     def warn(self, kind: str, message: str) -> None:
-        """Say nothing."""
+        """Count nothing."""
 
 
 class FrameLog:
-    """Keeps the frames of a run, and chooses keyframes while it goes on.
+    """Records the frames of a run and selects keyframes.
 
-    A frame is a keyframe if it is the first or last one, if the last keyframe is as long ago as
-    the spacing says, or if few of its features are left.
+    A frame is a keyframe if it is the first or the last one, if the keyframe spacing has passed
+    since the last keyframe, or if few features of the last keyframe are still tracked.
 
     Attributes:
-        rig: by which the frames were undistorted.
+        rig: the calibration with which the frames were undistorted.
     """
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
@@ -62,7 +65,7 @@ class FrameLog:
     @classmethod
     @contextmanager
     def recording(cls, rig: Rig, config: FinalBaConfig, folder: Path) -> Iterator[FrameLog]:
-        """A log to which frames can be added inside of the block, and which can be read behind it.
+        """A log that takes frames inside of the block and can be read after it.
 
         Args:
             rig: the cameras that frames have observations of.
@@ -74,11 +77,11 @@ class FrameLog:
             yield log
 
     def add(self, imu: ImuData, frame: FeatureFrame, noise: tuple[float, float]) -> None:
-        """Take a frame; one that does not follow those before is left out.
+        """Add a frame; one out of order, or without IMU samples around it, is left out.
 
         Args:
-            imu: the samples since the frame before.
-            frame: what all cameras saw.
+            imu: the samples since the last frame.
+            frame: the observations of all cameras.
             noise: factors on the white noise of gyroscope and accelerometer around this time.
         """
         if len(imu):
@@ -116,22 +119,22 @@ class FrameLog:
 
     def packets(self, first: int, stop: int) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = TrackRecordingSequence(self._path, diagnostics=_Silent())
+        sequence = TrackRecordingSequence(self._path, ReaderOptions(diagnostics=_Silent()))
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:
-        """Whether a frame follows those before, at a time of which the IMU tells."""
+        """Whether a frame is later than the others and within the IMU samples."""
         if self._imu_ns is None or (len(self._frames) and frame_ns <= self._frames[-1]):
             return False
         stamp_ns = frame_ns + round(self.rig.cameras[0].time_offset_s * 1e9)
         first_ns, last_ns = self._imu_ns
-        return first_ns - MAX_BEYOND_NS <= stamp_ns <= last_ns + MAX_BEYOND_NS
+        return first_ns - _MAX_BEYOND_NS <= stamp_ns <= last_ns + _MAX_BEYOND_NS
 
     def _is_keyframe(self, frame: FeatureFrame) -> bool:
         if not self._keyframes:
             return True
         since_s = (frame.stamp_ns - self._frames[self._keyframes[-1]]) * 1e-9
-        if since_s >= JITTER * self._config.keyframe_spacing_s:
+        if since_s >= _JITTER * self._config.keyframe_spacing_s:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
         return len(common) > 0 and bool(common.mean() < self._config.min_common_features)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""States between, before and after those that are known, by the IMU."""
+"""States between, before and after known states, by IMU prediction."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.cost.imu_factor import ImuBuffer, predict, preintegrate
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate
 
-MAX_HOLE_S = 1.0
-"""Between two causal states that are farther apart the IMU leads on."""
+__all__ = ["fill_in", "states_at"]
+
+_MAX_GAP_S = 1.0
+"""States farther apart are not interpolated: the IMU predicts across the gap."""
 
 
-def state_at(trajectory: Trajectory, row: int) -> NavState:
+def _state_at(trajectory: Trajectory, row: int) -> NavState:
     """One row of a trajectory with velocities and biases."""
     assert trajectory.velocities is not None
     assert trajectory.gyro_biases is not None
@@ -28,8 +30,8 @@ def state_at(trajectory: Trajectory, row: int) -> NavState:
         int(trajectory.stamps_ns[row]),
         trajectory.pose(row),
         trajectory.velocities[row],
-        trajectory.gyro_biases[row],
-        trajectory.accel_biases[row],
+        accel_bias=trajectory.accel_biases[row],
+        gyro_bias=trajectory.gyro_biases[row],
     )
 
 
@@ -39,29 +41,29 @@ def states_at(
     imu: ImuBuffer,
     params: gtsam.PreintegrationCombinedParams,
 ) -> list[NavState]:
-    """States at some times: known ones interpolated, others from the nearest by the IMU.
+    """States at given times: interpolated, or predicted by the IMU from the nearest one.
 
     Args:
-        known: causal estimate.
-        stamps_ns: (K,) ascending, at least one of them inside of `known`.
-        imu: samples over all of them.
-        params: gravity.
+        known: the causal estimate.
+        stamps_ns: (K,) ascending times, at least one within `known`.
+        imu: samples over all of these times.
+        params: gravity and noise.
     """
-    inside, valid = interpolate(known, stamps_ns, MAX_HOLE_S)
+    inside, valid = interpolate(known, stamps_ns, _MAX_GAP_S)
     rows = np.cumsum(valid) - 1
     states: dict[int, NavState] = {
-        k: state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
+        k: _state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
     }
     count, first = len(stamps_ns), int(np.argmax(valid))
     for k in range(first - 1, -1, -1):
-        states[k] = predict_back(states[k + 1], int(stamps_ns[k]), imu, params)
+        states[k] = _predict_backward(states[k + 1], int(stamps_ns[k]), imu, params)
     for k in range(first + 1, count):
         if k not in states:
-            states[k] = predict_on(states[k - 1], int(stamps_ns[k]), imu, params)
+            states[k] = _predict_forward(states[k - 1], int(stamps_ns[k]), imu, params)
     return [states[k] for k in range(count)]
 
 
-def predict_on(
+def _predict_forward(
     state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
 ) -> NavState:
     """The state at a later time."""
@@ -70,12 +72,12 @@ def predict_on(
     return predict(state, pim, stamp_ns)
 
 
-def predict_back(
+def _predict_backward(
     state: NavState, stamp_ns: int, imu: ImuBuffer, params: gtsam.PreintegrationCombinedParams
 ) -> NavState:
-    """The state at an earlier time: the dynamics solved for their beginning.
+    """The state at an earlier time: the inverse of the dynamics.
 
-    With ΔR, Δv and Δp preintegrated over T from there to here (Forster et al. 2017, eq. 33),
+    With ΔR, Δv and Δp preintegrated over the time T in between (Forster et al. 2017, eq. 33),
     R = R' ΔRᵀ, v = v' - g T - R Δv, p = p' - v T - ½ g T² - R Δp.
     """
     bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
@@ -90,7 +92,9 @@ def predict_back(
         - rotation.rotate(pim.deltaPij())
     )
     pose = gtsam.Pose3(rotation, position)
-    return NavState(stamp_ns, pose, velocity, state.gyro_bias, state.accel_bias)
+    return NavState(
+        stamp_ns, pose, velocity, accel_bias=state.accel_bias, gyro_bias=state.gyro_bias
+    )
 
 
 def fill_in(
@@ -101,14 +105,14 @@ def fill_in(
 ) -> list[NavState]:
     """States at all frames, from those of the keyframes.
 
-    From each keyframe the IMU leads on to the next one. What is missing there is laid on the way
-    in proportion to the time, so that both ends are met.
+    The IMU predicts from each keyframe to the next one. The difference to the estimate there is
+    distributed over the frames in between in proportion to time, so that both ends are met.
 
     Args:
         keyframes: at least one state.
         stamps_ns: (N,) ascending times, those of the keyframes among them.
-        imu: samples over all of them.
-        params: gravity.
+        imu: samples over all of these times.
+        params: gravity and noise.
     """
     states: list[NavState] = []
     at = np.searchsorted(stamps_ns, [state.stamp_ns for state in keyframes])
@@ -117,14 +121,14 @@ def fill_in(
         inside = stamps_ns[at[k] + 1 : at[k + 1]].tolist()
         if not inside:
             continue
-        way = [start]
+        predicted = [start]
         for stamp_ns in [*inside, end.stamp_ns]:
-            way.append(predict_on(way[-1], stamp_ns, imu, params))
-        missing = gtsam.Pose3.Logmap(way[-1].world_T_body.between(end.world_T_body))
-        faster = end.velocity - way[-1].velocity
-        for state in way[1:-1]:
+            predicted.append(_predict_forward(predicted[-1], stamp_ns, imu, params))
+        pose_error = gtsam.Pose3.Logmap(predicted[-1].world_T_body.between(end.world_T_body))
+        velocity_error = end.velocity - predicted[-1].velocity
+        for state in predicted[1:-1]:
             part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
-            pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * missing))
-            velocity = state.velocity + part * faster
+            pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * pose_error))
+            velocity = state.velocity + part * velocity_error
             states.append(replace(state, world_T_body=pose, velocity=velocity))
     return [*states, keyframes[-1]]

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The measurement model where parameters of the rig are variables too.
+"""The measurement model with parameters of the rig as variables.
 
-No parameter of a rig moves with the world's origin or heading. So the projection may be linearised
-at the current calibration, while poses and features stay at their first estimates: the directions
-that no measurement sees remain unseen (see state.py).
+The parameters of a rig do not depend on the origin and heading of the world. So the projection may
+be linearised at the current calibration while poses and features stay at their first estimates: the
+unobservable directions remain unobservable (see `state`).
 
 The pose X(i) of a frame is that at the time t_i + τ_i, for the time offset τ_i that was known when
 the frame came. Under another offset τ the body is, to first order, at X(i) ⊕ (τ - τ_i) (ω_i, v_i),
@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import D, E, K, T
+from gtsam.symbol_shorthand import E, K, T
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, skew
@@ -26,7 +26,9 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import MIN_DEPTH, Geometry, RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.solve.square_root import Layout
-from slam_graph.backend.solve.state import State, dims_of, stacked_poses
+from slam_graph.backend.solve.state import State, dims_of, distortion_key, stacked_poses
+
+__all__ = ["CalibratedProjection"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,9 +116,10 @@ class CalibratedProjection(RigProjection):
             if K(c) in self._columns:
                 by_intrinsics = camera.by_intrinsics(normalized[rows])
                 by_calibration[rows, :, self._columns[K(c)]] = by_intrinsics
-            if D(c) in self._columns:
+            distortion = distortion_key(c, len(camera.coefficients))
+            if distortion in self._columns:
                 by_coefficients = camera.by_coefficients(normalized[rows])
-                by_calibration[rows, :, self._columns[D(c)]] = by_coefficients
+                by_calibration[rows, :, self._columns[distortion]] = by_coefficients
         shift = self._shift(obs.frames)
         if shift is not None:
             by_offset = np.einsum("nij,nj->ni", by_pose, shift.rate[obs.frame])

@@ -18,18 +18,18 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     ReducedFeatures,
     WhitenedObservations,
     reduce_features,
-    robust_loss,
     whiten,
 )
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.schur import CondensedFeatures, condense_features
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
@@ -87,6 +87,7 @@ class Cost:
         factors: GTSAM's factors between the variables.
         tracked: observations of features that are in the state already.
         fresh: features that enter now.
+        loss: on reprojection residuals; None for that of the settings.
     """
 
     state: State
@@ -96,10 +97,18 @@ class Cost:
     factors: Sequence[gtsam.NonlinearFactor] = field(default_factory=list)
     tracked: Observations | None = None
     fresh: NewFeatures | None = None
+    loss: RobustLoss | None = None
+
+    @property
+    def _robust(self) -> RobustLoss:
+        return self.loss or RobustLoss(self.config.gating.robust_loss)
 
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
+        if self.tracked is not None:
+            keys += self.rig.keys_of(self.tracked)
+            keys += [L(j) for j in np.unique(self.tracked.ids[self.tracked.feature]).tolist()]
         if self.fresh is not None:
             keys += self.rig.keys_of(self.fresh.obs)
             keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
@@ -114,12 +123,20 @@ class Cost:
         return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
-        """The prior with only some of the factors and of the new features (J,)."""
+        """The prior and the features of the state, with some of the factors and new features (J,).
+
+        Observations of features of the state are never linearised again, so no part is without
+        them. New features that fewer than two observations are left of are left out.
+        """
         features = None
         if self.fresh is not None:
             features = self.fresh.subset(fresh & (self.fresh.obs.counts > 1))
             features = replace(features, obs=features.obs.without_idle_frames())
-        return Cost(self.state, self.rig, self.config, self.prior, factors, None, features)
+        return replace(self, factors=factors, fresh=features)
+
+    def ids_of(self, fresh: BoolArray) -> IntArray:
+        """Ids, ascending, of some of the new features (J,)."""
+        return self.fresh.obs.ids[fresh] if self.fresh is not None else np.zeros(0, np.int64)
 
     def value(self) -> float:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""
@@ -135,7 +152,7 @@ class Cost:
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
         errors = np.sqrt(self.squared_errors(obs, points))
-        return float(np.sum(robust_loss(errors, self.config.gating)))
+        return float(np.sum(self._robust.value(errors)))
 
     def squared_errors(self, obs: Observations, points: FloatArray | None) -> FloatArray:
         """Squared residuals (N,) of observations at the current estimates, in units of σ².
@@ -174,7 +191,7 @@ class Cost:
             self._geometry(rig, values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
-        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.config.gating)
+        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self._robust)
 
     def _geometry(
         self,

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import GatingConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,13 +110,13 @@ def whiten(
     first: Geometry,
     estimate: Geometry,
     sigma_px: float,
-    gating: GatingConfig,
+    loss: RobustLoss,
 ) -> WhitenedObservations:
     """Linearise observations: Jacobians at the first estimates, residuals at the current ones."""
     residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     r = residuals / sigma_px
-    weight = np.sqrt(robust_weights(np.linalg.norm(r, axis=1), gating)) / sigma_px
+    weight = np.sqrt(loss.weights(np.linalg.norm(r, axis=1))) / sigma_px
     return WhitenedObservations(
         residuals * weight[:, None],
         by_pose * weight[:, None, None],
@@ -124,26 +124,6 @@ def whiten(
         by_calibration * weight[:, None, None],
         depths,
     )
-
-
-def robust_weights(error: FloatArray, gating: GatingConfig) -> FloatArray:
-    """Weights of iteratively reweighted least squares for errors (N,) in standard deviations."""
-    width = gating.robust_width
-    if gating.robust_loss == "huber":
-        return width / np.maximum(error, width)
-    if gating.robust_loss == "cauchy":
-        return 1.0 / (1.0 + (error / width) ** 2)
-    return np.ones_like(error)
-
-
-def robust_loss(error: FloatArray, gating: GatingConfig) -> FloatArray:
-    """The loss (N,) whose weights are `robust_weights`; half the square without one."""
-    width = gating.robust_width
-    if gating.robust_loss == "huber":
-        return np.where(error <= width, 0.5 * error**2, width * (error - 0.5 * width))
-    if gating.robust_loss == "cauchy":
-        return np.asarray(0.5 * width**2 * np.log1p((error / width) ** 2), dtype=np.float64)
-    return 0.5 * error**2
 
 
 def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:

@@ -1,11 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The feature observations of the frames in the cost, and tables of them for the solver."""
+"""The observations of features that wait to be used, and tables of them for the solver.
+
+`FeatureTracks` owns the life of an observation. It waits from when its frame comes until exactly
+one `Outcome` takes it away; nothing else adds or removes observations (table in docs/engine.md).
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,14 +93,67 @@ class Observations:
         )
 
 
-class TrackWindow:
-    """The observations of the frames in the cost that have not been used yet.
+class Outcome(StrEnum):
+    """What became of an observation."""
 
-    Every observation enters the cost once: `consume` forgets those that have become part of the
-    prior. Rows are sorted by feature, then frame, then camera.
+    USED = "used"
+    """Part of the prior: its information is kept, the observation itself never enters again."""
+    GATED = "gated"
+    """It failed the χ² test before the steps: all observations of a feature outside the state
+    together, those of a feature of the state one by one."""
+    OUTLIER = "outlier"
+    """Its residual failed the χ² test after the steps."""
+    NOT_TRIANGULATED = "not_triangulated"
+    """Its feature was to be used now, and its position cannot be trusted."""
+    DYNAMIC = "dynamic"
+    """Its feature was an outlier in too many consecutive frames."""
+    ENDED = "ended"
+    """Its track has ended, and the policy uses only features of the state."""
+    STANDSTILL = "standstill"
+    """Its feature is a variable of the state, and the platform stands still."""
+    POSE_LEFT = "pose_left"
+    """The pose of its frame has left the state before the feature was used."""
+
+
+class Removals:
+    """Observations that a step does not leave waiting, by what became of them."""
+
+    def __init__(self) -> None:
+        self._features: list[tuple[Outcome, IntArray]] = []
+        self._observations: list[tuple[Outcome, Observations]] = []
+
+    def add_features(self, outcome: Outcome, ids: IntArray) -> None:
+        """All observations of some features (ascending ids)."""
+        self._features.append((outcome, ids))
+
+    def add_observations(self, outcome: Outcome, obs: Observations) -> None:
+        """Single observations."""
+        self._observations.append((outcome, obs))
+
+    def ids(self) -> IntArray:
+        """The features of which no observation is left, ascending."""
+        return np.unique(
+            np.concatenate([np.zeros(0, np.int64), *(ids for _, ids in self._features)])
+        )
+
+    def apply(self, tracks: FeatureTracks) -> None:
+        """Take the observations away: single ones first, then features in the order of adding."""
+        for outcome, obs in self._observations:
+            tracks.remove_observations(outcome, obs)
+        for outcome, ids in self._features:
+            tracks.remove(outcome, ids)
+
+
+class FeatureTracks:
+    """The observations, of the frames whose poses are in the state, that have not been used yet.
+
+    Every observation enters the prior at most once: whatever takes it there takes it out of here.
+    Rows are sorted by feature, then frame, then camera.
 
     Attributes:
         seen: ids (N,) of all features that the last frame saw, used or not, ascending.
+        added: number of observations that were added so far.
+        outcomes: number of observations that each outcome has taken away so far.
     """
 
     def __init__(self) -> None:
@@ -104,6 +163,12 @@ class TrackWindow:
         self._pixels = np.zeros((0, 2))
         self._normalized = np.zeros((0, 2))
         self.seen = np.zeros(0, np.int64)
+        self.added = 0
+        self.outcomes: Counter[Outcome] = Counter()
+
+    def __len__(self) -> int:
+        """How many observations wait."""
+        return len(self._ids)
 
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
@@ -111,6 +176,7 @@ class TrackWindow:
         self.seen = np.unique(np.concatenate([c.ids for c in cameras]))
         ids = np.concatenate([self._ids, *(c.ids for c in cameras)])
         count = len(ids) - len(self._ids)
+        self.added += count
         numbers = [np.full(len(c), number) for number, c in enumerate(cameras)]
         order = np.argsort(ids, kind="stable")
         self._ids = ids[order]
@@ -121,21 +187,22 @@ class TrackWindow:
             order
         ]
 
-    def retain(self, frames: Sequence[int]) -> None:
-        """Forget the observations of all other frames."""
-        self._select(np.isin(self._frames, frames))
+    def keep_frames(self, frames: Sequence[int]) -> None:
+        """Drop the observations of all frames but these, as their poses have left."""
+        self._keep(np.isin(self._frames, frames), Outcome.POSE_LEFT)
 
-    def consume(self, ids: IntArray) -> None:
-        """Forget all observations of some features (ascending ids)."""
+    def remove(self, outcome: Outcome, ids: IntArray) -> None:
+        """Take away all observations of some features (ascending ids)."""
         if len(ids):
-            self._select(~is_in(self._ids, ids))
+            self._keep(~is_in(self._ids, ids), outcome)
 
-    def forget(self, obs: Observations) -> None:
-        """Forget single observations."""
+    def remove_observations(self, outcome: Outcome, obs: Observations) -> None:
+        """Take away single observations."""
         if len(obs):
             frames = np.array(obs.frames)[obs.frame]
             key = self._key(obs.ids[obs.feature], frames, obs.camera)
-            self._select(~np.isin(self._key(self._ids, self._frames, self._cameras), key))
+            rows = ~np.isin(self._key(self._ids, self._frames, self._cameras), key)
+            self._keep(rows, outcome)
 
     def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
         """A number (N,) for each observation that no other one has."""
@@ -144,9 +211,10 @@ class TrackWindow:
         count = self._cameras.max(initial=0) + 1
         return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
 
-    def _select(self, rows: NDArray[np.bool_]) -> None:
+    def _keep(self, rows: NDArray[np.bool_], outcome: Outcome) -> None:
         if rows.all():
             return
+        self.outcomes[outcome] += int(np.sum(~rows))
         self._ids, self._frames, self._cameras = (
             self._ids[rows],
             self._frames[rows],
@@ -154,9 +222,13 @@ class TrackWindow:
         )
         self._pixels, self._normalized = self._pixels[rows], self._normalized[rows]
 
-    def frames(self) -> set[int]:
-        """The frames with unused observations."""
-        return set(np.unique(self._frames).tolist())
+    def frames(self, without: IntArray) -> set[int]:
+        """The frames of all waiting observations but those of some features (ascending ids)."""
+        return set(np.unique(self._frames[~is_in(self._ids, without)]).tolist())
+
+    def ids_waiting(self) -> IntArray:
+        """All features with waiting observations, ascending."""
+        return sorted_unique(self._ids)
 
     def ids_in(self, index: int) -> IntArray:
         """The features that any camera saw in one frame, ascending."""
@@ -182,14 +254,18 @@ class TrackWindow:
         sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
         return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
 
+    def ids_in_any(self, frames: Sequence[int]) -> IntArray:
+        """The features that any camera saw in some frames, ascending."""
+        return sorted_unique(self._ids[np.isin(self._frames, frames)])
+
     def lengths(self) -> tuple[IntArray, IntArray]:
-        """All features with unused observations (J,), and the number of frames that see each."""
+        """All features with waiting observations (J,), and the number of frames that see each."""
         new_frame = np.ones(len(self._ids), np.bool_)
         new_frame[1:] = (np.diff(self._ids) != 0) | (np.diff(self._frames) != 0)
         return np.unique(self._ids[new_frame], return_counts=True)
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
-        """The unused observations of some features (ascending ids) in some or all frames."""
+        """The waiting observations of some features (ascending ids) in some or all frames."""
         rows = is_in(self._ids, ids)
         if frames is not None:
             rows &= np.isin(self._frames, frames)

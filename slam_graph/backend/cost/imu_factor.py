@@ -1,152 +1,33 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamics model: IMU samples preintegrated between frames (GTSAM's `CombinedImuFactor`).
+"""The dynamics model: the state of a new frame predicted by the IMU, and the factor between frames.
 
 The residual x_{t+1} - g(x_t) of the dynamics is the preintegrated IMU factor of Forster et al. 2017
-with the random walk of the biases. Samples are taken as instantaneous values of a signal that is
-linear between them, so the mean of two neighbours is integrated over the time between them.
+with the random walk of the biases (GTSAM's `CombinedImuFactor`); the integration itself is in
+`sensors.imu_buffer`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
-import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_noise import (
+    IMU_GAP_SCALE,
+    DynamicsNoise,
+    predicted_covariance,
+)
+from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
+from slam_graph.backend.window import Window
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate
 from slam_graph.sensors.rig import ImuNoise
 
-NS_PER_S = 1_000_000_000
-FAR_FUTURE_NS = 2**62
-INTEGRATION_SIGMA = 1e-5
-"""Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
-
-
-def preintegration_params(
-    noise: ImuNoise,
-    gravity: float,
-    scale: float = 1.0,
-    gyro_scale: float = 1.0,
-    accel_scale: float = 1.0,
-) -> gtsam.PreintegrationCombinedParams:
-    """GTSAM's parameters for an IMU.
-
-    Args:
-        noise: continuous-time densities.
-        gravity: magnitude in m/s²; the world's z axis points up.
-        scale: factor on all densities.
-        gyro_scale: factor on the white noise of the gyroscope.
-        accel_scale: factor on that of the accelerometer.
-    """
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
-    eye = np.eye(3)
-    params.setGyroscopeCovariance(eye * (scale * gyro_scale * noise.gyro_noise_density) ** 2)
-    params.setAccelerometerCovariance(eye * (scale * accel_scale * noise.accel_noise_density) ** 2)
-    params.setBiasOmegaCovariance(eye * (scale * noise.gyro_random_walk) ** 2)
-    params.setBiasAccCovariance(eye * (scale * noise.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(eye * INTEGRATION_SIGMA**2)
-    return params
-
-
-class ImuBuffer:
-    """The recent IMU samples, kept as long as a frame may still need them."""
-
-    def __init__(self) -> None:
-        self.data = ImuData.empty()
-
-    def add(self, imu: ImuData) -> int:
-        """Append samples, and return how many were left out.
-
-        Samples that are not finite or do not follow those already there are left out.
-        """
-        newest = self.data.stamps_ns[-1] if len(self.data) else np.iinfo(np.int64).min
-        latest = np.maximum.accumulate(np.concatenate([[newest], imu.stamps_ns]))[:-1]
-        good = (imu.stamps_ns > latest) & np.isfinite(imu.gyro).all(axis=1)
-        good &= np.isfinite(imu.accel).all(axis=1)
-        if good.any():
-            rows = ImuData(imu.stamps_ns[good], imu.gyro[good], imu.accel[good])
-            self.data = ImuData.concatenate([self.data, rows])
-        return int(np.sum(~good))
-
-    def newest_ns(self) -> int:
-        """Time of the last sample; far in the future as long as there is none."""
-        return int(self.data.stamps_ns[-1]) if len(self.data) else FAR_FUTURE_NS
-
-    def forget_before(self, stamp_ns: int) -> None:
-        """Drop the samples before the last one at or before `stamp_ns`."""
-        first = int(np.searchsorted(self.data.stamps_ns, stamp_ns, side="right")) - 1
-        if first > 0:
-            self.data = self.data[first:]
-
-    def covers(self, stamp_ns: int) -> bool:
-        """Whether there is a sample at or before `stamp_ns`."""
-        return len(self.data) > 0 and int(self.data.stamps_ns[0]) <= stamp_ns
-
-    def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
-        """Longest time between samples that an interval has part in, infinite without samples."""
-        if len(self.data) == 0:
-            return float("inf")
-        t = self.data.stamps_ns
-        before = t[: int(np.searchsorted(t, start_ns, side="right"))][-1:]
-        after = t[int(np.searchsorted(t, end_ns)) :][:1]
-        inside = t[(t > start_ns) & (t < end_ns)]
-        first = before if len(before) else [start_ns]
-        last = after if len(after) else [end_ns]
-        return float(np.max(np.diff(np.concatenate([first, inside, last])))) * 1e-9
-
-    def between(self, start_ns: int, end_ns: int) -> ImuData:
-        """Samples at both ends (interpolated, or the nearest held) and all in between."""
-        t = self.data.stamps_ns
-        if len(t) == 0:  # nothing known: the caller asks `largest_gap_s` first
-            return ImuData(np.array([start_ns, end_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
-        inside = slice(
-            int(np.searchsorted(t, start_ns, side="right")), int(np.searchsorted(t, end_ns))
-        )
-        around = slice(max(inside.start - 1, 0), inside.stop + 1)
-        stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
-        seconds = (t[around] - start_ns) * 1e-9
-        at = (stamps - start_ns) * 1e-9
-        gyro, accel = (
-            np.stack([np.interp(at, seconds, values[around, axis]) for axis in range(3)], axis=1)
-            for values in (self.data.gyro, self.data.accel)
-        )
-        return ImuData(stamps, gyro, accel)
-
-
-def preintegrate(
-    samples: ImuData,
-    bias: gtsam.imuBias.ConstantBias,
-    params: gtsam.PreintegrationCombinedParams,
-) -> gtsam.PreintegratedCombinedMeasurements:
-    """Preintegrate from the first to the last sample.
-
-    Args:
-        samples: at least two; `ImuBuffer.between` gives them with the ends in place.
-        bias: at which the integration is linearised.
-        params: noise of the IMU.
-    """
-    pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    gyro = 0.5 * (samples.gyro[1:] + samples.gyro[:-1])
-    accel = 0.5 * (samples.accel[1:] + samples.accel[:-1])
-    dts = np.diff(samples.stamps_ns) * 1e-9
-    # GTSAM turns the specific force by the attitude at the start of a step; this is half a step on
-    half_turn = 0.5 * dts[:, None] * (gyro - bias.gyroscope())
-    accel = accel + np.cross(half_turn, accel - bias.accelerometer())
-    for a, w, dt in zip(accel, gyro, dts.tolist(), strict=True):
-        pim.integrateMeasurement(a, w, dt)
-    return pim
-
-
-def predict(
-    state: NavState, pim: gtsam.PreintegratedCombinedMeasurements, stamp_ns: int
-) -> NavState:
-    """The state at the end of a preintegration that began at `state`: g(x_t)."""
-    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-    there = pim.predict(gtsam.NavState(state.world_T_body, state.velocity), bias)
-    return NavState(
-        stamp_ns, there.pose(), np.asarray(there.velocity()), state.gyro_bias, state.accel_bias
-    )
+__all__ = ["Propagation", "imu_factor"]
 
 
 def imu_factor(
@@ -154,3 +35,71 @@ def imu_factor(
 ) -> gtsam.CombinedImuFactor:
     """The dynamics residual between frames i and j."""
     return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
+
+
+class Propagation:
+    """Appends a new frame to a window by the dynamics model.
+
+    Attributes:
+        noise: of the IMU; it adapts to the innovations where the settings ask for it.
+    """
+
+    def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
+        self.config = config
+        self.diagnostics = diagnostics
+        self.noise = DynamicsNoise(imu, config.noise)
+        self._last: NavState | None = None
+        self._predicted: NavState | None = None
+
+    def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
+        """Make a new frame the current one.
+
+        Args:
+            window: gets the predicted state of the new frame, and the factors between it and the
+                frame before.
+            imu: samples up to the frame.
+            stamp_ns: time of the frame on the clock of the IMU.
+            still: whether the platform has not moved.
+        """
+        i, j = window.frame, window.frame + 1
+        previous = window.state.nav_state(i, window.stamp_ns, None)
+        samples = imu.between(window.stamp_ns, stamp_ns)
+        bias = window.state.estimate.atConstantBias(B(i))
+        pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
+        predicted = predict(previous, pim, stamp_ns)
+        window.state.insert_imu_state(j, predicted)
+        window.past.append(i)
+        window.moving.append(i)
+        window.frame, window.stamp_ns = j, stamp_ns
+        factor = imu_factor(i, j, pim)
+        window.factors.append(factor)
+        self._predicted = None if still else self._with_covariance(predicted, factor, window)
+        if still:
+            window.factors += zero_velocity_factors(i, j)
+
+    def _with_covariance(
+        self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window
+    ) -> NavState | None:
+        """A prediction from the last state, with its covariance where that is known."""
+        last = self._last
+        if last is None or last.covariance is None:
+            return None
+        covariance = predicted_covariance(factor, window.state.estimate, last.covariance)
+        return replace(predicted, covariance=covariance)
+
+    def learn(self, state: NavState) -> None:
+        """Adapt the noise of the IMU to the difference of an estimate from its prediction."""
+        if self._last is not None and self._predicted is not None:
+            dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
+            self.noise.learn(self._predicted, state, dt_s)
+        self._last = state
+
+    def _params(
+        self, imu: ImuBuffer, start_ns: int, end_ns: int
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Parameters of the preintegration; where samples are missing, with much larger noise."""
+        gap_s = imu.largest_gap_s(start_ns, end_ns)
+        if gap_s <= self.config.noise.max_imu_gap_s:
+            return self.noise.params()
+        self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
+        return self.noise.params(IMU_GAP_SCALE)

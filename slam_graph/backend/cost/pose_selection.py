@@ -1,44 +1,83 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which past poses stay in the cost beside the current IMU state."""
+"""Which past poses stay in the cost beside the current IMU state: the policy `past_poses`.
+
+A pose that leaves is marginalised. What its frame saw and has not been used yet is either used now
+(the features that it saw enter the cost with all of their observations, or become part of the prior
+if they are there already) or dropped unused; a selection says which.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.policies import CostPolicy
-from slam_graph.backend.window import Window
+from slam_graph.plugins import Registry
 
-PoseChoice = Callable[[Window, CostPolicy, RigProjection], list[int]]
+if TYPE_CHECKING:
+    from slam_graph.backend.cost.reprojection import RigProjection
+    from slam_graph.backend.policies import CostPolicy
+    from slam_graph.backend.window import Window
 
-
-def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
-    """The latest poses."""
-    return window.past[-policy.max_past_poses :]
+__all__ = ["POSE_SELECTIONS", "PoseSelection", "PoseSelector"]
 
 
-def evenly_spaced(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
+@dataclass(frozen=True, slots=True)
+class PoseSelection:
+    """What a step keeps of the past frames.
+
+    Attributes:
+        kept: the frames whose poses stay, ascending; some of `window.past`.
+        dropped: those of the others whose waiting observations are dropped unused. The features
+            that the remaining others saw are used now.
+        keyframes: those of `kept` that are keyframes.
+    """
+
+    kept: list[int]
+    dropped: frozenset[int] = frozenset()
+    keyframes: frozenset[int] = frozenset()
+
+
+PoseSelector = Callable[["Window", "CostPolicy", "RigProjection"], PoseSelection]
+"""Selects among `window.past`, with the current frame's observations in `window.tracks`; it must
+not change the window."""
+
+POSE_SELECTIONS: Registry[PoseSelector] = Registry("slam_graph.pose_selections", "pose selection")
+"""Pose selections by the names that `algorithm.cost.past_poses` takes."""
+
+
+@POSE_SELECTIONS.register("most_recent")
+def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
+    """The latest poses. When the oldest leaves, the features that it saw are used."""
+    return PoseSelection(window.past[-policy.max_past_poses :])
+
+
+@POSE_SELECTIONS.register("evenly_spaced")
+def evenly_spaced(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
     """Poses thinned evenly in time once there are too many, the oldest kept.
 
     Every third pose leaves, starting from the second oldest (Mourikis & Roumeliotis 2007, sec.
-    III-E), so that some poses of the far past stay beside the recent ones.
+    III-E), so that some poses of the far past stay beside the recent ones. The observations of the
+    poses that leave are dropped; the features that they saw go on with their other observations.
     """
     frames = window.past
     if len(frames) <= policy.max_past_poses:
-        return list(frames)
-    leaving = set(frames[1:-1:3])
-    return [frame for frame in frames if frame not in leaving]
+        return PoseSelection(list(frames))
+    leaving = frozenset(frames[1:-1:3])
+    return PoseSelection([frame for frame in frames if frame not in leaving], leaving)
 
 
-def keyframes(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
+@POSE_SELECTIONS.register("keyframes")
+def keyframes(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
     """Keyframes, and the most recent frames (Leutenegger et al. 2015, sec. 3.4).
 
     A frame that is no longer recent stays if it is a keyframe, that is, if it sees enough that the
     last keyframe did not see, or sees it from elsewhere; else it leaves, and its observations are
-    dropped. When there are too many keyframes, the oldest leaves with its features.
+    dropped. When there are too many keyframes, the oldest leaves, and the features that it saw are
+    used.
     """
     count = max(len(window.past) - (policy.recent_frames - 1), 0)
     older, recent = window.past[:count], window.past[count:]
@@ -47,8 +86,8 @@ def keyframes(window: Window, policy: CostPolicy, rig: RigProjection) -> list[in
         if not kept or frame in window.keyframes or _is_new(window, kept[-1], frame, policy, rig):
             kept.append(frame)
     kept = kept[-policy.max_past_poses :]
-    window.keyframes_before, window.keyframes = window.keyframes, set(kept)
-    return kept + recent
+    dropped = set(older).difference(kept, window.keyframes)
+    return PoseSelection(kept + recent, frozenset(dropped), frozenset(kept))
 
 
 def _is_new(
@@ -62,10 +101,3 @@ def _is_new(
     if len(angles) < policy.keyframe_overlap * len(window.tracks.ids_in(frame)):
         return True
     return bool(np.median(angles) > policy.keyframe_parallax_rad) if len(angles) else False
-
-
-POSE_CHOICES: dict[str, PoseChoice] = {
-    "most_recent": most_recent,
-    "evenly_spaced": evenly_spaced,
-    "keyframes": keyframes,
-}

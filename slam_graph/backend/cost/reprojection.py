@@ -22,8 +22,10 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.solve.state import State, stacked_poses
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["MIN_DEPTH", "Geometry", "RigProjection"]
+
 MIN_DEPTH = 1e-3
-"""Points nearer than this (m) are projected at this depth; depth checks reject them elsewhere."""
+"""Points nearer than this (m) are projected as if at this depth; depth checks reject them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +60,7 @@ class RigProjection:
         self.body_R_camera = matrices[:, :3, :3]
         self.body_p_camera = matrices[:, :3, 3]
 
-    # --- what an estimated calibration changes (see calibrated_projection.py) ---------------------
+    # --- overridden where the calibration is estimated (see `calibrated_projection`) --------------
 
     def at(self, state: State) -> RigProjection:
         """The projection with the calibration of a state."""

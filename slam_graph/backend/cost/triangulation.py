@@ -12,31 +12,35 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 
-REGULARISATION = 1e-9
+__all__ = ["Triangulation", "triangulate"]
+
+STEPS = 5
+"""Damped Gauss-Newton steps that refine the linear solution, at most."""
+_REGULARISATION = 1e-9
+"""Added to diagonals, so that features without parallax have a solution too (which is refused)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Triangulation:
-    """Positions of features and whether they can be trusted.
+    """Positions of features and whether they are accepted.
 
     Attributes:
         points: (J, 3) in the world.
-        good: (J,) passed all checks: in front of every camera that saw it, not too near or far,
-            and seen with enough parallax.
+        good: (J,) whether all checks passed: in front of every camera that observed it, neither too
+            near nor too far, and with enough parallax.
         reprojection_px: (J,) root mean square reprojection error.
-        depth_error: (J,) standard deviation of the inverse depth over the inverse depth, for
-            observations with a standard deviation of 1 in normalised coordinates from known poses.
+        depth_error: (J,) relative standard deviation of the inverse depth, for known poses and a
+            standard deviation of 1 of the observations in normalised coordinates.
     """
 
     points: FloatArray
-    good: NDArray[np.bool_]
+    good: BoolArray
     reprojection_px: FloatArray
     depth_error: FloatArray
 
@@ -45,7 +49,7 @@ class Triangulation:
 class _Rays:
     """Camera poses and bearings of all observations, relative to each feature's first camera."""
 
-    anchor: NDArray[np.int64]  # (J,) row of the first observation of each feature
+    anchor: IntArray  # (J,) row of the first observation of each feature
     world_R_camera: FloatArray  # (N, 3, 3)
     world_p_camera: FloatArray  # (N, 3)
     R: FloatArray  # (N, 3, 3) camera_R_anchor
@@ -58,19 +62,22 @@ def triangulate(
     rotations: FloatArray,
     positions: FloatArray,
     config: TriangulationConfig,
+    min_parallax_rad: float = 0.0,
 ) -> Triangulation:
     """Triangulate every feature of `obs` from known poses.
 
     Args:
-        obs: at least two observations of every feature.
-        rig: where the cameras are mounted.
+        obs: at least two observations of each feature.
+        rig: mounting of the cameras.
         rotations: (F, 3, 3) world_R_body of the frames of `obs`.
         positions: (F, 3) of the body in the world.
         config: thresholds.
+        min_parallax_rad: smallest accepted angle between two rays; the one in `config` if that is
+            larger.
     """
     rays = _rays(obs, rig, rotations, positions)
     points = _nearest_to_rays(obs, rays)
-    points, depth_error = _refine(obs, rays, points, config.iterations)
+    points, depth_error = _refine(obs, rays, points)
     residuals, depths = rig.residuals(obs, Geometry(rotations, positions, points))
     count = np.maximum(obs.counts, 1)
     squares = np.bincount(obs.feature, np.sum(residuals**2, axis=1), len(obs.ids))
@@ -82,7 +89,7 @@ def triangulate(
         np.all(np.isfinite(points), axis=1)
         & (nearest > config.min_depth_m)
         & (anchor_depth < config.max_depth_m)
-        & (parallax > config.min_parallax_rad)
+        & (parallax > max(config.min_parallax_rad, min_parallax_rad))
     )
     return Triangulation(points, good, np.sqrt(squares / count), depth_error)
 
@@ -114,14 +121,12 @@ def _nearest_to_rays(obs: Observations, rays: _Rays) -> FloatArray:
     offset = rays.world_p_camera - home[obs.feature]
     A = np.eye(3) - b[:, :, None] * b[:, None, :]
     starts = rays.anchor
-    lhs = np.add.reduceat(A, starts) + REGULARISATION * np.eye(3)
+    lhs = np.add.reduceat(A, starts) + _REGULARISATION * np.eye(3)
     rhs = np.add.reduceat(np.einsum("nij,nj->ni", A, offset), starts)
     return home + np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
 
 
-def _refine(
-    obs: Observations, rays: _Rays, points: FloatArray, iterations: int
-) -> tuple[FloatArray, FloatArray]:
+def _refine(obs: Observations, rays: _Rays, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton on the normalised reprojection error in inverse depth of the first camera.
 
     Returns:
@@ -131,14 +136,14 @@ def _refine(
     home_R, home_p = rays.world_R_camera[rays.anchor], rays.world_p_camera[rays.anchor]
     local = np.einsum("nji,nj->ni", home_R, points - home_p)
     z = np.where(np.abs(local[:, 2]) > 1e-3, local[:, 2], 1e-3)
-    z = np.where(z < 0, 1e3, z)  # behind the camera: noise of a far point
+    z = np.where(z < 0, 1e3, z)  # behind the camera: a distant point and noise
     start = np.stack([local[:, 0] / z, local[:, 1] / z, 1.0 / z], axis=1)
     behind = local[:, 2] <= 1e-3
     start[behind, :2] = obs.normalized[rays.anchor][behind]
     x, damping = start, np.full(len(points), 1e-3)
     error, lhs, rhs = _normal_equations(obs, rays, x)
-    for _ in range(iterations):
-        diagonal = np.einsum("jii->ji", lhs) * damping[:, None] + REGULARISATION
+    for _ in range(STEPS):
+        diagonal = np.einsum("jii->ji", lhs) * damping[:, None] + _REGULARISATION
         step = np.linalg.solve(lhs + diagonal[:, :, None] * np.eye(3), rhs[:, :, None])[:, :, 0]
         trial = x + step
         trial[:, 2] = np.maximum(trial[:, 2], 1e-6)
@@ -153,7 +158,7 @@ def _refine(
             break
     local = np.concatenate([x[:, :2], np.ones((len(x), 1))], axis=1) / x[:, 2:]
     points = home_p + np.einsum("nij,nj->ni", home_R, local)
-    variance = np.linalg.inv(lhs + REGULARISATION * np.eye(3))[:, 2, 2]
+    variance = np.linalg.inv(lhs + _REGULARISATION * np.eye(3))[:, 2, 2]
     return points, np.sqrt(variance) / x[:, 2]
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Factors of GTSAM alone for observations and for a prior, as its own smoothers need them."""
+"""GTSAM's factors for observations and for a prior, as its smoothers need them."""
 
 from __future__ import annotations
 
@@ -9,48 +9,44 @@ from typing import Any
 import gtsam
 from gtsam.symbol_shorthand import L, X
 
-from slam_graph.backend.backend_config import GatingConfig
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.errors import ConfigError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["ProjectionFactors", "calibration", "joint_prior", "pixel_noise"]
+
 
 def calibration(camera: Camera) -> tuple[Any, Any]:
-    """GTSAM's calibration of a camera, and the type of its projection factor."""
-    intrinsics = (camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    if camera.distortion == "equidistant":
-        fisheye = gtsam.Cal3Fisheye(*intrinsics, *camera.coefficients)
-        return fisheye, gtsam.GenericProjectionFactorCal3Fisheye
-    if camera.distortion == "radtan":
-        radtan = gtsam.Cal3DS2(*intrinsics, *camera.coefficients)
-        return radtan, gtsam.GenericProjectionFactorCal3DS2
-    if camera.distortion == "mei":
-        xi, k1, k2, p1, p2 = camera.coefficients
-        unified = gtsam.Cal3Unified(*intrinsics, k1, k2, p1, p2, xi)
-        return unified, gtsam.GenericProjectionFactorCal3Unified
-    if camera.distortion != "none":
+    """GTSAM's calibration of a camera, and the type of its projection factor.
+
+    Raises:
+        ConfigError: if GTSAM has no such camera model.
+    """
+    model = camera.gtsam_calibration()
+    if model is None:
         raise ConfigError(
             f"GTSAM's smoothers have no camera with distortion '{camera.distortion}'; "
             "choose another algorithm"
         )
-    return gtsam.Cal3_S2(*intrinsics), gtsam.GenericProjectionFactorCal3_S2
+    return model, getattr(gtsam, f"GenericProjectionFactor{type(model).__name__}")
 
 
-def pixel_noise(sigma_px: float, gating: GatingConfig) -> gtsam.noiseModel.Base:
-    """Noise of an observation, with the robust loss around it."""
+def pixel_noise(sigma_px: float, loss: RobustLoss) -> gtsam.noiseModel.Base:
+    """Noise model of an observation under a robust loss."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_px)
     estimators = gtsam.noiseModel.mEstimator
-    if gating.robust_loss == "huber":
-        return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(gating.robust_width), noise)
-    if gating.robust_loss == "cauchy":
-        return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(gating.robust_width), noise)
+    if loss.name == "huber":
+        return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(loss.width), noise)
+    if loss.name == "cauchy":
+        return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(loss.width), noise)
     return noise
 
 
 class ProjectionFactors:
-    """Makes projection factors for the cameras of a rig."""
+    """Makes the projection factors of the cameras of a rig."""
 
     def __init__(self, rig: Rig, noise: gtsam.noiseModel.Base) -> None:
         self._noise = noise
@@ -59,7 +55,7 @@ class ProjectionFactors:
     def of(self, obs: Observations) -> list[gtsam.NonlinearFactor]:
         """One factor between `X(frame)` and `L(feature)` for each observation.
 
-        A point behind the camera gets a constant cost instead of an exception.
+        For a point behind the camera the cost is constant; no exception is raised.
         """
         factors = []
         poses, points = [X(i) for i in obs.frames], [L(j) for j in obs.ids.tolist()]
@@ -78,11 +74,11 @@ class ProjectionFactors:
 
 
 def joint_prior(prior: SquareRootInformation, at: gtsam.Values) -> gtsam.NonlinearFactor:
-    """A Gaussian over pose, velocity and bias of one frame as one factor, with all correlations.
+    """A Gaussian on pose, velocity and bias of one frame as one factor, with all correlations.
 
     Args:
-        prior: ‖R δ - d‖² over exactly these three variables.
-        at: the point from which δ is counted.
+        prior: ‖R δ - d‖² on exactly these three variables.
+        at: the linearisation point, at which δ is zero.
     """
     (x, A_x), (v, A_v), (b, A_b) = (
         (key, prior.R[:, columns]) for key, columns in prior.layout.columns.items()

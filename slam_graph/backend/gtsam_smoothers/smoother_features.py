@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Features of GTSAM's smoothers: which are variables, and which observations become factors.
 
-A feature enters with all its observations in the lag once these determine it, and is observed once
-more in every later state that sees it. It leaves when it was not seen for the lag.
+A feature enters with all its observations in the lag once these determine its position. Every later
+state that sees it adds one observation. It leaves when no state in the lag has seen it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import Observations, TrackWindow, is_in
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, Outcome, is_in
 from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
 from slam_graph.backend.policies import SmootherPolicy
@@ -27,9 +27,11 @@ from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["NewObservations", "SmootherFeatures"]
+
 GATE_SCALE = 4.0
 """The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
-OUTLIER_PX = 3.0
+OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error do not enter, in units of σ."""
 
 
@@ -53,9 +55,9 @@ class SmootherFeatures:
 
     Attributes:
         active: ids (N,) of the features that are variables, ascending.
-        rejected: ids (N,) of those whose last observation the gate rejected.
-        innovations: how far the last observations of these were from what was predicted, by a
-            covariance that lacks that of the features.
+        rejected: ids (N,) of those of which the gate rejected an observation of the newest state.
+        innovations: of the observations of the newest state, under a predicted covariance without
+            that of the features.
     """
 
     def __init__(
@@ -68,23 +70,22 @@ class SmootherFeatures:
         self._config = config
         self._diagnostics = diagnostics
         self._rig = RigProjection(rig)
-        gating = config.gating.model_copy(update={"robust_loss": policy.robust_loss})
-        self._factors = ProjectionFactors(rig, pixel_noise(config.noise.pixel_sigma, gating))
-        angle = max(policy.min_parallax_rad, config.triangulation.min_parallax_rad)
-        self._triangulation = config.triangulation.model_copy(update={"min_parallax_rad": angle})
+        self._factors = ProjectionFactors(
+            rig, pixel_noise(config.noise.pixel_sigma, RobustLoss(policy.robust_loss))
+        )
 
     def retain(self, estimate: gtsam.Values) -> None:
-        """Forget the features that are no variables any more."""
+        """Forget the features that are not variables any more."""
         kept = [j for j in self.active.tolist() if estimate.exists(L(j))]
         self.active = np.array(kept, np.int64)
 
     def observe(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, covariance: FloatArray
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, covariance: FloatArray
     ) -> NewObservations:
         """The observations of the graph's newest state.
 
         Args:
-            tracks: observations that are not in the graph yet.
+            tracks: observations that are not in the graph.
             frame: index of the newest state.
             estimate: of the poses in `tracks`, the newest one predicted, and of the features.
             covariance: (6, 6) of the predicted pose.
@@ -92,7 +93,7 @@ class SmootherFeatures:
         new = NewObservations()
         seen = np.intersect1d(self.active, tracks.ids_in(frame), True)
         again = tracks.observations(seen, [frame])
-        tracks.consume(self.active)
+        tracks.remove(Outcome.USED, self.active)
         again = again.rows(self._gate(again, estimate, covariance))
         ids = np.unique(again.ids[again.feature])
         self._add(new, again, ids)
@@ -101,7 +102,7 @@ class SmootherFeatures:
         for j, point in zip(entering.ids.tolist(), points, strict=True):
             new.points.insert(L(j), point)
         self._add(new, entering, entering.ids)
-        tracks.consume(entering.ids)
+        tracks.remove(Outcome.USED, entering.ids)
         self.active = np.union1d(self.active, entering.ids)
         return new
 
@@ -109,10 +110,8 @@ class SmootherFeatures:
         new.factors += self._factors.of(obs)
         new.seen += [L(j) for j in ids.tolist()]
 
-    def _gate(
-        self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray
-    ) -> NDArray[np.bool_]:
-        """Which observations (N,) are where the predicted pose lets them be."""
+    def _gate(self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray) -> BoolArray:
+        """Which observations (N,) agree with the predicted pose."""
         self.rejected = np.zeros(0, np.int64)
         self.innovations = Innovations()
         if len(obs) == 0:
@@ -133,9 +132,9 @@ class SmootherFeatures:
         return np.asarray(good)
 
     def _entering(
-        self, tracks: TrackWindow, frame: int, estimate: gtsam.Values, room: int
+        self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, room: int
     ) -> tuple[Observations, FloatArray]:
-        """New variables: the longest tracks that are seen now and determine a point."""
+        """New variables: the longest current tracks that determine a point."""
         ids, lengths = tracks.lengths()
         ready = (lengths >= self._policy.min_feature_frames) & is_in(ids, tracks.ids_in(frame))
         ids, lengths = ids[ready], lengths[ready]
@@ -143,8 +142,10 @@ class SmootherFeatures:
         if len(ids) == 0 or room <= 0:
             return obs.subset(np.zeros(len(ids), np.bool_)), np.zeros((0, 3))
         poses = stacked_poses(estimate, obs.frames)
-        result = triangulate(obs, self._rig, *poses, self._triangulation)
-        fits = result.reprojection_px < OUTLIER_PX * self._config.noise.pixel_sigma
+        result = triangulate(
+            obs, self._rig, *poses, self._config.triangulation, self._policy.min_parallax_rad
+        )
+        fits = result.reprojection_px < OUTLIER_SIGMAS * self._config.noise.pixel_sigma
         good = result.good & fits
         longest = np.argsort(-np.where(good, lengths, 0), kind="stable")[:room]
         chosen = np.zeros(len(ids), np.bool_)

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """GTSAM's three smoothers behind one interface: two with a fixed lag, and iSAM2 without.
 
-They eliminate by Cholesky, or by QR if the policy says so. Orderings are COLAMD's.
+`IncrementalFixedLagSmoother` is iSAM2 with a lag, `BatchFixedLagSmoother` solves the whole lag by
+Levenberg-Marquardt at every update. They eliminate by Cholesky, or by QR if the policy says so, in
+COLAMD's order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import gtsam
@@ -17,11 +19,13 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import dim
 
+__all__ = ["SOLVERS", "SmootherSolver"]
+
 Stamps = Mapping[Any, float]
 """Time of each key, in seconds."""
 
 
-class NativeSolver(Protocol):
+class SmootherSolver(Protocol):
     """A smoother of GTSAM."""
 
     def update(
@@ -38,16 +42,16 @@ class NativeSolver(Protocol):
             stamps_s: when each new or newly observed variable was seen.
 
         Raises:
-            RuntimeError: if the problem cannot be solved; the solver is of no use then.
+            RuntimeError: if the problem cannot be solved; the solver cannot be used any more.
         """
         ...
 
     def estimate(self, keys: Iterable[int]) -> gtsam.Values:
-        """Estimates of those of some variables that are still there."""
+        """Estimates of at least those of some variables that were not marginalised."""
         ...
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
-        """All factors that it holds, those of variables that left included."""
+        """All factors, with those that marginalised variables have left behind."""
         ...
 
     def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
@@ -59,7 +63,7 @@ class NativeSolver(Protocol):
         ...
 
 
-def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
     """A graph of some factors."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
@@ -76,7 +80,7 @@ def _stacked(joint: gtsam.JointMarginal, keys: Sequence[int]) -> FloatArray:
 def _covariance_of_graph(
     graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, keys: Sequence[int]
 ) -> FloatArray:
-    """Joint marginal covariance from a graph: what is asked for is eliminated last, in the root."""
+    """Joint marginal covariance of some variables, which are eliminated last and so in the root."""
     linear = graph.linearize(at)
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys))
     root = linear.eliminateMultifrontal(order).roots()[0].conditional()
@@ -90,20 +94,13 @@ def _covariance_of_graph(
     return covariance
 
 
-def _isam2_params(policy: SmootherPolicy) -> gtsam.ISAM2Params:
-    params = gtsam.ISAM2Params()
-    params.setRelinearizeThreshold(policy.relinearize_threshold)
-    params.relinearizeSkip = policy.relinearize_skip
-    params.setFactorization(policy.factorization.upper())
-    params.findUnusedFactorSlots = True
-    return params
+class _FixedLag:
+    """A smoother of GTSAM out of which variables are marginalised that are older than the lag."""
 
-
-class FixedLagIsam2:
-    """`IncrementalFixedLagSmoother`: iSAM2, out of which old variables are marginalised."""
-
-    def __init__(self, policy: SmootherPolicy) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(policy.lag_s, _isam2_params(policy))
+    def __init__(
+        self, smoother: gtsam.IncrementalFixedLagSmoother | gtsam.BatchFixedLagSmoother
+    ) -> None:
+        self._smoother = smoother
         self._estimate = gtsam.Values()
 
     def update(
@@ -112,36 +109,32 @@ class FixedLagIsam2:
         values: gtsam.Values,
         stamps_s: Stamps,
     ) -> None:
-        """See `NativeSolver`."""
-        self._smoother.update(graph_of(factors), values, stamps_s)
+        """See `SmootherSolver`."""
+        self._smoother.update(_graph_of(factors), values, stamps_s)
         self._estimate = self._smoother.calculateEstimate()
 
     def estimate(self, keys: Iterable[int]) -> gtsam.Values:
-        """See `NativeSolver`."""
+        """All variables, whatever the keys: see `SmootherSolver`."""
         return self._estimate
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         return gtsam.NonlinearFactorGraph(self._smoother.getFactors())
 
     def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         return self._estimate, dict(self._smoother.timestamps())
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         return _covariance_of_graph(self._smoother.getFactors(), self._estimate, keys)
 
 
-class FixedLagBatch:
-    """`BatchFixedLagSmoother`: Levenberg-Marquardt over the whole lag at every update."""
+class _FullIsam2:
+    """`ISAM2`: nothing is ever marginalised."""
 
-    def __init__(self, policy: SmootherPolicy) -> None:
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(policy.max_iterations)
-        params.setLinearSolverType(f"MULTIFRONTAL_{policy.factorization.upper()}")
-        self._smoother = gtsam.BatchFixedLagSmoother(policy.lag_s, params)
-        self._estimate = gtsam.Values()
+    def __init__(self, isam2: gtsam.ISAM2) -> None:
+        self._isam2 = isam2
 
     def update(
         self,
@@ -149,44 +142,11 @@ class FixedLagBatch:
         values: gtsam.Values,
         stamps_s: Stamps,
     ) -> None:
-        """See `NativeSolver`."""
-        self._smoother.update(graph_of(factors), values, stamps_s)
-        self._estimate = self._smoother.calculateEstimate()
+        """See `SmootherSolver`."""
+        self._isam2.update(_graph_of(factors), values)
 
     def estimate(self, keys: Iterable[int]) -> gtsam.Values:
-        """See `NativeSolver`."""
-        return self._estimate
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """See `NativeSolver`."""
-        return gtsam.NonlinearFactorGraph(self._smoother.getFactors())
-
-    def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
-        """See `NativeSolver`."""
-        return self._estimate, dict(self._smoother.timestamps())
-
-    def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """See `NativeSolver`."""
-        return _covariance_of_graph(self._smoother.getFactors(), self._estimate, keys)
-
-
-class FullIsam2:
-    """`ISAM2`: nothing ever leaves."""
-
-    def __init__(self, policy: SmootherPolicy) -> None:
-        self._isam2 = gtsam.ISAM2(_isam2_params(policy))
-
-    def update(
-        self,
-        factors: Sequence[gtsam.NonlinearFactor],
-        values: gtsam.Values,
-        stamps_s: Stamps,
-    ) -> None:
-        """See `NativeSolver`."""
-        self._isam2.update(graph_of(factors), values)
-
-    def estimate(self, keys: Iterable[int]) -> gtsam.Values:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         values = gtsam.Values()
         for key in keys:
             kind = chr(gtsam.Symbol(key).chr())
@@ -203,20 +163,45 @@ class FullIsam2:
         return values
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         return gtsam.NonlinearFactorGraph(self._isam2.getFactorsUnsafe())
 
     def everything(self) -> tuple[gtsam.Values, dict[int, float]]:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`; there are no stamps."""
         return self._isam2.calculateEstimate(), {}
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """See `NativeSolver`."""
+        """See `SmootherSolver`."""
         return _stacked(self._isam2.jointMarginalCovariance(list(keys)), keys)
 
 
-SOLVERS: dict[str, type[FixedLagIsam2] | type[FixedLagBatch] | type[FullIsam2]] = {
-    "fixed_lag_isam2": FixedLagIsam2,
-    "fixed_lag_batch": FixedLagBatch,
-    "isam2": FullIsam2,
+def _isam2_params(policy: SmootherPolicy) -> gtsam.ISAM2Params:
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(policy.relinearize_threshold)
+    params.relinearizeSkip = policy.relinearize_skip
+    params.setFactorization(policy.factorization.upper())
+    params.findUnusedFactorSlots = True
+    return params
+
+
+def _isam2(policy: SmootherPolicy) -> SmootherSolver:
+    return _FullIsam2(gtsam.ISAM2(_isam2_params(policy)))
+
+
+def _fixed_lag_isam2(policy: SmootherPolicy) -> SmootherSolver:
+    return _FixedLag(gtsam.IncrementalFixedLagSmoother(policy.lag_s, _isam2_params(policy)))
+
+
+def _fixed_lag_batch(policy: SmootherPolicy) -> SmootherSolver:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(policy.max_iterations)
+    params.setLinearSolverType(f"MULTIFRONTAL_{policy.factorization.upper()}")
+    return _FixedLag(gtsam.BatchFixedLagSmoother(policy.lag_s, params))
+
+
+SOLVERS: dict[str, Callable[[SmootherPolicy], SmootherSolver]] = {
+    "fixed_lag_isam2": _fixed_lag_isam2,
+    "fixed_lag_batch": _fixed_lag_batch,
+    "isam2": _isam2,
 }
+"""Makes the smoother that `algorithm.engine` names."""

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The first state: from standstill, in motion, or given."""
+"""Initialization: the first state, from standstill, in motion, or given."""

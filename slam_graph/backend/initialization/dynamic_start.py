@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start in motion: a first guess of all states of a short window, from images and IMU together.
 
-Gyroscope bias from epipolar geometry, then velocity, gravity and scale in closed form. The
-engine refines the guess with its own cost and steps (see initialization.py).
+Gyroscope bias from epipolar geometry, static features by consensus, then velocity, gravity and
+scale in closed form. The engine refines the guess (see dynamic_refinement.py).
 """
 
 from __future__ import annotations
@@ -15,26 +15,28 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.imu_factor import ImuBuffer, preintegrate
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.initialization.first_state import level_rotation
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.start_consensus import static_features
-from slam_graph.backend.initialization.static_start import level_rotation
 from slam_graph.backend.initialization.visual_inertial_alignment import Alignment, Motion, align
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer, preintegrate
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 
-OUTLIER_PX = 3.0
-"""Features with a larger root mean square reprojection error leave the window, in units of σ."""
+__all__ = ["MIN_FEATURES", "OUTLIER_SIGMAS", "StartFrames", "StartGuess", "guess_states"]
+
+OUTLIER_SIGMAS = 3.0
+"""Features with a larger root mean square reprojection error are outliers, in units of σ."""
 
 MIN_FEATURES = 10
-"""Fewer features than this that are seen from several frames do not make a start."""
+"""Smallest number of features that a start in motion is computed from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StartWindow:
-    """Frames from which a start in motion is tried, thinned in time.
+class StartFrames:
+    """The frames from which a start in motion is computed.
 
     Attributes:
         stamps_ns: times on the clock of the IMU.
@@ -45,27 +47,27 @@ class StartWindow:
     frames: list[FeatureFrame]
 
     @staticmethod
-    def thinned(stamps_ns: list[int], frames: list[FeatureFrame], spacing_s: float) -> StartWindow:
-        """Every frame that is `spacing_s` after the one before, counted back from the last."""
+    def thinned(stamps_ns: list[int], frames: list[FeatureFrame], spacing_s: float) -> StartFrames:
+        """The last frame, and going back every frame about `spacing_s` before the one chosen."""
         chosen = [len(frames) - 1]
         for k in range(len(frames) - 2, -1, -1):
             if stamps_ns[chosen[-1]] - stamps_ns[k] >= round(spacing_s * 0.95e9):
                 chosen.append(k)
         chosen.reverse()
-        return StartWindow([stamps_ns[k] for k in chosen], [frames[k] for k in chosen])
+        return StartFrames([stamps_ns[k] for k in chosen], [frames[k] for k in chosen])
 
     def imu_between(self, imu: ImuBuffer) -> list[ImuData]:
-        """Samples between each frame and the next."""
+        """IMU samples between each frame and the next."""
         ends = zip(self.stamps_ns[:-1], self.stamps_ns[1:], strict=True)
         return [imu.between(a, b) for a, b in ends]
 
-    def only(self, ids: IntArray) -> StartWindow:
-        """The same frames with some features alone."""
-        return StartWindow(self.stamps_ns, [frame.only(ids) for frame in self.frames])
+    def only(self, ids: IntArray) -> StartFrames:
+        """The same frames with only some features (N,)."""
+        return StartFrames(self.stamps_ns, [frame.only(ids) for frame in self.frames])
 
-    def tracks(self) -> TrackWindow:
+    def tracks(self) -> FeatureTracks:
         """The observations of all frames, numbered from 0."""
-        window = TrackWindow()
+        window = FeatureTracks()
         for k, frame in enumerate(self.frames):
             window.add(k, frame)
         return window
@@ -73,11 +75,11 @@ class StartWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartGuess:
-    """What a window says of itself before it is solved as a whole.
+    """First estimates for the batch problem of a start in motion.
 
     Attributes:
-        states: of all its frames; the world has its origin and zero yaw at the first body.
-        static: ids (J,) of the features that last and stand still, ascending.
+        states: of all frames; the first body is at the origin of the world with zero yaw.
+        static: ids (J,) of the static features that are tracked for long enough, ascending.
     """
 
     states: list[NavState]
@@ -85,44 +87,45 @@ class StartGuess:
 
 
 def guess_states(
-    window: StartWindow,
+    frames: StartFrames,
     imu: ImuBuffer,
     rig: RigProjection,
     params: gtsam.PreintegrationCombinedParams,
     config: NoiseConfig,
     rng: np.random.Generator,
 ) -> StartGuess | str:
-    """States of all frames of a window, or the reason why there is no guess.
+    """States of all frames of a window, or what is missing for them.
 
     Args:
-        window: at least two frames with features in common.
-        imu: samples over the window.
+        frames: at least two frames with features in common.
+        imu: samples over them.
         rig: mounting of the cameras.
         params: of the preintegration.
         config: gravity and the noise of the features.
-        rng: draws samples of features that may stand still.
+        rng: draws the samples of RANSAC.
     """
-    samples = window.imu_between(imu)
-    tracks = window.tracks()
+    samples = frames.imu_between(imu)
+    tracks = frames.tracks()
     ids, lengths = tracks.lengths()
-    ids = ids[lengths >= max(3, len(window.frames) // 3)]
+    ids = ids[lengths >= max(3, len(frames.frames) // 3)]
     if len(ids) < MIN_FEATURES:
-        return f"more features that last ({len(ids)} so far)"
+        return f"more features with long tracks ({len(ids)} so far)"
     obs = tracks.observations(ids)
-    tolerance = OUTLIER_PX * config.pixel_sigma / rig.cameras[0].fx
+    tolerance = OUTLIER_SIGMAS * config.pixel_sigma / rig.cameras[0].fx
 
-    def agreed(seen: StartWindow) -> tuple[FloatArray, Motion, BoolArray] | None:
+    def consensus(seen: StartFrames) -> tuple[FloatArray, Motion, BoolArray] | None:
+        """Gyroscope bias by some features, the motion that it gives, and the static features."""
         gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params)
         if gyro_bias is None:
             return None
-        motion = _integrate(window, samples, gyro_bias, params)
+        motion = _integrate(frames, samples, gyro_bias, params)
         static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
         return gyro_bias, motion, static
 
-    found = agreed(window)
+    found = consensus(frames)
     if found is not None and not found[2].all():
-        # what moves by itself has spoilt the bias, and so what agrees
-        found = agreed(window.only(ids[found[2]]))
+        # dynamic features have biased the gyroscope bias, and with it the consensus
+        found = consensus(frames.only(ids[found[2]]))
     if found is None:
         return "features in common between frames"
     gyro_bias, motion, static = found
@@ -130,12 +133,12 @@ def guess_states(
         return "features that agree on a motion"
     alignment = align(obs.subset(static), motion, rig, config.gravity)
     if alignment is None:
-        return "motion that shows gravity and scale"
-    return StartGuess(_states(window, motion, alignment, gyro_bias), ids[static])
+        return "motion that determines gravity and scale"
+    return StartGuess(_states(frames, motion, alignment, gyro_bias), ids[static])
 
 
 def _integrate(
-    window: StartWindow,
+    frames: StartFrames,
     samples: list[ImuData],
     gyro_bias: FloatArray,
     params: gtsam.PreintegrationCombinedParams,
@@ -152,12 +155,12 @@ def _integrate(
         rotations.append(R)
         displacements.append(p)
         velocities.append(v)
-    times_s = (np.array(window.stamps_ns) - window.stamps_ns[0]) * 1e-9
+    times_s = (np.array(frames.stamps_ns) - frames.stamps_ns[0]) * 1e-9
     return Motion(times_s, np.array(rotations), np.array(displacements), np.array(velocities))
 
 
 def _states(
-    window: StartWindow, motion: Motion, alignment: Alignment, gyro_bias: FloatArray
+    frames: StartFrames, motion: Motion, alignment: Alignment, gyro_bias: FloatArray
 ) -> list[NavState]:
     world_R_first = level_rotation(-alignment.gravity).matrix()
     positions = alignment.positions(motion) @ world_R_first.T
@@ -168,8 +171,8 @@ def _states(
             stamp_ns,
             gtsam.Pose3(gtsam.Rot3.ClosestTo(rotations[k]), positions[k]),
             velocities[k],
-            gyro_bias,
-            np.zeros(3),
+            accel_bias=np.zeros(3),
+            gyro_bias=gyro_bias,
         )
-        for k, stamp_ns in enumerate(window.stamps_ns)
+        for k, stamp_ns in enumerate(frames.stamps_ns)
     ]

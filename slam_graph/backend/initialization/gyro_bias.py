@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Gyroscope bias from images alone: the rotation that makes epipolar planes meet in one line.
+"""Gyroscope bias from epipolar geometry: rotations for which the epipolar planes share one line.
 
 For a pair of frames with relative rotation R, the normals n = f₁ × R f₂ of the epipolar planes are
 all orthogonal to the translation, so the smallest eigenvalue of Σ n nᵀ vanishes (Kneip & Lynen
 2013). With R integrated from the gyroscope this is a cost in its bias only: no depth, velocity or
 gravity is needed (He, Xu, Ouyang & Li 2023).
 
-Noise adds to that eigenvalue, and for a translation along the optical axis hardly anything. So the
-plain smallest eigenvalue prefers wrong rotations under which the camera seems to go straight ahead.
-The eigenvalue relative to what noise adds has no such preference (Kanatani 1996, renormalization).
+Noise increases that eigenvalue, but hardly for a translation along the optical axis. So the plain
+smallest eigenvalue is biased towards rotations under which the camera seems to move straight ahead.
+The eigenvalue relative to the part that noise adds is not (Kanatani 1996, renormalization).
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.imu_factor import preintegrate
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.sensors.imu_buffer import preintegrate
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
+__all__ = ["estimate_gyro_bias"]
+
 MIN_COMMON = 8
-"""Fewer common features than this say nothing about the rotation of a pair."""
+"""Pairs of frames with fewer common features than this are left out."""
 STEP_RAD_S = 1e-4
 """Step of the numerical derivative by the bias."""
 ROBUST_WIDTH = 0.02
+"""Width of the robust loss on the whitened residual of a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +47,7 @@ class _Pairs:
         first, second: (N, 3) bearings in the orientation of the body.
         R: (P, 3, 3) rotation from the second body to the first.
         by_bias: (P, 3, 3) its derivative by the bias.
-        whitening: (P, 3, 3) makes the noise of the sum of n nᵀ the same in all directions.
+        whitening: (P, 3, 3) makes the noise of Σ n nᵀ the same in all directions.
     """
 
     pair: NDArray[np.intp]
@@ -124,10 +127,10 @@ def _pairs(
 
 
 def _whitening(first: FloatArray, second: FloatArray, R: FloatArray) -> FloatArray:
-    """What (3, 3) makes the noise of the normals of a pair equal in all directions, on the average.
+    """The matrix (3, 3) that whitens the noise of the normals of a pair, on average.
 
-    Noise of σ across a bearing moves n = f₁ × R f₂ across it too, so to Σ n nᵀ the noise of all
-    bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ).
+    Noise σ perpendicular to the bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ) to Σ n nᵀ, the
+    normals being n = f₁ × R f₂.
 
     Args:
         first: (N, 3) bearings.

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which features of a start window stand still: consensus of whole tracks on one inertial motion.
+"""Static features of a start in motion: RANSAC over whole tracks with one inertial motion as model.
 
-The equations of the alignment, with the position of each feature eliminated, hold for the points of
-a world in which the IMU measures what it does, and for no other: an object that speeds up or turns
-has a motion that no velocity and gravity explain together with the specific force. So RANSAC
-(Fischler & Bolles 1981; scores of Torr & Zisserman 2000) over whole tracks, with the closed form as
-the model, needs no view to be dominated by the static world. What only moves evenly is an inertial
-frame like any other, there the larger group wins.
+The equations of the alignment, with the position of each feature eliminated, hold for static
+features only: no velocity and gravity explain the tracks of an object that accelerates or turns
+together with the measured specific force. So RANSAC (Fischler & Bolles 1981, with the score of Torr
+& Zisserman 2000) with the closed-form alignment as model finds the static features even where most
+features are dynamic. An object in uniform motion is an inertial frame like any other: against it
+the larger group wins.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ from slam_graph.backend.initialization.visual_inertial_alignment import (
     constrained_solution,
 )
 
+__all__ = ["static_features"]
+
 SAMPLES = 100
-"""With samples of four, one is good with a probability of 0.998 if half of the features are."""
+"""If half of the features are static, one sample of four has only such with a probability of
+0.998."""
 SAMPLE_FEATURES = 4
+"""Features in a sample."""
 REFINED = 5
-"""How many of the best samples are refined by all that agree with them."""
+"""How many of the best samples are refined by their inliers."""
 REFINEMENTS = 3
+"""How often a sample is refined by its inliers."""
 
 
 class _Model:
@@ -74,7 +79,7 @@ class _Model:
         return x if np.isfinite(x).all() else None
 
     def distances(self, x: FloatArray) -> FloatArray:
-        """How far (J,) the features are from the camera under a motion x (6,), m."""
+        """Mean distances (J,) of the features from the body under a motion x (6,), m."""
         right = self._top[:, :, 6] - self._top[:, :, :6] @ x
         points = np.linalg.solve(self._R, right[:, :, None])[:, :, 0]
         eyes = self._t[:, None] * x[:3] + 0.5 * self._tt[:, None] * x[3:] + self._shift
@@ -95,7 +100,7 @@ def static_features(
     tolerance: float,
     rng: np.random.Generator,
 ) -> BoolArray:
-    """Which features (J,) agree on one motion of the body.
+    """Which features (J,) are static: those that agree on one motion of the body.
 
     Args:
         obs: features seen from at least three of the frames.
@@ -122,7 +127,7 @@ def static_features(
 
 
 def _refined(model: _Model, x: FloatArray, limit: float) -> FloatArray:
-    """The motion of all features that agree with a motion, repeatedly."""
+    """A motion that is computed from its inliers again and again."""
     for _ in range(REFINEMENTS):
         agree = np.flatnonzero(model.errors(x) < limit)
         better = model.solve(agree, 1.0 / model.distances(x)) if len(agree) else None

@@ -25,9 +25,19 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.solve.square_root import triangularize
 
+__all__ = [
+    "MIN_DEPTH_M",
+    "Alignment",
+    "Motion",
+    "align",
+    "alignment_equations",
+    "constrained_solution",
+]
+
 REWEIGHTINGS = 2
-"""How often the equations are weighed anew by the depths that they gave."""
+"""How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
+"""Depths are at least this, so that weights stay finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +59,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """What the alignment found, in the frame of the first body.
+    """Velocity and gravity, in the frame of the first body.
 
     Attributes:
         velocity: (3,) of the body at the first frame.
@@ -60,12 +70,12 @@ class Alignment:
     gravity: FloatArray
 
     def positions(self, motion: Motion) -> FloatArray:
-        """(K, 3) of the body."""
+        """Positions (K, 3) of the body."""
         t = motion.times_s[:, None]
         return self.velocity * t + 0.5 * self.gravity * t**2 + motion.displacements
 
     def velocities(self, motion: Motion) -> FloatArray:
-        """(K, 3) of the body."""
+        """Velocities (K, 3) of the body."""
         return self.velocity + self.gravity * motion.times_s[:, None] + motion.velocities
 
 
@@ -138,7 +148,16 @@ def _depths(
 
 
 def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignment:
-    """Least squares under |g| = gravity: a secular equation in the Lagrange multiplier."""
+    """Least squares under |g| = gravity: a secular equation in the Lagrange multiplier.
+
+    Args:
+        A: (rows, 6), by velocity and gravity.
+        b: (rows,).
+        gravity: its magnitude, m/s².
+
+    Raises:
+        ValueError: if the equations do not depend on gravity.
+    """
     R = triangularize(np.column_stack([A, b]))
     of_v, of_g, right = R[:3, :3], R[3:6, 3:6], R[3:6, 6]
     values, vectors = np.linalg.eigh(of_g.T @ of_g)

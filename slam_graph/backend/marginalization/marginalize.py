@@ -5,6 +5,11 @@
 min over (x_K, x_M) of c = min over x_K of (min over x_M of c): the inner minimum of the linearised
 cost is again a quadratic in x_K, the marginal prior. A QR whose columns begin with x_M gives it
 without forming the information matrix (see `SquareRootInformation.marginal`).
+
+Which residuals become part of the prior follows from what the policies keep. A filter (features
+used once or in the state, no past IMU states) keeps no residual: all become part of the prior.
+Otherwise those do that touch a variable which leaves, and all observations of features of the
+state; the others are linearised anew in the next step.
 """
 
 from __future__ import annotations
@@ -13,9 +18,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 from slam_graph.backend.cost.construction import ConstructedCost
+from slam_graph.backend.cost.feature_tracks import Outcome
 from slam_graph.backend.marginalization.delayed_features import FeatureArchive
 from slam_graph.backend.marginalization.observability import relinearized
-from slam_graph.backend.policies import MarginalizationPolicy
+from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.gauss_newton import Minimum, linearized
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
@@ -26,50 +32,56 @@ LinearizationPoints = Literal["first", "current", "corrected"]
 
 
 def marginalize_step(
-    window: Window,
-    constructed: ConstructedCost,
-    minimum: Minimum,
-    policy: MarginalizationPolicy,
+    window: Window, constructed: ConstructedCost, minimum: Minimum, algorithm: AlgorithmConfig
 ) -> None:
-    """Let go of what does not stay after a step.
+    """End a step: the only place where the window changes after the current frame was appended.
 
     Args:
-        window: loses the variables and observations that leave, and gets the new prior.
+        window: gets the new state and prior; loses what does not stay.
         constructed: the cost of the step, at its minimum, and what stays.
         minimum: what the steps have come to.
-        policy: which residuals become part of the prior.
+        algorithm: its policies.
     """
-    posterior = minimum.posterior
-    keep = window.keys(constructed.past, constructed.moving, constructed.features)
-    if policy.absorb == "all":
-        window.factors = []
-    else:
+    kept = constructed.poses.kept
+    keep = window.keys(kept, constructed.moving, constructed.features)
+    posterior, factors = minimum.posterior, []
+    if algorithm.relinearizes:
         staying = set(keep)
         stays = [staying.issuperset(factor.keys()) for factor in window.factors]
         leaving = [f for f, stay in zip(window.factors, stays, strict=True) if not stay]
+        factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
         posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
-        window.factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
-    _keep_landmarks(window, constructed)
+    points: LinearizationPoints = "current"
+    if algorithm.marginalization.first_estimates:
+        points = "corrected" if minimum.repeated else "first"
     archive = window.archive if constructed.keep_lost_features else None
-    points: LinearizationPoints = "first" if policy.first_estimates else "current"
-    if policy.first_estimates and minimum.repeated:
-        points = "corrected"
+    window.state = constructed.cost.state.copy()
     window.prior = marginalize(posterior, window.state, keep, points, archive)
-    window.past, window.moving = list(constructed.past), list(constructed.moving)
-    window.features = constructed.features
-    window.tracks.retain([*constructed.past, window.frame])
+    window.factors, window.features = factors, constructed.features
+    window.past, window.moving = list(kept), list(constructed.moving)
+    window.keyframes = set(constructed.poses.keyframes)
+    _keep_points(window, constructed)
+    _settle_observations(window, constructed)
 
 
-def _keep_landmarks(window: Window, constructed: ConstructedCost) -> None:
-    """Remember where the features are that the next step uses again, forget the others."""
+def _keep_points(window: Window, constructed: ConstructedCost) -> None:
+    """Remember where the features are that the step estimated outside the state."""
     fresh = constructed.cost.fresh
     if fresh is None:
         return
-    window.used = fresh.obs.ids, fresh.points
     again = ~constructed.leaving
+    window.used = fresh.obs.ids, fresh.points
     window.landmarks = fresh.obs.ids[again], fresh.points[again]
-    if len(constructed.leaving):
-        window.tracks.consume(fresh.obs.ids[constructed.leaving])
+
+
+def _settle_observations(window: Window, constructed: ConstructedCost) -> None:
+    """Take away the observations that no longer wait."""
+    cost, removals = constructed.cost, constructed.removals
+    if cost.tracked is not None:
+        removals.add_features(Outcome.USED, cost.tracked.ids)
+    removals.add_features(Outcome.USED, cost.ids_of(constructed.leaving))
+    removals.apply(window.tracks)
+    window.tracks.keep_frames([*constructed.poses.kept, window.frame])
 
 
 def marginalize(

@@ -4,14 +4,14 @@
 
 Keys follow GTSAM's symbols with one frame index i everywhere: `X(i)` the pose world_T_body of frame
 i, `V(i)` its velocity in the world, `B(i)` its IMU bias, `L(j)` the position of feature j in the
-world; `E(c)`, `K(c)`, `D(c)` and `T(0)` are parameters of the rig (see calibration.py). Tangents
-are GTSAM's (rotation before translation, both in the body frame; accelerometer bias before
-gyroscope bias).
+world; `E(c)`, `K(c)`, `distortion_key(c, n)` and `T(0)` are parameters of the rig (see
+`online_calibration`). Tangents are GTSAM's (rotation before translation, both in the body frame;
+accelerometer bias before gyroscope bias).
 
 First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
 marginal prior, all Jacobians with respect to it are evaluated at the value it had then, its *first
 estimate*. Otherwise its linearisation point follows the estimate, and the estimator gains
-information about directions that no measurement can see (global position and yaw).
+information about unobservable directions (global position and yaw).
 """
 
 from __future__ import annotations
@@ -21,21 +21,65 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import B, D, L, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.geometry.trajectory import NavState
 
+__all__ = [
+    "POINT_DIM",
+    "POSE_DIM",
+    "FrameMotion",
+    "State",
+    "dim",
+    "dims_of",
+    "distortion_key",
+    "imu_state_keys",
+    "letter_and_index",
+    "stacked_points",
+    "stacked_poses",
+]
+
 POSE_DIM, VELOCITY_DIM, BIAS_DIM, POINT_DIM = 6, 3, 6, 3
 IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
-CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "d": 4, "t": 1}
+CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "t": 1}
 DIMS = IMU_STATE_DIMS | CALIBRATION_DIMS
+"""Tangent dimension by the letter of the symbol. Distortion coefficients (`d`) are not here: their
+number depends on the camera model, and their keys carry it (see `distortion_key`)."""
+
+_LETTER_SHIFT = 56  # GTSAM's symbols: the letter is in the highest of eight bytes
+_INDEX_MASK = (1 << _LETTER_SHIFT) - 1
+_COUNT_SHIFT = 16
+_DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
+_DISTORTION_CODE = ord("d")
 
 
 def dim(key: int) -> int:
     """Tangent dimension of the variable of a key."""
-    return DIMS[chr(gtsam.Symbol(key).chr())]
+    code = key >> _LETTER_SHIFT
+    if code == _DISTORTION_CODE:
+        return (key & _INDEX_MASK) >> _COUNT_SHIFT
+    return _DIMS_BY_CODE[code]
+
+
+def distortion_key(camera: int, coefficients: int) -> int:
+    """Key of the distortion coefficients of a camera, as a variable.
+
+    Camera models have different numbers of coefficients. The key holds the number, so that layouts
+    can be made of keys alone.
+
+    Args:
+        camera: index in the rig.
+        coefficients: their number, that of `CameraModel.coefficient_names`.
+    """
+    return int(D(camera + (coefficients << _COUNT_SHIFT)))
+
+
+def letter_and_index(key: int) -> tuple[str, int]:
+    """The letter of a key, and the index of its frame, feature or camera."""
+    letter, index = chr(key >> _LETTER_SHIFT), key & _INDEX_MASK
+    return letter, index & ((1 << _COUNT_SHIFT) - 1) if letter == "d" else index
 
 
 def imu_state_keys(frame: int) -> tuple[int, int, int]:
@@ -164,15 +208,15 @@ class State:
             stamp_ns,
             self.estimate.atPose3(X(frame)),
             np.asarray(self.estimate.atVector(V(frame))),
-            np.asarray(bias.gyroscope()),
-            np.asarray(bias.accelerometer()),
-            covariance,
+            accel_bias=np.asarray(bias.accelerometer()),
+            gyro_bias=np.asarray(bias.gyroscope()),
+            covariance=covariance,
         )
 
 
 def _copy(source: gtsam.Values, target: gtsam.Values, key: int) -> None:
     """Insert the value of `key` in `source` into `target`."""
-    kind = chr(gtsam.Symbol(key).chr())
+    kind, _ = letter_and_index(key)
     if kind in "xe":
         target.insert(key, source.atPose3(key))
     elif kind == "b":

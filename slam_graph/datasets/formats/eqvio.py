@@ -7,12 +7,12 @@ left camera at 20 Hz, already undistorted, and the IMU at 200 Hz. Rows begin wit
 
 - ``meta`` rows give keys and values, among them `camera_fx` … `camera_cy` and the pose `T_ci_*`,
   which is `body_T_camera` (it equals the `T_BS` of EuRoC's ``cam0/sensor.yaml``);
-- ``imu`` rows give rates and specific forces as measured. Their bias columns are the drift of the
-  bias in the model of the file's makers, all zero, and are not read;
+- ``imu`` rows give rates and specific forces as measured. Their bias columns, all zero, are not
+  read;
 - ``vision_feature`` rows give a landmark's id and normalised coordinates.
 
-Times are float64 seconds, of which 0.24 µs is the last digit; the recorder's clock counted whole
-microseconds, to which they are rounded back. They agree with EuRoC's own stamps to 0.2 µs.
+Times are float64 seconds with a resolution of 0.24 µs. They are rounded to whole microseconds, in
+which the recorder's clock counted, and agree with EuRoC's own stamps to 0.2 µs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
@@ -40,21 +46,22 @@ from slam_graph.datasets.streams.track_frames import (
     TrackTable,
     frames_from_tables,
 )
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
+__all__ = ["EqvioTracks", "is_eqvio_file", "wheel_tracks"]
+
 HEADER = "row_type,"
 META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"
 
 QUATERNION_TOLERANCE = 1e-3
-"""How far the length of the quaternion of a calibration may be from one."""
+"""Largest deviation of the length of the calibration's quaternion from one."""
 
 RESOLUTION = (752, 480)
-"""Of EuRoC's cameras; the file does not say."""
+"""Of EuRoC's cameras; it is not in the file."""
 
 IMU_COLUMNS = (1, 6, 7, 8, 9, 10, 11)
 IMU_ROW = [("stamp", STAMP_TEXT), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
@@ -79,11 +86,8 @@ class EqvioTracks(RecordedSequence):
     """The tracks in GTSAM's wheel, or another file of this kind.
 
     Args:
-        path: the CSV file.
-        cameras: 1 or None; the file has one camera.
-        calibration: a Kalibr camera chain to use instead of the one in the file.
-        groundtruth: file or folder with ground truth; the file itself has none.
-        diagnostics: where faults are counted.
+        path: the CSV file; it has one camera and no ground truth.
+        options: what else is asked for.
 
     Raises:
         DataError: if the file is missing, or a row cannot be read.
@@ -92,19 +96,12 @@ class EqvioTracks(RecordedSequence):
     format: ClassVar[str] = "eqvio"
     content: ClassVar[Literal["images", "tracks"]] = "tracks"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path
-        rig = _read_rig(path) if calibration is None else read_kalibr(calibration).select(1)
-        super().__init__(
-            path.stem, rig if cameras is None else rig.select(cameras), groundtruth, diagnostics
-        )
+        chain = options.calibration
+        rig = _read_rig(path) if chain is None else read_kalibr(chain).select(1)
+        super().__init__(path.stem, options.select(rig), options)
 
     def measure(self) -> Extent:
         """Count frames and IMU samples in one pass over the file."""
@@ -118,7 +115,7 @@ class EqvioTracks(RecordedSequence):
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
         selected = (rows.select(IMU_PREFIX) for rows in read_rows(self.path))
-        blocks = ((rows, _parse_imu(rows)) for rows in selected)
+        blocks = ((rows.where, _parse_imu(rows)) for rows in selected)
         return clean_blocks(blocks, self.diagnostics, after_ns)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
@@ -136,7 +133,7 @@ class EqvioTracks(RecordedSequence):
 
 
 def _stamps(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int64]:
-    """Stamps (N,) in ns, rounded to the microseconds of the clock that they came from."""
+    """Stamps (N,) in ns, rounded to whole microseconds."""
     return (stamps_from_seconds(rows, texts) + 500) // 1000 * 1000
 
 
@@ -175,7 +172,7 @@ class _Meta:
                 return
 
     def text(self, key: str) -> tuple[str, str]:
-        """Value of a key, and where it stands."""
+        """Value of a key, and file and line of it."""
         if key not in self._values:
             raise DataError(f"{self.path}: no meta row with the key '{key}' in this file")
         return self._values[key]

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EuRoC / ASL folders: images of any number of cameras, an IMU, and often ground truth.
 
-The files of an ASL folder (``mav0``): which sensors are there, their calibration and indices.
+Each sensor has a folder in ``mav0``, with its calibration in ``sensor.yaml`` and an index or its
+samples in ``data.csv``.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.groundtruth import find_groundtruth
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows
-from slam_graph.datasets.streams.image_sequence import STEREO_TOLERANCE_S, FileImageSequence
+from slam_graph.datasets.streams.image_sequence import STEREO_TOLERANCE_S, ImageSequence
 from slam_graph.datasets.streams.images import FileImages
 from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.streams.pairing import in_order
@@ -29,9 +31,11 @@ from slam_graph.sensors.euroc_calibration import read_euroc_rig, read_imu_noise
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["EurocSequence", "ordered_images"]
 
-def find_mav0(path: Path) -> Path:
-    """The folder of sensors that a path stands for."""
+
+def _find_mav0(path: Path) -> Path:
+    """The folder of sensors of a recording that is given by this folder or its parent."""
     for folder in (path / "mav0", path):
         if (folder / "imu0").is_dir() or (folder / "cam0").is_dir():
             return folder.resolve()
@@ -43,30 +47,25 @@ def find_mav0(path: Path) -> Path:
     )
 
 
-def imu_file(mav0: Path) -> ImuFile | None:
+def _imu_file(mav0: Path) -> ImuFile | None:
     """The samples of the IMU; None where there is no IMU."""
     folder = mav0 / "imu0"
     return ImuFile(folder / "data.csv", parse_imu_rows) if folder.is_dir() else None
 
 
-def name_of(mav0: Path) -> str:
+def _name_of(mav0: Path) -> str:
     """Name of the recording: that of the folder around ``mav0``."""
     return mav0.parent.name if mav0.name == "mav0" else mav0.name
 
 
-def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[Rig, list[Path]]:
-    """The calibration, and the folder of each of its cameras.
-
-    Args:
-        mav0: folder of sensors.
-        count: number of cameras to use, the first ones; None for all.
-        calibration: Kalibr camera chain to use instead of the ``sensor.yaml`` files.
-    """
+def _read_rig(mav0: Path, options: ReaderOptions) -> tuple[Rig, list[Path]]:
+    """The calibration of the cameras that are used, and the folder of each."""
+    count, chain = options.cameras, options.calibration
     found = [(int(m[1]), p) for p in mav0.iterdir() if (m := re.fullmatch(r"cam(\d+)", p.name))]
     folders = [folder for _, folder in sorted(found)]
     if not folders:
         raise DataError(f"{mav0}: no camera folder (cam0, cam1, …) here")
-    if calibration is None:
+    if chain is None:
         if count is not None and 1 <= count <= len(folders):
             folders = folders[:count]
         rig = read_euroc_rig(mav0, [folder.name for folder in folders])
@@ -74,17 +73,17 @@ def read_rig(mav0: Path, count: int | None, calibration: Path | None) -> tuple[R
         beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
         imu = next((file for file in beside if file.is_file()), None)
         noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
-        rig = read_kalibr(calibration, fallback=noise, needs_imu=imu_file(mav0) is not None)
+        rig = read_kalibr(chain, fallback=noise, needs_imu=(mav0 / "imu0").is_dir())
         if len(rig.cameras) > len(folders):
             raise DataError(
-                f"{calibration}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "
+                f"{chain}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "
                 f"choose fewer cameras"
             )
-    rig = rig if count is None else rig.select(count)
+    rig = options.select(rig)
     return rig, folders[: len(rig.cameras)]
 
 
-def list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
+def _list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
     """The images of a camera; none if its folder holds no images at all."""
     index = folder / "data.csv"
     if not index.is_file():
@@ -105,12 +104,12 @@ def list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
 
 def ordered_images(
     name: str,
-    stamps_ns: NDArray[np.int64],
+    stamps_ns: IntArray,
     paths: Sequence[Path],
     index: Path,
     diagnostics: Diagnostics,
 ) -> FileImages:
-    """The images of a camera without those that break the order of time.
+    """The images of a camera whose stamps increase; the others are counted.
 
     Args:
         name: of the camera.
@@ -139,7 +138,7 @@ def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:
     return parsed, name.strip()
 
 
-class EurocSequence(FileImageSequence):
+class EurocSequence(ImageSequence):
     """A recording in the ASL layout: a folder for each sensor, in one folder ``mav0``.
 
     A folder whose cameras are calibrated but hold no images opens with 0 frames, for its IMU and
@@ -147,10 +146,7 @@ class EurocSequence(FileImageSequence):
 
     Args:
         path: ``mav0`` or the folder that holds it.
-        cameras: use only the first so many.
-        calibration: a Kalibr camera chain to use instead of the ``sensor.yaml`` files.
-        groundtruth: file or folder to use instead of the recording's own ground truth.
-        diagnostics: where faults are counted.
+        options: what else is asked for.
         stereo_tolerance_s: largest time difference of images that are one frame.
 
     Raises:
@@ -162,21 +158,18 @@ class EurocSequence(FileImageSequence):
     def __init__(
         self,
         path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
+        options: ReaderOptions | None = None,
         stereo_tolerance_s: float = STEREO_TOLERANCE_S,
     ) -> None:
-        self.path = find_mav0(path)
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
-        rig, folders = read_rig(self.path, cameras, calibration)
+        options = options or ReaderOptions()
+        self.path = _find_mav0(path)
+        rig, folders = _read_rig(self.path, options)
         super().__init__(
-            name_of(self.path),
+            _name_of(self.path),
             rig,
-            [list_images(folder, diagnostics) for folder in folders],
-            imu_file(self.path),
-            groundtruth or find_groundtruth(self.path),
-            diagnostics,
+            [_list_images(folder, options.diagnostics) for folder in folders],
+            _imu_file(self.path),
+            options,
+            find_groundtruth(self.path),
             stereo_tolerance_s,
         )

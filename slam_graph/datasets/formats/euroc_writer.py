@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""EuRoC (ASL) folders, written whole or not at all."""
+"""EuRoC (ASL) folders: written frame by frame, or converted from any recording of images.
+
+A folder appears when it is complete; an interrupted one leaves nothing behind.
+"""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import mkdtemp
@@ -15,15 +19,17 @@ import cv2
 import gtsam
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.euroc_calibration import camera_entry
 from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+__all__ = ["EurocWriter", "convert_to_euroc", "refuse_existing"]
 
 CALIBRATION = "calibration.yaml"
 """The calibration in Kalibr's format, beside ``mav0``."""
@@ -43,8 +49,12 @@ TRUTH_COLUMNS = (
 TRUTH_FOLDER = "state_groundtruth_estimate0"
 
 
+Progress = Callable[[int], None]
+"""Called with the time of every frame that was written."""
+
+
 def refuse_existing(path: Path, force: bool = False) -> None:
-    """Refuse a folder that is there already, before any work is done.
+    """Refuse a folder that exists already, before any work is done.
 
     Args:
         path: where to write.
@@ -58,15 +68,15 @@ def refuse_existing(path: Path, force: bool = False) -> None:
 
 
 class EurocWriter:
-    """Writes a recording to a new folder, which appears when the block ends well.
+    """Writes a recording to a new folder, which appears when the block ends without an error.
 
     Args:
         path: the new folder.
         rig: calibration of the sensors.
         truth: ground truth, where there is one.
-        comment: what to say of the sensors in their ``sensor.yaml``.
+        comment: for the ``sensor.yaml`` files.
         rate_hz: of the cameras.
-        force: replace an EuRoC folder that is there already; it is kept until the new one is whole.
+        force: replace an existing EuRoC folder, which is kept until the new one is complete.
         with_imu: whether there will be samples of an IMU.
 
     Raises:
@@ -154,7 +164,7 @@ class EurocWriter:
         return file
 
     def _appear(self) -> None:
-        """Give the folder its name; one that it replaces goes last."""
+        """Rename the folder to its path; one that it replaces is removed afterwards."""
         old = self._folder.with_name(f"{self._folder.name}.old")
         replaces = self._path.exists()
         if replaces:
@@ -164,10 +174,51 @@ class EurocWriter:
             shutil.rmtree(old, ignore_errors=True)
 
 
+def convert_to_euroc(
+    sequence: RecordedSequence,
+    path: str | Path,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Write a recording to a new EuRoC folder, completely or not at all.
+
+    Images become 8 bit grey PNG with the stamp of their frame. Unusable samples of the IMU are left
+    out, and so are missing and damaged images; the sequence counts them.
+
+    Args:
+        sequence: any recording of images; without an IMU there is no ``imu0`` in the folder.
+        path: the new folder.
+        force: replace an existing EuRoC folder.
+        progress: called with the time of every frame that was written.
+
+    Raises:
+        DataError: if the recording holds no images, or the folder exists already.
+    """
+    info = sequence.info()
+    if info.content == "tracks":
+        raise DataError(
+            f"{info.name}: format '{info.format}' holds feature tracks, no images; copy it as it "
+            "is, or write tracks with slam_graph.datasets.formats.track_recorder.TrackRecorder"
+        )
+    seconds = max((info.end_ns - info.start_ns) * 1e-9, 1e-9)
+    rate_hz = round((info.frames - 1) / seconds, 3)
+    comment = f"converted from {info.format}"
+    truth, has_imu = sequence.groundtruth(), sequence.has_imu
+    with EurocWriter(Path(path), sequence.rig, truth, comment, rate_hz, force, has_imu) as writer:
+        for block in sequence.imu_blocks():
+            writer.write_imu(block)
+        for frame in sequence.frames():
+            if not isinstance(frame, CameraFrame):
+                raise DataError(f"{info.name}: frame at {frame.stamp_ns} holds no images")
+            writer.write_frame(frame)
+            if progress is not None:
+                progress(frame.stamp_ns)
+
+
 SENSOR_TYPES = {"cam": "camera", "imu": "imu", TRUTH_FOLDER.rstrip("0"): "ground truth"}
 
 
-def _write_rows(file: TextIO, stamps_ns: NDArray[np.int64], values: FloatArray) -> None:
+def _write_rows(file: TextIO, stamps_ns: IntArray, values: FloatArray) -> None:
     """Rows with numbers in the shortest form that gives the same double again."""
     for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True):
         file.write(f"{stamp},{','.join(map(repr, row))}\n")
@@ -185,16 +236,15 @@ def _truth_rows(truth: Trajectory) -> FloatArray:
 
 def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
     """What EuRoC's ``sensor.yaml`` holds, and Kalibr's key for the time offset, if there is one."""
-    camera = mounted.camera
-    model, intrinsics, distortion, coefficients = camera_entry(camera)
+    camera, entry = mounted.camera, camera_entry(mounted.camera)
     values: dict[str, object] = {
         "T_BS": _matrix(mounted.body_T_camera),
         "rate_hz": float(rate_hz),
         "resolution": [camera.width, camera.height],
-        "camera_model": model,
-        "intrinsics": intrinsics,
-        "distortion_model": "radial-tangential" if distortion == "radtan" else distortion,
-        "distortion_coefficients": coefficients,
+        "camera_model": entry.camera_model,
+        "intrinsics": entry.intrinsics,
+        "distortion_model": entry.euroc_distortion,
+        "distortion_coefficients": entry.coefficients,
     }
     if mounted.time_offset_s:
         values["timeshift_cam_imu"] = float(mounted.time_offset_s)

@@ -5,13 +5,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.formats.loose_files import (
     LooseFiles,
@@ -20,10 +17,13 @@ from slam_graph.datasets.formats.loose_files import (
     regular_stamps,
     stamps_from_names,
 )
-from slam_graph.datasets.streams.image_sequence import FileImageSequence
+from slam_graph.datasets.sequence import ReaderOptions
+from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+
+__all__ = ["ImageFolderSequence", "is_image_folder"]
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
@@ -46,20 +46,17 @@ def _find_images(path: Path) -> Path | None:
     return None
 
 
-class ImageFolderSequence(FileImageSequence):
+class ImageFolderSequence(ImageSequence):
     """Images of one camera in a folder.
 
-    Their times are in a table (see `loose_files`), whose second column may name the files; without
-    names they belong to the images in the order of their names. Without a table the names of the
-    images must be their times, or a rate must be told.
+    Their times are in a table (see `loose_files`), whose second column may name the files. Without
+    names the times belong to the images in the order of the numbers in their names. Without a table
+    the names of the images must be their times, or a rate must be given.
 
     Args:
         path: the folder; the images are in it, or in its ``images`` or ``data``.
-        cameras: 1 or None.
-        calibration: a Kalibr camera chain; without it ``calibration.yaml`` in the folder.
-        groundtruth: file or folder with the ground truth.
-        diagnostics: where faults are counted.
-        sources: ``stamps`` and ``imu`` files to use instead of those in the folder, or ``rate``.
+        options: what else is asked for. Without `calibration` it is ``calibration.yaml`` in the
+            folder; `sources` may name files ``stamps`` and ``imu``, or give a ``rate`` in Hz.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
@@ -67,17 +64,9 @@ class ImageFolderSequence(FileImageSequence):
 
     format: ClassVar[str] = "images"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-        sources: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path.resolve()
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
         folder = _find_images(path)
         if folder is None:
             raise DataError(f"{path}: no images ({', '.join(sorted(SUFFIXES))}) in this folder")
@@ -86,10 +75,9 @@ class ImageFolderSequence(FileImageSequence):
             "imu": [path / "imu.csv"],
             "calibration": [path / "calibration.yaml"],
         }
-        files = find_files(path, sources or {}, beside, calibration)
-        images = _list_images(folder, files, diagnostics)
-        rig = files.rig if cameras is None else files.rig.select(cameras)
-        super().__init__(self.path.name, rig, [images], files.imu, groundtruth, diagnostics)
+        files = find_files(path, beside, options)
+        images = _list_images(folder, files, options.diagnostics)
+        super().__init__(self.path.name, files.rig, [images], files.imu, options)
 
 
 def _list_images(folder: Path, files: LooseFiles, diagnostics: Diagnostics) -> FileImages:
@@ -100,10 +88,8 @@ def _list_images(folder: Path, files: LooseFiles, diagnostics: Diagnostics) -> F
     return ordered_images(folder.name, stamps, paths, index, diagnostics)
 
 
-def _times(
-    folder: Path, there: list[Path], files: LooseFiles
-) -> tuple[NDArray[np.int64], list[Path], Path]:
-    """Times (N,), the image of each, and the file that says so."""
+def _times(folder: Path, there: list[Path], files: LooseFiles) -> tuple[IntArray, list[Path], Path]:
+    """Times (N,), the image of each, and where the times are from."""
     if files.rate_hz is not None:
         return regular_stamps(len(there), files.rate_hz), there, folder
     if files.stamps is None:
@@ -131,5 +117,5 @@ def _named(folder: Path, table: Path, name: str) -> Path:
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Sorts names with numbers in them by the numbers: 9 before 10."""
+    """Sort key of names with numbers in them: 9 comes before 10."""
     return [(int(part or 0), text) for text, part in re.findall(r"(\D*)(\d*)", path.name)]

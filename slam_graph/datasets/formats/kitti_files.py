@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The text files of KITTI: calibrations of lines ``key: numbers``, and time stamps as dates."""
+"""The text files of KITTI: calibrations of lines ``key: numbers``, and time stamps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class CalibrationFile:
         """(count,) numbers of a line.
 
         Raises:
-            DataError: if the line is missing or has not so many numbers.
+            DataError: if the line is missing or has another number of numbers.
         """
         if key not in self.values:
             raise DataError(f"{self.path}: missing line '{key}:'")
@@ -42,7 +42,7 @@ class CalibrationFile:
         return np.array(self.values[key])
 
     def pose(self) -> gtsam.Pose3:
-        """The transformation of a file with the lines ``R`` and ``T``: p_to = R p_from + T."""
+        """The transformation in the lines ``R`` and ``T``: p_to = R p_from + T."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.numbers("R", 9).reshape(3, 3)
         matrix[:3, 3] = self.numbers("T", 3)
@@ -88,10 +88,10 @@ def rectified_camera(projection: FloatArray, width: int, height: int) -> tuple[C
 def read_dates(path: Path) -> NDArray[np.int64]:
     """Time stamps (N,) in ns from lines like ``2011-09-26 13:02:25.964389445``.
 
-    The files do not say their time zone; the times are taken as UTC.
+    The files have no time zone; the times are taken as UTC.
 
     Raises:
-        DataError: naming file and line of what is not a date.
+        DataError: if one is not a date and time; names file and line.
     """
     stamps: list[int] = []
     for rows in read_rows(path):
@@ -113,7 +113,7 @@ def read_seconds(path: Path) -> NDArray[np.int64]:
     """Time stamps (N,) in ns from lines of seconds.
 
     Raises:
-        DataError: naming file and line of what is not a number.
+        DataError: if one is not a number; names file and line.
     """
     blocks = []
     for rows in read_rows(path):
@@ -127,7 +127,7 @@ def read_seconds(path: Path) -> NDArray[np.int64]:
 def increasing(
     stamps_ns: NDArray[np.int64], kind: str, path: Path, diagnostics: Diagnostics
 ) -> NDArray[np.intp]:
-    """Indices of the stamps (N,), one a line, that increase; the others are counted."""
+    """Indices of the stamps (N,), one per line, that increase; the others are counted."""
     return in_order(
         stamps_ns,
         lambda k, _: diagnostics.warn(

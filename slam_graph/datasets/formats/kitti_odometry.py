@@ -10,31 +10,30 @@ camera 0 in its first frame, for sequences 00 to 10.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.formats.kitti_files import (
     increasing,
     read_calibration,
     read_seconds,
     rectified_camera,
 )
-from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import parse, read_rows
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
+
+__all__ = ["KittiOdometrySequence", "is_kitti_odometry"]
 
 WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Turns x right, y down, z forward into the x forward, y left, z up of a world frame."""
@@ -51,61 +50,38 @@ class KittiOdometrySequence(ImageSequence):
 
     Args:
         path: ``sequences/NN``.
-        cameras: 1 or 2.
-        calibration: a Kalibr camera chain to use instead of ``calib.txt``.
-        groundtruth: file or folder to use instead of ``poses/NN.txt``.
-        diagnostics: where faults are counted.
+        options: what else is asked for.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
     """
 
     format: ClassVar[str] = "kitti_odometry"
-    has_imu = False
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path.resolve()
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
         self._times_ns = read_seconds(path / "times.txt")
         folders = [folder for k in range(2) if (folder := path / f"image_{k}").is_dir()]
         kept = increasing(
-            self._times_ns, "camera_out_of_order", path / "times.txt", diagnostics
+            self._times_ns, "camera_out_of_order", path / "times.txt", options.diagnostics
         ).tolist()
         streams = [
             FileImages(f.name, self._times_ns[kept], [f / f"{k:06d}.png" for k in kept])
             for f in folders
         ]
-        if calibration is not None:
-            rig = read_kalibr(calibration, needs_imu=False)
-        else:
-            rig = _read_rig(path, streams)
-        rig = rig if cameras is None else rig.select(cameras)
+        chain = options.calibration
+        rig = _read_rig(path, streams) if chain is None else read_kalibr(chain, needs_imu=False)
+        rig = options.select(rig)
         if len(rig.cameras) > len(streams):
-            raise DataError(f"{calibration}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
-        used = streams[: len(rig.cameras)]
-        super().__init__(f"kitti_{self.path.name}", rig, used, groundtruth, diagnostics)
+            raise DataError(f"{chain}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
         self._poses = self.path.parent.parent / "poses" / f"{self.path.name}.txt"
-        if groundtruth is None and self._poses.is_file():
-            self.own_groundtruth = self._read_poses
-
-    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """Nothing: there is no IMU."""
-        return iter(())
-
-    def measure(self) -> Extent:
-        """Count frames."""
-        stamps = self._groups.stamps_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), 0)
+        truth = self._read_poses if self._poses.is_file() else None
+        used = streams[: len(rig.cameras)]
+        super().__init__(f"kitti_{self.path.name}", rig, used, None, options, truth)
 
     def _read_poses(self) -> Trajectory:
-        matrices = read_poses(self._poses)
+        matrices = _read_poses(self._poses)
         if len(matrices) != len(self._times_ns):
             raise DataError(
                 f"{self._poses}: {len(matrices)} poses, {self.path} has {len(self._times_ns)} times"
@@ -119,11 +95,11 @@ class KittiOdometrySequence(ImageSequence):
         )
 
 
-def read_poses(path: Path) -> NDArray[np.float64]:
+def _read_poses(path: Path) -> FloatArray:
     """Poses (N, 3, 4) of a file with twelve numbers a row.
 
     Raises:
-        DataError: naming file and line of a row that cannot be read.
+        DataError: if a row cannot be read; names file and line.
     """
     blocks = [
         parse(rows, [("pose", "f8", (12,))], "12 numbers of a 3x4 pose", None, None)["pose"]

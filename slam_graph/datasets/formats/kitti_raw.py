@@ -7,17 +7,17 @@ Geiger et al., "Vision meets robotics: The KITTI dataset", IJRR 2013. A drive co
 images are as they were taken and the unit has its 100 Hz. The calibration is in the folder of the
 day, beside the drives.
 
-The inertial and satellite navigation unit of KITTI's raw data: its IMU, and its poses.
-
-Each sample is a file of 30 numbers. Of them are read (from 0): latitude, longitude [deg] and
-altitude [m] (0 to 2); roll, pitch, yaw [rad] (3 to 5; yaw is 0 towards east, counterclockwise);
-velocity to north and east, and upwards [m/s] (6, 7, 10); specific force x y z [m/s²] (11 to 13) and
-angular rate x y z [rad/s] (17 to 19) along the axes of the unit: x forward, y left, z up.
+Each sample of the navigation unit is a file of 30 numbers, of which these are read (counted from
+0): latitude, longitude [deg] and altitude [m] (0 to 2); roll, pitch, yaw [rad] (3 to 5; yaw is 0
+towards east, counterclockwise); velocity to north and east, and upwards [m/s] (6, 7, 10); specific
+force x y z [m/s²] (11 to 13) and angular rate x y z [rad/s] (17 to 19) along the axes of the unit:
+x forward, y left, z up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -33,16 +33,18 @@ from slam_graph.datasets.formats.kitti_files import (
     rectified_camera,
 )
 from slam_graph.datasets.formats.tum_rgbd import rectifier
-from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages, Image
-from slam_graph.datasets.streams.imu_stream import ImuCleaner
+from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+
+__all__ = ["KittiRawSequence", "is_kitti_raw"]
 
 EARTH_RADIUS_M = 6_378_137.0
 
@@ -53,7 +55,7 @@ EAST_NORTH_UP = [7, 6, 10]
 FILES_PER_BLOCK = 256
 
 
-class Oxts:
+class _Oxts:
     """A folder ``oxts`` with ``timestamps.txt`` and a file for each sample in ``data``.
 
     Attributes:
@@ -78,23 +80,34 @@ class Oxts:
         """The file of a sample."""
         return str(self._file(index))
 
-    def imu_blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
         """The cleaned IMU stream; a sample without a file is not finite."""
-        cleaner = ImuCleaner(diagnostics, after_ns)
+        return clean_blocks(self._samples_in_blocks(after_ns), diagnostics, after_ns)
+
+    def count(self) -> int:
+        """Number of samples, before faulty ones are dropped."""
+        return len(self.stamps_ns)
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        return int(self.stamps_ns[0]), int(self.stamps_ns[-1])
+
+    def _samples_in_blocks(
+        self, after_ns: int | None
+    ) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         for begin in range(0, len(self.stamps_ns), FILES_PER_BLOCK):
             stamps = self.stamps_ns[begin : begin + FILES_PER_BLOCK]
             if after_ns is not None and np.all(stamps < after_ns):
                 continue
+            files = [self._file(begin + k) for k in range(len(stamps))]
             values = np.array([self._read(begin + k) for k in range(len(stamps))])
             data = ImuData(stamps, values[:, GYRO].copy(), values[:, ACCEL].copy())
-            cleaned = cleaner.clean(data, lambda k, begin=begin: self.where(begin + k))  # type: ignore[misc]
-            if len(cleaned):
-                yield cleaned
+            yield partial(_file_name, files), data
 
     def trajectory(self, diagnostics: Diagnostics) -> Trajectory:
-        """Poses of the unit in a world east, north, up with its origin at the first pose.
+        """Poses of the unit in a frame east, north, up with its origin at the first pose.
 
-        Positions are Mercator's, scaled to be true at the first latitude, as KITTI's own tools do.
+        Positions are Mercator coordinates scaled for the first latitude, as in KITTI's own tools.
         """
         stamps_ns = self.stamps_ns
         values = np.array([self._read(k) for k in range(len(stamps_ns))])
@@ -108,7 +121,7 @@ class Oxts:
         if len(kept) == 0:
             raise DataError(f"{self.folder}: no pose in these files")
         values = values[kept]
-        positions = mercator(values[:, POSITION])
+        positions = _mercator(values[:, POSITION])
         rotations = Rotation.from_euler("ZYX", values[:, ANGLES][:, ::-1])
         return Trajectory(
             stamps_ns[kept],
@@ -134,7 +147,11 @@ class Oxts:
         return np.array(values)
 
 
-def mercator(places: FloatArray) -> FloatArray:
+def _file_name(files: Sequence[Path], index: int) -> str:
+    return str(files[index])
+
+
+def _mercator(places: FloatArray) -> FloatArray:
     """Positions (N, 3) east, north, up [m] of latitude, longitude [deg] and altitude [m] (N, 3)."""
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
     scale = EARTH_RADIUS_M * np.cos(latitude[0])
@@ -156,7 +173,8 @@ NOISE = {
     "accel_noise_density": 1e-2,
     "accel_random_walk": 1e-4,
 }
-"""Assumed, KITTI tells none: well above the unit's (OXTS RT3003), for the vibration of a car."""
+"""Assumed, because KITTI gives none: well above the data sheet of the unit (OXTS RT3003), for the
+vibration of a car."""
 
 
 def is_kitti_raw(path: Path) -> bool:
@@ -173,10 +191,7 @@ class KittiRawSequence(ImageSequence):
 
     Args:
         path: folder of the drive, with ``image_00``, ``image_01`` and ``oxts``.
-        cameras: 1 or 2.
-        calibration: a Kalibr camera chain of the rectified images, instead of that of the day.
-        groundtruth: file or folder to use instead of the poses of the navigation unit.
-        diagnostics: where faults are counted.
+        options: what else is asked for; a calibration is that of the rectified images.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
@@ -184,56 +199,49 @@ class KittiRawSequence(ImageSequence):
 
     format: ClassVar[str] = "kitti_raw"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path.resolve()
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
         self._oxts = _find_oxts(self.path)
         streams = [
-            _images(self.path, camera, diagnostics)
+            _images(self.path, camera, options.diagnostics)
             for camera in GREY
             if (self.path / f"image_{camera}").is_dir()
         ]
         day = self.path.parent
         noise = ImuNoise(**NOISE, rate_hz=self._oxts.rate_hz)
-        if calibration is not None:
-            rig = read_kalibr(calibration, fallback=noise)
+        chain = options.calibration
+        if chain is not None:
+            rig = read_kalibr(chain, fallback=noise)
         else:
             rig = _read_rig(day, len(streams), noise)
-        rig = rig if cameras is None else rig.select(cameras)
+        rig = options.select(rig)
         if len(rig.cameras) > len(streams):
-            raise DataError(f"{calibration}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
+            raise DataError(f"{chain}: {len(rig.cameras)} cameras, {path} has {len(streams)}")
         for camera, stream in zip(GREY, streams, strict=False):
             stream.process = _rectification(day, camera, stream)
         used = streams[: len(rig.cameras)]
-        super().__init__(self.path.name, rig, used, groundtruth, diagnostics, STEREO_TOLERANCE_S)
-        if groundtruth is None:
-            self.own_groundtruth = lambda: self._oxts.trajectory(self.diagnostics)
+        super().__init__(
+            self.path.name,
+            rig,
+            used,
+            self._oxts,
+            options,
+            lambda: self._oxts.trajectory(self.diagnostics),
+            STEREO_TOLERANCE_S,
+        )
         if self._oxts.rate_hz < SLOW_IMU_HZ:
             what = f"{self._oxts.folder}: the IMU has {self._oxts.rate_hz:.0f} Hz only"
             better = self.path.name.replace("_sync", "_extract")
-            diagnostics.warn("imu_slow", f"{what}; {better} has 100 Hz, lay it beside")
-
-    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """The cleaned IMU stream from `after_ns` on."""
-        return self._oxts.imu_blocks(self.diagnostics, after_ns)
-
-    def measure(self) -> Extent:
-        """Count frames and IMU samples."""
-        stamps = self._groups.stamps_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), len(self._oxts.stamps_ns))
+            options.diagnostics.warn(
+                "imu_slow", f"{what}; {better} has 100 Hz, put it beside this drive"
+            )
 
 
-def _find_oxts(drive: Path) -> Oxts:
-    """The navigation unit at its full rate, if the unsynchronised form of a drive is beside it."""
+def _find_oxts(drive: Path) -> _Oxts:
+    """The navigation unit at its full rate, if the ``…_extract`` form of a drive is beside it."""
     extract = drive.with_name(drive.name.replace("_sync", "_extract")) / "oxts"
-    return Oxts(extract if (extract / "timestamps.txt").is_file() else drive / "oxts")
+    return _Oxts(extract if (extract / "timestamps.txt").is_file() else drive / "oxts")
 
 
 def _images(drive: Path, camera: str, diagnostics: Diagnostics) -> FileImages:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in no format: which files hold time stamps, IMU and calibration of some images.
+"""Images without a format: the files with their time stamps, IMU and calibration.
 
 Times in these files are nanoseconds if they are whole numbers, seconds if any has a decimal point.
 """
@@ -13,8 +13,9 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
@@ -23,13 +24,22 @@ from slam_graph.datasets.streams.csv_rows import (
     stamp_from_seconds,
 )
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
-from slam_graph.errors import DataError
+from slam_graph.errors import DataError, closest
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig
 
+__all__ = [
+    "LooseFiles",
+    "find_files",
+    "is_usable_rate",
+    "read_stamps",
+    "regular_stamps",
+    "stamps_from_names",
+]
+
 SHORTEST_PERIOD_NS = 100_000
-"""Frames that follow one another faster than this have stamps of another unit."""
+"""Frames closer in time than this have stamps in another unit."""
 
 SLOWEST_HZ, FASTEST_HZ = 0.01, 1000.0
 
@@ -38,11 +48,11 @@ SOURCES = ("stamps", "rate", "imu")
 
 @dataclass(frozen=True, slots=True)
 class LooseFiles:
-    """What goes with some images.
+    """The files that belong to some images.
 
     Attributes:
         stamps: table with a time for each image, or None.
-        rate_hz: of the images, if that was told instead.
+        rate_hz: of the images, if that was given instead.
         imu: CSV with time, rate x y z [rad/s], specific force x y z [m/s²], or None.
         rig: one camera; without an IMU its frame is the body frame.
     """
@@ -54,25 +64,22 @@ class LooseFiles:
 
 
 def find_files(
-    path: Path,
-    named: Mapping[str, str],
-    beside: Mapping[str, Sequence[Path]],
-    calibration: Path | None,
+    path: Path, beside: Mapping[str, Sequence[Path]], options: ReaderOptions
 ) -> LooseFiles:
-    """Find what goes with some images: as said, or where it usually is.
+    """Find the files that belong to some images: as named, or where they usually are.
 
     Args:
         path: of the images.
-        named: files by ``stamps`` and ``imu``, and ``rate`` in Hz.
-        beside: where to look for ``stamps``, ``imu`` and ``calibration`` otherwise.
-        calibration: a Kalibr camera chain, if one was given.
+        beside: where to look for ``stamps``, ``imu`` and ``calibration`` that are not named.
+        options: `sources` names ``stamps`` and ``imu``, or gives ``rate`` in Hz.
 
     Raises:
-        DataError: if there is no calibration, or what was named makes no sense.
+        DataError: if there is no calibration, a source is unknown, or its file is not there.
     """
+    named, calibration = options.sources, options.calibration
     unknown = [key for key in named if key not in SOURCES]
     if unknown:
-        raise DataError(f"unknown source '{unknown[0]}'; known: {', '.join(SOURCES)}")
+        raise DataError(f"unknown source '{unknown[0]}'; {closest(unknown[0], SOURCES)}")
     found = {key: next(filter(Path.is_file, files), None) for key, files in beside.items()}
     files = {key: Path(named[key]) if key in named else found[key] for key in ("stamps", "imu")}
     for file in files.values():
@@ -89,28 +96,28 @@ def find_files(
     return LooseFiles(
         stamps=None if rate_hz is not None else files["stamps"],
         rate_hz=rate_hz,
-        imu=None if imu is None else ImuFile(imu, parse_timed_imu),
-        rig=read_kalibr(chain, needs_imu=imu is not None).select(1),
+        imu=None if imu is None else ImuFile(imu, _parse_timed_imu),
+        rig=options.select(read_kalibr(chain, needs_imu=imu is not None).select(1)),
     )
 
 
 def is_usable_rate(rate_hz: float) -> bool:
-    """Whether images can come so often."""
+    """Whether a camera can have this rate."""
     return SLOWEST_HZ <= rate_hz <= FASTEST_HZ
 
 
-def regular_stamps(count: int, rate_hz: float) -> NDArray[np.int64]:
-    """Stamps (N,) in ns of images that come at a rate, the first one at 0."""
-    stamps: NDArray[np.int64] = np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+def regular_stamps(count: int, rate_hz: float) -> IntArray:
+    """Stamps (N,) in ns of images at a constant rate, the first one at 0."""
+    stamps: IntArray = np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     return stamps
 
 
-def read_stamps(path: Path) -> tuple[NDArray[np.int64], list[str]]:
+def read_stamps(path: Path) -> tuple[IntArray, list[str]]:
     """Times of a table, one a row, in its first column.
 
     Returns:
         stamps_ns: (N,) in the order of the file.
-        names: what stands in the second column of each row; empty where there is none.
+        names: the second column of each row; empty where there is none.
 
     Raises:
         DataError: if there are none, one cannot be read, or they are of another unit.
@@ -128,12 +135,12 @@ def read_stamps(path: Path) -> tuple[NDArray[np.int64], list[str]]:
         ],
         np.int64,
     )
-    require_unit(stamps, path)
+    _require_unit(stamps, path)
     return stamps, [row[1] if len(row) > 1 else "" for block in cells for row in block]
 
 
-def require_unit(stamps_ns: NDArray[np.int64], path: Path) -> None:
-    """Refuse stamps that follow one another too fast to be in nanoseconds."""
+def _require_unit(stamps_ns: IntArray, path: Path) -> None:
+    """Refuse stamps that are too close to be in nanoseconds."""
     if len(stamps_ns) < 2:
         return
     period = float(np.median(np.abs(np.diff(stamps_ns))))
@@ -144,8 +151,8 @@ def require_unit(stamps_ns: NDArray[np.int64], path: Path) -> None:
         )
 
 
-def stamps_from_names(paths: Sequence[Path]) -> NDArray[np.int64] | None:
-    """Stamps (N,) that files have as their names; None if one of them has not."""
+def stamps_from_names(paths: Sequence[Path]) -> IntArray | None:
+    """Stamps (N,) of files whose names are their times; None if one is not."""
     stamps = []
     for path in paths:
         try:
@@ -159,7 +166,7 @@ def stamps_from_names(paths: Sequence[Path]) -> NDArray[np.int64] | None:
     return together
 
 
-def parse_timed_imu(rows: Rows) -> ImuData:
+def _parse_timed_imu(rows: Rows) -> ImuData:
     """Samples of rows: time, gyro xyz in rad/s, accel xyz in m/s²."""
     what = "time, gyro xyz, accel xyz"
     if not any(_in_seconds(_cells(line)[0]) for line in rows.lines):

@@ -1,25 +1,30 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated measurements dumped from OpenVINS: tracks, IMU, exact calibration and start state.
+"""Simulated measurements written by OpenVINS: tracks, IMU, exact calibration and start state.
 
 The folder holds ``calib.yaml``, ``imu.csv`` and ``tracks.csv`` (raw, distorted pixels), and may
 hold ``groundtruth.csv`` and ``init_state.csv``. Times are seconds with nine decimals, read as text
 so that no nanosecond is lost. Quaternions are x y z w of `world_R_body`.
-
-The small files of a simulation dumped from OpenVINS: calibration, true states, start state.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
@@ -37,7 +42,6 @@ from slam_graph.datasets.streams.track_frames import (
     TrackTable,
     frames_from_tables,
 )
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.calibration_yaml import read_yaml
@@ -46,17 +50,19 @@ from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
+__all__ = ["OpenvinsSimulation"]
+
 STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
 STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"
 
 DEFAULT_SIGMAS = {"q": 0.017, "p": 0.05, "v": 0.01, "bg": 0.02, "ba": 0.02}
-"""Prior of the start state where the file does not state one: rad, m, m/s, rad/s, m/s²."""
+"""Standard deviations of the start state where the file gives none: rad, m, m/s, rad/s, m/s²."""
 
 COVARIANCE_ORDER = ("q", "p", "v", "ba", "bg")
 """Blocks of `NavState.covariance`."""
 
 
-def read_rig(path: Path) -> Rig:
+def _read_rig(path: Path) -> Rig:
     """The exact calibration of the simulation (``calib.yaml``).
 
     Its time offset is OpenVINS': t_imu = t_camera + offset, which is ours.
@@ -82,7 +88,7 @@ def read_rig(path: Path) -> Rig:
     return Rig(tuple(cameras), noise)
 
 
-def read_states(path: Path) -> Trajectory:
+def _read_states(path: Path) -> Trajectory:
     """States over time: rows of time, position, quaternion x y z w, velocity and biases.
 
     Raises:
@@ -98,14 +104,14 @@ def read_states(path: Path) -> Trajectory:
         values[:, :3].copy(),
         values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True),
         values[:, 7:10].copy(),
-        values[:, 10:13].copy(),
-        values[:, 13:].copy(),
+        accel_biases=values[:, 13:].copy(),
+        gyro_biases=values[:, 10:13].copy(),
     )
 
 
-def read_start(path: Path) -> NavState:
+def _read_start(path: Path) -> NavState:
     """The start state, and how well it is known, from ``init_state.csv``."""
-    states = read_states(path)
+    states = _read_states(path)
     assert states.velocities is not None
     assert states.gyro_biases is not None
     assert states.accel_biases is not None
@@ -136,7 +142,7 @@ def _prior_covariance(text: str) -> NDArray[np.float64]:
 
 
 ROWS_PER_TRACK_BLOCK = 8192
-"""Some 16 frames of two cameras: large enough for fast parsing, half a megabyte of text."""
+"""About 16 frames of two cameras: large enough to parse fast, half a megabyte of text."""
 
 IMU_ROW = [("stamp", STAMP_TEXT), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
 TRACK_COLUMNS = [("stamp", STAMP_TEXT), ("camera", "i8"), ("id", "i8"), ("pixel", "f8", (2,))]
@@ -147,10 +153,7 @@ class OpenvinsSimulation(RecordedSequence):
 
     Args:
         path: the folder.
-        cameras: use only the first so many.
-        calibration: a Kalibr camera chain to use instead of ``calib.yaml``.
-        groundtruth: file or folder to use instead of ``groundtruth.csv``.
-        diagnostics: where faults are counted.
+        options: what else is asked for.
 
     Raises:
         DataError: if a file is missing, or a row cannot be read.
@@ -159,29 +162,18 @@ class OpenvinsSimulation(RecordedSequence):
     format: ClassVar[str] = "openvins_sim"
     content: ClassVar[Literal["images", "tracks"]] = "tracks"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path
-        rig = read_rig(path / "calib.yaml") if calibration is None else read_kalibr(calibration)
+        chain = options.calibration
+        rig = _read_rig(path / "calib.yaml") if chain is None else read_kalibr(chain)
         self._known_cameras = len(rig.cameras)
-        rig = rig if cameras is None else rig.select(cameras)
-        super().__init__(path.resolve().name, rig, groundtruth, diagnostics)
-        own = path / "groundtruth.csv"
-        self._own_groundtruth = own if groundtruth is None and own.is_file() else None
+        truth = path / "groundtruth.csv"
+        own = partial(_read_states, truth) if truth.is_file() else None
+        super().__init__(path.resolve().name, options.select(rig), options, own)
         self._tracks, self._imu_file = path / "tracks.csv", path / "imu.csv"
         for file in (self._tracks, self._imu_file):
             require_rows(file)
-
-    @property
-    def has_groundtruth(self) -> bool:
-        """Whether `groundtruth()` gives one."""
-        return self._own_groundtruth is not None or super().has_groundtruth
 
     def measure(self) -> Extent:
         """Count frames and IMU samples in one pass over the files."""
@@ -197,7 +189,7 @@ class OpenvinsSimulation(RecordedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
-        blocks = ((rows, _parse_imu(rows)) for rows in read_rows(self._imu_file))
+        blocks = ((rows.where, _parse_imu(rows)) for rows in read_rows(self._imu_file))
         return clean_blocks(blocks, self.diagnostics, after_ns)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
@@ -207,16 +199,10 @@ class OpenvinsSimulation(RecordedSequence):
             tables, len(self.rig.cameras), self.diagnostics, str(self._tracks)
         )
 
-    def groundtruth(self) -> Trajectory | None:
-        """The simulated truth: poses, velocities and biases."""
-        if self._own_groundtruth is None:
-            return super().groundtruth()
-        return read_states(self._own_groundtruth)
-
     def initial_state(self) -> NavState | None:
-        """The start state of ``init_state.csv``, with the prior that its comment states."""
+        """The start state of ``init_state.csv``, with the covariance that its comment gives."""
         file = self.path / "init_state.csv"
-        return read_start(file) if file.is_file() else None
+        return _read_start(file) if file.is_file() else None
 
     def _tables(self, start_ns: int | None, end_ns: int | None) -> Iterator[TrackTable]:
         for rows in read_rows(self._tracks, ROWS_PER_TRACK_BLOCK):

@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder format of a recorded front end: what is in which file.
+"""The folder format of recorded feature tracks: its files and their records.
 
-A recording is a folder with these files; all numbers are little-endian, and no file is a pickle:
+All numbers are little-endian, and no file is a pickle:
 
 - ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, `name`, and the number of `cameras`,
-  `frames`, `imu_samples` and `features`, by which a cut file is found out;
+  `frames`, `imu_samples` and `features`, by which a truncated file is recognised;
 - ``calibration.yaml``: the rig, as `slam_graph.sensors.kalibr_calibration` writes it;
 - ``frames.bin``: for each frame `stamp` (int64, ns) and `counts` (int64 for each camera), the
-  number of features that each camera saw;
+  number of features of each camera;
 - ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
-  ordered by frame, then camera, then as the front end gave them;
+  ordered by frame, then camera, then as in the `FeatureFrame`;
 - ``descriptors.bin``, where features have any: for each feature of the first camera, in the same
-  order, as many bytes as `descriptor_bytes` in ``meta.yaml`` says (0 or nothing if there are none);
+  order, `descriptor_bytes` of ``meta.yaml`` bytes (0 or missing if there are none);
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
 - ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
   `NavState` under their names (`world_T_body` as a 4x4 matrix).
 
-Every float64 is stored as it is, so a recording gives back bit for bit what was recorded.
+A recording is replayed bit for bit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def frame_record(cameras: int) -> np.dtype[np.void]:
 
 
 def save_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; what it does not have is left out."""
+    """Write a trajectory; arrays that it does not have are left out."""
     _save(path, {name: getattr(trajectory, name) for name in Trajectory.__dataclass_fields__})
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Record what a front end found, for `recording` to replay; `recording_format` has the files."""
+"""Records feature tracks for replay; `track_format` describes the files."""
 
 from __future__ import annotations
 
@@ -22,19 +22,21 @@ from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["TrackRecorder"]
+
 
 class TrackRecorder:
     """Writes the packets of a front end to a folder; a context manager.
 
-    Everything is written beside the folder and moved there at the end, so a recording is whole or
-    not there: an exception inside the ``with`` block leaves nothing behind.
+    Everything is written beside the folder and moved there at the end: an exception inside the
+    ``with`` block leaves nothing behind.
 
     Args:
-        path: folder to make; it must not exist.
-        rig: the cameras that frames will have observations of, and the IMU.
-        name: of the recording, default that of the folder.
-        groundtruth: true trajectory to keep with it.
-        initial_state: known start to keep with it.
+        path: of the new folder; it must not exist.
+        rig: calibration of the cameras and the IMU.
+        name: of the recording; that of the folder if None.
+        groundtruth: true trajectory to store with it.
+        initial_state: known state at the start to store with it.
 
     Raises:
         DataError: if the folder exists already.
@@ -42,12 +44,13 @@ class TrackRecorder:
 
     def __init__(
         self,
-        path: Path,
+        path: str | Path,
         rig: Rig,
         name: str | None = None,
         groundtruth: Trajectory | None = None,
         initial_state: NavState | None = None,
     ) -> None:
+        path = Path(path)
         if path.exists():
             raise DataError(f"{path}: exists already; remove it or record to another folder")
         self.path = path
@@ -117,7 +120,7 @@ class TrackRecorder:
         self._counts["features"] += sum(len(seen) for seen in frame.cameras)
 
     def _write_descriptors(self, seen: FeatureObservations) -> None:
-        """Append the descriptors of the first camera; the first features say how long they are."""
+        """Append the descriptors of the first camera; all have the length of the first ones."""
         if len(seen) == 0:
             return
         descriptors = seen.descriptors

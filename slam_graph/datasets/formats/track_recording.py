@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay what a front end found: the same features for every algorithm.
+"""Recorded feature tracks: replayed, so that every algorithm gets the same features.
 
-`TrackRecorder` writes recordings; the files are described in `recording_format`.
+`TrackRecorder` writes recordings; `track_format` describes the files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -18,17 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.formats import track_format as layout
-from slam_graph.datasets.formats.track_recorder import TrackRecorder
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence, within
-from slam_graph.datasets.streams.imu_stream import ImuCleaner
-from slam_graph.diagnostics import Diagnostics
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+    within,
+)
+from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.calibration_yaml import read_yaml
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
-__all__ = ["TrackRecorder", "TrackRecordingSequence", "is_recording"]
+__all__ = ["TrackRecordingSequence", "is_recording"]
 
 SAMPLES_PER_BLOCK = 4096
 """IMU samples that are read at a time."""
@@ -39,7 +43,7 @@ def _where(name: str, first: int, index: int) -> str:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder is a recording of ours."""
+    """Whether a folder is one that `TrackRecorder` wrote."""
     meta = path / layout.META
     return meta.is_file() and layout.FORMAT_NAME in meta.read_text(errors="replace")[:200]
 
@@ -49,11 +53,8 @@ class TrackRecordingSequence(RecordedSequence):
 
     Args:
         path: the folder.
-        cameras: use only the first so many.
-        calibration: a Kalibr camera chain to use instead of the recorded one; the normalised
-            coordinates are then computed anew from the pixels.
-        groundtruth: file or folder to use instead of the recorded ground truth.
-        diagnostics: where faults are counted.
+        options: what else is asked for. With another calibration the normalised coordinates are
+            computed anew from the pixels.
 
     Raises:
         DataError: if a file is missing or cut, or the recording is of another version.
@@ -62,14 +63,8 @@ class TrackRecordingSequence(RecordedSequence):
     format: ClassVar[str] = "recording"
     content: ClassVar[Literal["images", "tracks"]] = "tracks"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path
         meta = read_yaml(path / layout.META)
         version = meta.require("version")
@@ -79,12 +74,12 @@ class TrackRecordingSequence(RecordedSequence):
                 f"version {layout.FORMAT_VERSION}; record it again"
             )
         recorded = read_kalibr(path / layout.CALIBRATION)
-        rig = recorded if calibration is None else read_kalibr(calibration)
-        self._recalibrated = calibration is not None
-        rig = rig if cameras is None else rig.select(cameras)
-        super().__init__(meta.require("name").text(), rig, groundtruth, diagnostics)
-        own = path / layout.GROUNDTRUTH
-        self._own_groundtruth = own if groundtruth is None and own.is_file() else None
+        chain = options.calibration
+        self._recalibrated = chain is not None
+        rig = options.select(recorded if chain is None else read_kalibr(chain))
+        truth = path / layout.GROUNDTRUTH
+        own = partial(layout.load_trajectory, truth) if truth.is_file() else None
+        super().__init__(meta.require("name").text(), rig, options, own)
         counts = {
             name: int(meta.require(name).number()) for name in ("frames", "imu_samples", "features")
         }
@@ -99,11 +94,6 @@ class TrackRecordingSequence(RecordedSequence):
         self._index = np.fromfile(path / layout.FRAMES, self._record)
         self._check_descriptors()
 
-    @property
-    def has_groundtruth(self) -> bool:
-        """Whether `groundtruth()` gives one."""
-        return self._own_groundtruth is not None or super().has_groundtruth
-
     def measure(self) -> Extent:
         """How much was recorded."""
         stamps = self._index["stamp"]
@@ -112,14 +102,14 @@ class TrackRecordingSequence(RecordedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU stream from `after_ns` on."""
-        cleaner = ImuCleaner(self.diagnostics, after_ns)
+        return clean_blocks(self._samples_in_blocks(), self.diagnostics, after_ns)
+
+    def _samples_in_blocks(self) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         with (self.path / layout.IMU).open("rb") as file:
             first = 0
             while len(rows := np.fromfile(file, layout.IMU_RECORD, SAMPLES_PER_BLOCK)):
                 data = ImuData(*(np.ascontiguousarray(rows[n]) for n in ("stamp", "gyro", "accel")))
-                cleaned = cleaner.clean(data, partial(_where, file.name, first))
-                if len(cleaned):
-                    yield cleaned
+                yield partial(_where, file.name, first), data
                 first += len(rows)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
@@ -131,7 +121,7 @@ class TrackRecordingSequence(RecordedSequence):
         with ExitStack() as files:
             file = files.enter_context((self.path / layout.FEATURES).open("rb"))
             file.seek(int(before.sum()) * size)
-            looks = self._open_descriptors(files, int(before[:, 0].sum()))
+            descriptors_file = self._open_descriptors(files, int(before[:, 0].sum()))
             for row in self._index[wanted[0] : wanted[-1] + 1]:
                 counts = row["counts"].tolist()
                 features = np.frombuffer(file.read(sum(counts) * size), layout.FEATURE_RECORD)
@@ -140,17 +130,13 @@ class TrackRecordingSequence(RecordedSequence):
                     self._unpack(features[ends[c] : ends[c + 1]], c)
                     for c in range(len(self.rig.cameras))
                 ]
-                if looks is not None:
-                    rows = np.frombuffer(looks.read(counts[0] * self._descriptor_bytes), np.uint8)
+                if descriptors_file is not None:
+                    rows = np.frombuffer(
+                        descriptors_file.read(counts[0] * self._descriptor_bytes), np.uint8
+                    )
                     descriptors = rows.reshape(counts[0], self._descriptor_bytes)
                     observed[0] = replace(observed[0], descriptors=descriptors)
                 yield FeatureFrame(int(row["stamp"]), tuple(observed))
-
-    def groundtruth(self) -> Trajectory | None:
-        """The trajectory that was recorded with the features, unless another was given."""
-        if self._own_groundtruth is None:
-            return super().groundtruth()
-        return layout.load_trajectory(self._own_groundtruth)
 
     def initial_state(self) -> NavState | None:
         """The state at the start, if one was recorded."""
@@ -166,7 +152,7 @@ class TrackRecordingSequence(RecordedSequence):
         return FeatureObservations(ids, pixels, normalized)
 
     def _open_descriptors(self, files: ExitStack, first: int) -> BinaryIO | None:
-        """The file of descriptors, from that of some feature on; None where there are none."""
+        """The file of descriptors, positioned at feature `first`; None where there are none."""
         if self._descriptor_bytes == 0:
             return None
         file = files.enter_context((self.path / layout.DESCRIPTORS).open("rb"))

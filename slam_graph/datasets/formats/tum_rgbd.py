@@ -1,23 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""TUM RGB-D: colour images of a Kinect with motion capture; neither a gyroscope nor an IMU.
+"""TUM RGB-D: colour images of a Kinect with motion capture, without an IMU.
 
 Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. ``rgb.txt`` lists
 time [s] and file of the images, ``groundtruth.txt`` the poses of the colour camera's optical frame.
-The images are undistorted with the published calibration as they are read.
 ``depth.txt`` and the depth images are not read, nor is ``accelerometer.txt``, which is of no use
 without a gyroscope.
 
-Images brought into the frame of a pinhole without distortion, where no camera model fits them.
-
-KITTI's unsynchronised images and those of TUM RGB-D are calibrated with five coefficients of
-Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows.
+The images are undistorted with the published calibration as they are read, because it has five
+coefficients of Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows. `rectifier`
+does the same for KITTI's unsynchronised images.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,7 +27,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.formats.euroc import ordered_images
-from slam_graph.datasets.sequence import Extent
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows, stamp_from_seconds
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages, Image
@@ -37,8 +35,9 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
+
+__all__ = ["TumRgbdSequence", "is_tum_rgbd", "rectifier"]
 
 Size = tuple[int, int]
 
@@ -51,9 +50,9 @@ def rectifier(
     size: Size,
     rectified_size: Size,
 ) -> Callable[[Image], Image]:
-    """What turns images of a distorted camera into rectified ones.
+    """A function that turns images of a distorted camera into rectified ones.
 
-    Images of another size than `size` are handed back as they are, to be found by their size.
+    Images of another size than `size` are returned as they are, to be refused for their size.
 
     Args:
         K: (3, 3) of the camera as it is.
@@ -96,51 +95,32 @@ class TumRgbdSequence(ImageSequence):
 
     Args:
         path: the folder with ``rgb.txt``.
-        cameras: 1 or None.
-        calibration: a Kalibr camera chain; needed where the name of the folder does not say whether
-            it is freiburg1, freiburg2 or freiburg3.
-        groundtruth: file or folder to use instead of ``groundtruth.txt``.
-        diagnostics: where faults are counted.
+        options: what else is asked for; `calibration` is needed where the name of the folder does
+            not contain freiburg1, freiburg2 or freiburg3.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
     """
 
     format: ClassVar[str] = "tum_rgbd"
-    has_imu = False
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path.resolve()
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
-        images = _list_images(path, diagnostics)
-        if calibration is not None:
-            rig = read_kalibr(calibration, needs_imu=False).select(1)
+        images = _list_images(path, options.diagnostics)
+        if options.calibration is not None:
+            rig = read_kalibr(options.calibration, needs_imu=False).select(1)
         else:
             rig = _known_rig(self.path, images)
         truth = path / "groundtruth.txt"
         super().__init__(
             self.path.name,
-            rig if cameras is None else rig.select(cameras),
+            options.select(rig),
             [images],
-            groundtruth or (truth if truth.is_file() else None),
-            diagnostics,
+            None,
+            options,
+            truth if truth.is_file() else None,
         )
-
-    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """Nothing: there is no gyroscope."""
-        return iter(())
-
-    def measure(self) -> Extent:
-        """Count frames."""
-        stamps = self._groups.stamps_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), 0)
 
 
 def _known_rig(path: Path, images: FileImages) -> Rig:

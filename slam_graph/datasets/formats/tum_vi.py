@@ -11,16 +11,19 @@ files of EuRoC are not there: the cameras are in ``dso/camchain.yaml``, the nois
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 from slam_graph.datasets.formats.euroc import EurocSequence
-from slam_graph.diagnostics import Diagnostics
+from slam_graph.datasets.sequence import ReaderOptions
+
+__all__ = ["TumViSequence", "is_tum_vi"]
 
 CHAIN = Path("dso") / "camchain.yaml"
 
 
-def tum_vi_root(path: Path) -> Path | None:
+def _find_root(path: Path) -> Path | None:
     """The folder with ``mav0`` and ``dso`` that a path stands for, or None."""
     for folder in (path, path.resolve().parent):
         if (folder / CHAIN).is_file() and (folder / "mav0").is_dir():
@@ -30,7 +33,7 @@ def tum_vi_root(path: Path) -> Path | None:
 
 def is_tum_vi(path: Path) -> bool:
     """Whether this is the folder of a TUM-VI sequence, or its ``mav0``."""
-    return path.is_dir() and tum_vi_root(path) is not None
+    return path.is_dir() and _find_root(path) is not None
 
 
 class TumViSequence(EurocSequence):
@@ -40,10 +43,7 @@ class TumViSequence(EurocSequence):
 
     Args:
         path: the folder with ``mav0`` and ``dso``, or ``mav0``.
-        cameras: use only the first so many.
-        calibration: a Kalibr camera chain to use instead of ``dso/camchain.yaml``.
-        groundtruth: file or folder to use instead of ``mav0/mocap0``.
-        diagnostics: where faults are counted.
+        options: what else is asked for.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
@@ -51,13 +51,7 @@ class TumViSequence(EurocSequence):
 
     format: ClassVar[str] = "tum_vi"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
-        root = tum_vi_root(path) or path
-        super().__init__(root, cameras, calibration or root / CHAIN, groundtruth, diagnostics)
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
+        root = _find_root(path) or path
+        super().__init__(root, replace(options, calibration=options.calibration or root / CHAIN))

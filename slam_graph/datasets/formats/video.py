@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,8 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.formats.loose_files import (
     LooseFiles,
     find_files,
@@ -22,7 +22,7 @@ from slam_graph.datasets.formats.loose_files import (
     read_stamps,
     regular_stamps,
 )
-from slam_graph.datasets.sequence import Extent, FrameStream
+from slam_graph.datasets.sequence import FrameStream, ReaderOptions
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     GroupedSequence,
@@ -31,14 +31,15 @@ from slam_graph.datasets.streams.image_sequence import (
 )
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors.measurements import CameraFrame, ImuData
+from slam_graph.sensors.measurements import CameraFrame
+
+__all__ = ["VideoSequence", "is_video"]
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
 
 SILENT = "-8"
-"""FFmpeg's level of logging; what it has to say about a damaged video is found out anyway."""
+"""FFmpeg's level of logging; damage is found and counted without its messages."""
 
 
 def is_video(path: Path) -> bool:
@@ -46,7 +47,7 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-class VideoReader:
+class _VideoReader:
     """Reads the frames of a video one after the other, as grey images.
 
     Raises:
@@ -67,21 +68,21 @@ class VideoReader:
 
     @property
     def count(self) -> int | None:
-        """How many frames the container says that there are; None if it does not."""
+        """Number of frames according to the container; None if it gives none."""
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         return int(count) if 0 < count < 1e9 else None
 
     @property
     def rate_hz(self) -> float | None:
-        """How many frames come in a second, by the container; None if it does not say.
+        """Frame rate according to the container; None if it gives none.
 
-        Of a stream that does not know its length the rate is FFmpeg's guess.
+        Without a number of frames it is FFmpeg's guess, and not used.
         """
         rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
         return rate_hz if self.count is not None and is_usable_rate(rate_hz) else None
 
     def skip_to(self, index: int) -> bool:
-        """Go on to a frame, not before the next one; whether there is one."""
+        """Go forward to a frame; whether there is one."""
         while self._next <= index:
             if not self._capture.grab():
                 return False
@@ -89,7 +90,7 @@ class VideoReader:
         return True
 
     def read(self, index: int) -> Image | None:
-        """A frame, not before the next one; None if the video ends before it."""
+        """Go forward to a frame and read it; None if the video ends before it."""
         if not self.skip_to(index):
             return None
         whole, image = self._capture.retrieve()
@@ -99,25 +100,21 @@ class VideoReader:
         return np.asarray(grey, np.uint8)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._capture.release()
 
 
 class VideoSequence(GroupedSequence):
     """A video of one camera.
 
-    The times of its frames are in a table (see `loose_files`), one for each frame. Without one,
-    they come at the rate that is told, or that the container tells (`stamps_assumed`), the first
-    one at time 0.
+    The times of its frames are in a table (see `loose_files`), one for each frame. Without one they
+    have the rate that is given, or that of the container (`stamps_assumed`), from time 0.
 
     Args:
         path: the video.
-        cameras: 1 or None.
-        calibration: a Kalibr camera chain; without it the file ``NAME.yaml`` beside the video.
-        groundtruth: file or folder with the ground truth.
-        diagnostics: where faults are counted.
-        sources: files ``stamps`` and ``imu`` to use instead of ``NAME.csv`` and ``NAME.imu.csv``
-            beside the video, or ``rate`` in Hz.
+        options: what else is asked for. Files that are not named are looked for beside the video:
+            calibration ``NAME.yaml``; of the `sources` ``stamps`` ``NAME.csv`` and ``imu``
+            ``NAME.imu.csv``. A source ``rate`` gives the frame rate in Hz.
 
     Raises:
         DataError: if a part of the recording is missing or cannot be read.
@@ -125,35 +122,24 @@ class VideoSequence(GroupedSequence):
 
     format: ClassVar[str] = "video"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-        sources: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
-        with closing(VideoReader(path)) as video:
+        with closing(_VideoReader(path)) as video:
             beside = {
                 "stamps": [path.with_suffix(".csv"), path.with_suffix(".txt")],
                 "imu": [path.with_suffix(".imu.csv")],
                 "calibration": [path.with_suffix(".yaml")],
             }
-            files = find_files(path, sources or {}, beside, calibration)
-            rig = files.rig if cameras is None else files.rig.select(cameras)
-            super().__init__(path.stem, rig, ["video"], groundtruth, diagnostics)
-            self.has_imu = files.imu is not None
-            self._imu = files.imu
+            files = find_files(path, beside, options)
+            super().__init__(path.stem, files.rig, ["video"], files.imu, options)
             rate_hz = files.rate_hz if files.rate_hz is not None else video.rate_hz
             count = video.count if video.count is not None else _count_frames(path)
             looked_at = [video.read(k) for k in range(LOOKED_AT)]
         first = [image for image in looked_at if image is not None]
         if not first:
             raise DataError(f"{path}: no frame of this video can be read")
-        require_size(first, rig.cameras[0].camera, path.name)
+        require_size(first, files.rig.cameras[0].camera, path.name)
         stamps = self._stamps(files, count, rate_hz)
         self._kept = in_order(stamps, partial(self._dropped, stamps))
         self._groups = group_by_time([stamps[self._kept]], 0)
@@ -162,16 +148,6 @@ class VideoSequence(GroupedSequence):
     def groups(self) -> Groups:
         """The frames by their times."""
         return self._groups
-
-    def measure(self) -> Extent:
-        """Count frames and IMU samples."""
-        stamps = self._groups.stamps_ns
-        samples = 0 if self._imu is None else self._imu.count()
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
-
-    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """The cleaned IMU stream from `after_ns` on."""
-        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """Frames with their images, the next ones decoded in a thread.
@@ -184,7 +160,7 @@ class VideoSequence(GroupedSequence):
             for k in wanted:
                 yield CameraFrame(int(self._groups.stamps_ns[k]), (None,))
             return
-        with closing(VideoReader(self.path)) as video:
+        with closing(_VideoReader(self.path)) as video:
             jobs = (partial(video.read, int(self._kept[k])) for k in wanted)
             with closing(prefetch(jobs)) as results:
                 for k, image in zip(wanted, results, strict=True):
@@ -198,7 +174,7 @@ class VideoSequence(GroupedSequence):
         where: Callable[[], str] = lambda: f"{self.path}: frame {self._kept[index]}"  # noqa: E731
         return check_size(image, self.rig.cameras[0].camera, where)
 
-    def _stamps(self, files: LooseFiles, count: int, rate_hz: float | None) -> NDArray[np.int64]:
+    def _stamps(self, files: LooseFiles, count: int, rate_hz: float | None) -> IntArray:
         """Times (N,) of the frames."""
         if files.stamps is not None:
             stamps, _ = read_stamps(files.stamps)
@@ -209,7 +185,7 @@ class VideoSequence(GroupedSequence):
             return stamps[:count]
         if rate_hz is None:
             raise DataError(
-                f"{self.path}: no times of the frames, and the container tells no frame rate; give "
+                f"{self.path}: no times of the frames, and the container has no frame rate; give "
                 "--source stamps=FILE or --source rate=HZ"
             )
         if files.rate_hz is None:
@@ -217,12 +193,12 @@ class VideoSequence(GroupedSequence):
             self.diagnostics.warn("stamps_assumed", f"{self.path}: {what}")
         return regular_stamps(count, rate_hz)
 
-    def _dropped(self, stamps: NDArray[np.int64], k: int, _: int) -> None:
+    def _dropped(self, stamps: IntArray, k: int, _: int) -> None:
         what = f"frame {k} at {stamps[k]} dropped, not in the order of time"
         self.diagnostics.warn("camera_out_of_order", f"{self.path}: {what}")
 
 
 def _count_frames(path: Path) -> int:
     """Go through a whole video to count its frames."""
-    with closing(VideoReader(path)) as video:
+    with closing(_VideoReader(path)) as video:
         return next(k for k in range(2**62) if not video.skip_to(k))

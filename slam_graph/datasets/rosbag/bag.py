@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of ROS 1 and ROS 2 (SQLite and MCAP) through the package `rosbags`; ROS is not needed."""
+"""Bags of ROS 1 and ROS 2 (SQLite and MCAP), read by the package `rosbags` without ROS."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
+__all__ = ["Bag", "Message", "is_bag"]
+
 ROS1_SUFFIX, ROS2_SUFFIXES = ".bag", (".mcap", ".db3")
 
 METADATA = "metadata.yaml"
 
 HEADER_BYTES = 12
-"""Of a message up to the end of its stamp."""
+"""Length of the beginning of a message that ends with its stamp."""
 
 REINDEX = (
     "if its recording was cut short, rebuild its index first (rosbag reindex, ros2 bag reindex)"
@@ -33,7 +35,7 @@ REINDEX = (
 
 
 def is_bag(path: Path) -> bool:
-    """Whether this is a file or folder that ROS records to."""
+    """Whether this is a bag: a file, or the folder of a ROS 2 bag."""
     if path.is_file():
         return path.suffix in (ROS1_SUFFIX, *ROS2_SUFFIXES)
     return (path / METADATA).is_file() and any(
@@ -43,7 +45,7 @@ def is_bag(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message as it lies in the bag.
+    """A message as it is stored in the bag.
 
     Attributes:
         topic: where it was published.
@@ -59,7 +61,7 @@ class Message:
 
 
 class Bag:
-    """A bag: which topics it has, and their messages in the order in which they were recorded.
+    """A bag: its topics, and their messages in the order in which they were recorded.
 
     Attributes:
         path: file or folder.
@@ -79,6 +81,11 @@ class Bag:
                 if connection.msgcount
             }
             self._is_ros2 = reader.is2
+
+    def listed(self) -> str:
+        """The topics with their types in one line, for messages."""
+        short = (f"{topic} ({name.rpartition('/')[2]})" for topic, name in self.topics.items())
+        return ", ".join(sorted(short)) or "none"
 
     def of_type(self, *types: str) -> list[str]:
         """Topics of these types, sorted by name."""
@@ -107,7 +114,7 @@ class Bag:
 
     @contextmanager
     def kept_open(self) -> Iterator[None]:
-        """Open the bag once for several streams of messages, of which each ends before the next."""
+        """Open the bag once for several streams of messages, used one after the other."""
         with self._open() as reader:
             self._kept = reader
             try:
@@ -116,10 +123,10 @@ class Bag:
                 self._kept = None
 
     def header_stamp_ns(self, message: Message) -> int:
-        """The stamp in the header of a message, which must begin with one; 0 if it is not set."""
+        """The stamp in the header that a message begins with; 0 if it is not set."""
         if len(message.raw) < HEADER_BYTES:
             return 0
-        if self._is_ros2:  # four bytes that tell the order of bytes, and the stamp
+        if self._is_ros2:  # four bytes with the byte order, and the stamp
             order = "<" if message.raw[1] & 1 else ">"
             seconds, nanoseconds = struct.unpack_from(f"{order}iI", message.raw, 4)
         else:  # a sequence number, and the stamp
@@ -127,7 +134,7 @@ class Bag:
         return int(seconds) * 10**9 + int(nanoseconds)
 
     def _decoder(self, types: Typestore, raw: bytes, msgtype: str) -> Callable[[], Any]:
-        """What decodes a message, also when its bag is closed by then."""
+        """A function that decodes a message, even after the bag is closed."""
         parse = types.deserialize_cdr if self._is_ros2 else types.deserialize_ros1
 
         def decode() -> Any:
@@ -153,12 +160,12 @@ class Bag:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Turn whatever a damaged bag makes the reader raise into one line."""
+        """Turn any exception of the reader of a damaged bag into one line."""
         try:
             yield
         except DataError:
             raise
-        except Exception as error:  # its parsers raise what comes, from struct.error to KeyError
+        except Exception as error:  # its parsers raise anything from struct.error to KeyError
             what = " ".join(str(error).split()) or type(error).__name__
             raise DataError(
                 f"{self.path}: this bag cannot be read ({what[:150]}); {REINDEX}"
@@ -167,7 +174,7 @@ class Bag:
 
 @cache
 def _usual_types() -> Typestore:
-    """The messages of ROS 2, for bags that do not bring their definitions."""
+    """The message types of ROS 2, for bags without definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.LATEST)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages as measurements: grey images of every common encoding, IMU samples, poses."""
+"""ROS messages as measurements: grey images of all common encodings, IMU samples, poses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,18 @@ import cv2
 import numpy as np
 
 from slam_graph.datasets.streams.images import Fault, Image, decode_grey
+
+__all__ = [
+    "CAMERA_INFO",
+    "COMPRESSED_IMAGE",
+    "IMAGE",
+    "IMU",
+    "POSES",
+    "TRANSFORMS",
+    "image_of",
+    "inertial_of",
+    "pose_of",
+]
 
 IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
@@ -23,14 +35,14 @@ POSES = {
     "geometry_msgs/msg/TransformStamped": "transform",
     "nav_msgs/msg/Odometry": "pose.pose",
 }
-"""Where the pose is in each type of message that has one."""
+"""The field with the pose in each type of message that has one."""
 
 
-class Encoding(NamedTuple):
+class _Encoding(NamedTuple):
     """How the pixels of an encoding are stored.
 
     Attributes:
-        channels: numbers a pixel.
+        channels: numbers per pixel.
         bits: of each number.
         to_grey: OpenCV's conversion, None where there is nothing to convert.
     """
@@ -41,23 +53,23 @@ class Encoding(NamedTuple):
 
 
 ENCODINGS = {
-    "mono8": Encoding(1, 8, None),
-    "8UC1": Encoding(1, 8, None),
-    "mono16": Encoding(1, 16, None),
-    "16UC1": Encoding(1, 16, None),
-    "rgb8": Encoding(3, 8, cv2.COLOR_RGB2GRAY),
-    "bgr8": Encoding(3, 8, cv2.COLOR_BGR2GRAY),
-    "8UC3": Encoding(3, 8, cv2.COLOR_BGR2GRAY),
-    "rgba8": Encoding(4, 8, cv2.COLOR_RGBA2GRAY),
-    "bgra8": Encoding(4, 8, cv2.COLOR_BGRA2GRAY),
-    "bayer_rggb8": Encoding(1, 8, cv2.COLOR_BayerRGGB2GRAY),
-    "bayer_bggr8": Encoding(1, 8, cv2.COLOR_BayerBGGR2GRAY),
-    "bayer_gbrg8": Encoding(1, 8, cv2.COLOR_BayerGBRG2GRAY),
-    "bayer_grbg8": Encoding(1, 8, cv2.COLOR_BayerGRBG2GRAY),
-    "yuv422": Encoding(2, 8, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": Encoding(2, 8, cv2.COLOR_YUV2GRAY_YUY2),
+    "mono8": _Encoding(1, 8, None),
+    "8UC1": _Encoding(1, 8, None),
+    "mono16": _Encoding(1, 16, None),
+    "16UC1": _Encoding(1, 16, None),
+    "rgb8": _Encoding(3, 8, cv2.COLOR_RGB2GRAY),
+    "bgr8": _Encoding(3, 8, cv2.COLOR_BGR2GRAY),
+    "8UC3": _Encoding(3, 8, cv2.COLOR_BGR2GRAY),
+    "rgba8": _Encoding(4, 8, cv2.COLOR_RGBA2GRAY),
+    "bgra8": _Encoding(4, 8, cv2.COLOR_BGRA2GRAY),
+    "bayer_rggb8": _Encoding(1, 8, cv2.COLOR_BayerRGGB2GRAY),
+    "bayer_bggr8": _Encoding(1, 8, cv2.COLOR_BayerBGGR2GRAY),
+    "bayer_gbrg8": _Encoding(1, 8, cv2.COLOR_BayerGBRG2GRAY),
+    "bayer_grbg8": _Encoding(1, 8, cv2.COLOR_BayerGRBG2GRAY),
+    "yuv422": _Encoding(2, 8, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": _Encoding(2, 8, cv2.COLOR_YUV2GRAY_YUY2),
 }
-"""What is read; of 16 bits the upper 8 are kept."""
+"""The encodings that can be read; of 16 bits the upper 8 are kept."""
 
 
 def image_of(message: Any, where: str) -> Image | Fault:

@@ -14,15 +14,9 @@ from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
 from slam_graph.datasets.rosbag.topics import Topics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera, Distortion
+from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.camera_model import CAMERA_MODELS
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-MODELS: dict[str, Distortion] = {
-    "plumb_bob": "radtan",
-    "rational_polynomial": "radtan",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-}
 
 STATIC_TOPIC = "/tf_static"
 
@@ -61,7 +55,10 @@ def _info(bag: Bag, topic: str) -> Any:
     base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
     beside = f"{base.rpartition('/')[0]}/camera_info"
     if bag.topics.get(beside) != CAMERA_INFO:
-        raise DataError(f"{bag.path}: no calibration, '{beside}' is missing; give --calibration")
+        raise DataError(
+            f"{bag.path}: no calibration: no topic '{beside}'; give --calibration; "
+            f"the bag has {bag.listed()}"
+        )
     return _first(bag, beside)
 
 
@@ -75,14 +72,17 @@ def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
     fx, fy, cx, cy = (P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]).tolist()
     if rectified or not np.any(D):
         return Camera(fx, fy, cx, cy, "none", (), *size)
-    model = MODELS.get(info.distortion_model)
-    if model is None or np.any(D[4:]):
+    models = {name: model for _, model in CAMERA_MODELS.working() for name in model.ros_names}
+    model = models.get(info.distortion_model)
+    count = 0 if model is None else len(model.coefficient_names)
+    if model is None or np.any(D[count:]):
         given = f"{info.distortion_model} with {len(D)} coefficients"
+        known = ", ".join(f"{name} ({len(m.coefficient_names)})" for name, m in models.items())
         raise DataError(
-            f"{bag.path}: the distortion of CameraInfo is {given}; known: plumb_bob with k3 = 0, "
-            "equidistant; give --calibration"
+            f"{bag.path}: the distortion of CameraInfo is {given}; known, with the number of "
+            f"coefficients that may differ from zero: {known}; give --calibration"
         )
-    return Camera(fx, fy, cx, cy, model, tuple(D[:4].tolist()), *size)
+    return Camera(fx, fy, cx, cy, model.name, tuple(D[:count].tolist()), *size)
 
 
 def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:

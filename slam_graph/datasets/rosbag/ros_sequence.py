@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,7 +19,7 @@ from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
 from slam_graph.datasets.rosbag.ros_calibration import read_bag_rig
 from slam_graph.datasets.rosbag.topics import find_topics
-from slam_graph.datasets.sequence import Extent, FrameStream
+from slam_graph.datasets.sequence import Extent, FrameStream, ReaderOptions
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     STEREO_TOLERANCE_S,
@@ -28,14 +28,15 @@ from slam_graph.datasets.streams.image_sequence import (
     require_size,
 )
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
-from slam_graph.datasets.streams.imu_stream import ImuCleaner
+from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.kalibr_calibration import read_kalibr
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
+
+__all__ = ["RosBagSequence"]
 
 SAMPLES_PER_BLOCK = 256
 
@@ -69,17 +70,15 @@ class _Index:
 class RosBagSequence(GroupedSequence):
     """A bag with images and an IMU.
 
-    The whole bag is gone through once for its stamps before the first frame is delivered. Messages
-    without a stamp get the time at which they were recorded (`stamp_missing`). A bag that is
-    damaged somewhere is used up to there (`bag_damaged`).
+    The whole bag is read once for its stamps before the first frame is delivered. Messages without
+    a stamp get the time at which they were recorded (`stamp_missing`). A damaged bag is used up to
+    the damage (`bag_damaged`).
 
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or the folder of a ROS 2 bag.
-        cameras: use only the first so many.
-        calibration: a Kalibr camera chain; without it `CameraInfo` and ``/tf_static`` are used.
-        groundtruth: file or folder with the ground truth.
-        diagnostics: where faults are counted.
-        sources: topics by ``imu``, ``cam0``, … and ``groundtruth`` (a topic of poses of the body).
+        options: what else is asked for. Without a calibration `CameraInfo` and ``/tf_static`` are
+            used; `sources` are topics by ``imu``, ``cam0``, … and ``groundtruth`` (poses of the
+            body).
 
     Raises:
         DataError: if a topic or the calibration is missing, or the bag cannot be read.
@@ -87,23 +86,16 @@ class RosBagSequence(GroupedSequence):
 
     format: ClassVar[str] = "rosbag"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: int | None = None,
-        calibration: Path | None = None,
-        groundtruth: Path | None = None,
-        diagnostics: Diagnostics | None = None,
-        sources: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
+        options = options or ReaderOptions()
         self.path = path
-        diagnostics = diagnostics if diagnostics is not None else Diagnostics()
         self._bag = Bag(path)
-        topics = find_topics(self._bag, sources or {}, calibration)
+        chain, cameras = options.calibration, options.cameras
+        topics = find_topics(self._bag, options.sources, chain)
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
         unknown = ImuNoise()
-        if calibration is not None:
-            rig = read_kalibr(calibration, fallback=unknown, needs_imu=topics.imu is not None)
+        if chain is not None:
+            rig = read_kalibr(chain, fallback=unknown, needs_imu=topics.imu is not None)
         else:
             count = len(topics.cameras) if cameras is None else cameras
             used = replace(topics, cameras=topics.cameras[:count])
@@ -111,20 +103,19 @@ class RosBagSequence(GroupedSequence):
                 rig = read_bag_rig(self._bag, used, unknown)
         if topics.imu is not None and rig.imu is unknown:
             what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
-            diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
+            options.diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
         if len(topics.cameras) < len(rig.cameras) or (
-            len(topics.cameras) > len(rig.cameras) and calibration is not None
+            len(topics.cameras) > len(rig.cameras) and chain is not None
         ):
             raise DataError(
                 f"{path}: {len(rig.cameras)} cameras are calibrated, images are on "
                 f"{', '.join(topics.cameras)}; choose with --topic cam0=…"
             )
-        rig = rig if cameras is None else rig.select(cameras)
+        rig = options.select(rig)
         self._cameras = topics.cameras[: len(rig.cameras)]
-        super().__init__(path.stem, rig, self._cameras, groundtruth, diagnostics)
+        truth = None if topics.groundtruth is None else self._read_poses
+        super().__init__(path.stem, rig, self._cameras, None, options, truth)
         self.has_imu = topics.imu is not None
-        if groundtruth is None and topics.groundtruth is not None:
-            self.own_groundtruth = self._read_poses
         with self._bag.kept_open():
             for k, topic in enumerate(self._cameras):
                 self._check_first_images(topic, k)
@@ -141,17 +132,19 @@ class RosBagSequence(GroupedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
+        return clean_blocks(self._samples_in_blocks(), self.diagnostics, after_ns)
+
+    def _samples_in_blocks(self) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         if self._imu_topic is None:
             return
-        cleaner = ImuCleaner(self.diagnostics, after_ns)
         with closing(self._until_damage([self._imu_topic])) as messages:
             while block := list(islice(messages, SAMPLES_PER_BLOCK)):
                 stamps = np.array([self._stamp_ns(message) for message in block], np.int64)
                 values = np.array([self._inertial(message) for message in block])
-                where: Callable[[int], str] = lambda k, block=block: self._where(block[k])  # type: ignore[misc]  # noqa: E731
-                cleaned = cleaner.clean(ImuData(stamps, values[:, :3], values[:, 3:]), where)
-                if len(cleaned):
-                    yield cleaned
+                yield partial(self._place, block), ImuData(stamps, values[:, :3], values[:, 3:])
+
+    def _place(self, block: list[Message], index: int) -> str:
+        return self._where(block[index])
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """Frames with their images, the next ones decoded in a thread.
@@ -199,7 +192,7 @@ class RosBagSequence(GroupedSequence):
     def _decode(
         self, frame: int, camera: int, message: Message
     ) -> tuple[int, int, Image | Fault | None]:
-        """An image with its place; runs in the thread, so it counts nothing itself."""
+        """An image with its frame and camera; runs in a thread, so it counts no faults."""
         return frame, camera, self._read(message, camera) if self.decode else None
 
     def _read(self, message: Message, camera: int) -> Image | Fault:
@@ -230,7 +223,7 @@ class RosBagSequence(GroupedSequence):
 
     @cached_property
     def _index(self) -> _Index:
-        """Go through the whole bag for the stamps of its images."""
+        """The stamps of all images, from one pass over the bag."""
         received: list[list[int]] = [[] for _ in self._cameras]
         stamps: list[list[int]] = [[] for _ in self._cameras]
         samples = 0
@@ -249,7 +242,7 @@ class RosBagSequence(GroupedSequence):
         return _Index([np.array(column, np.int64) for column in received], kept, groups, samples)
 
     def _in_order(self, topic: str, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Which images of a camera do not break the order of time."""
+        """The images of a camera whose stamps increase; the others are counted."""
 
         def dropped(k: int, _: int) -> None:
             what = f"{topic}: image at {stamps_ns[k]} dropped, not in the order of time"
@@ -258,14 +251,14 @@ class RosBagSequence(GroupedSequence):
         return in_order(stamps_ns, dropped)
 
     def _until_damage(self, topics: list[str]) -> Generator[Message, None, None]:
-        """Messages up to where the bag is damaged, if it is."""
+        """Messages up to the first damage of the bag."""
         try:
             yield from self._bag.messages(topics)
         except DataError as error:
             self.diagnostics.warn("bag_damaged", f"{error}; what comes before is used")
 
     def _stamp_ns(self, message: Message) -> int:
-        """The stamp of a message; where it has none, the time at which it was recorded."""
+        """The stamp of a message, or the time at which it was recorded if it has none."""
         stamp_ns = self._bag.header_stamp_ns(message)
         if stamp_ns > 0:
             return stamp_ns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are IMU and cameras: as said, as calibrated, or the obvious ones."""
+"""The topics of IMU and cameras in a bag: as named, as calibrated, or the only ones there are."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from slam_graph.datasets.rosbag.messages import COMPRESSED_IMAGE, IMAGE, IMU, PO
 from slam_graph.errors import DataError
 from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
 
+__all__ = ["Topics", "find_topics"]
+
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """Where the sensors are.
+    """The topics of the sensors.
 
     Attributes:
         imu: topic of the IMU, None where there is none.
@@ -39,7 +41,7 @@ def find_topics(bag: Bag, named: Mapping[str, str], calibration: Path | None) ->
         calibration: a Kalibr camera chain, whose keys ``rostopic`` are used where nothing is named.
 
     Raises:
-        DataError: if a topic is not there, of no use, or one of several would have to be guessed.
+        DataError: if a topic is missing or of another type, or several could be meant.
     """
     unknown = [key for key in named if not re.fullmatch(r"imu|groundtruth|cam\d+", key)]
     if unknown:
@@ -53,7 +55,7 @@ def find_topics(bag: Bag, named: Mapping[str, str], calibration: Path | None) ->
 
 
 def _recorded_topics(calibration: Path) -> dict[str, str]:
-    """The keys ``rostopic`` of a Kalibr file, by the sensor under which they stand."""
+    """The keys ``rostopic`` of a Kalibr file, by sensor."""
     topics = {}
     for name, value in read_yaml(calibration).items():
         if re.fullmatch(r"imu0|cam\d+", name):
@@ -88,21 +90,15 @@ def _find_cameras(bag: Bag, known: Mapping[str, str]) -> tuple[str, ...]:
     ]
     found = sorted(topic for topic in raw + compressed if "depth" not in topic)
     if not found:
-        raise DataError(f"{bag.path}: no images in this bag; it has {_listed(bag)}")
+        raise DataError(f"{bag.path}: no images in this bag; it has {bag.listed()}")
     return tuple(found)
 
 
 def _require(bag: Bag, topic: str, types: tuple[str, ...]) -> str:
     if topic not in bag.topics:
-        raise DataError(f"{bag.path}: no topic '{topic}' in this bag; it has {_listed(bag)}")
+        raise DataError(f"{bag.path}: no topic '{topic}' in this bag; it has {bag.listed()}")
     if bag.topics[topic] not in types:
         raise DataError(
             f"{bag.path}: '{topic}' is of type {bag.topics[topic]}; expected {' or '.join(types)}"
         )
     return topic
-
-
-def _listed(bag: Bag) -> str:
-    """The topics with their types, for messages."""
-    short = (f"{topic} ({msgtype.rpartition('/')[2]})" for topic, msgtype in bag.topics.items())
-    return ", ".join(sorted(short)) or "none"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""CSV in blocks of lines: fast parsing that streams, and that names the line of a bad cell."""
+"""CSV files in blocks of lines: streamed, parsed fast, with the line of a bad cell in errors."""
 
 from __future__ import annotations
 
@@ -17,18 +17,30 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 
+__all__ = [
+    "ROWS_PER_BLOCK",
+    "STAMP_TEXT",
+    "Rows",
+    "count_rows",
+    "parse",
+    "read_rows",
+    "require_rows",
+    "stamp_from_seconds",
+    "stamps_from_seconds",
+]
+
 ROWS_PER_BLOCK = 1024
-"""Rows that are in memory at a time: about five seconds of an IMU."""
+"""Rows in memory at a time: about five seconds of an IMU."""
 
 STAMP_TEXT = "S40"
 """Type of a column of stamps in seconds, kept as text until it is turned into nanoseconds."""
 
-DIGITS = frozenset("0123456789")
+_DIGITS = frozenset("0123456789")
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Some consecutive data rows of a text file.
+    """Consecutive data rows of a text file.
 
     Attributes:
         path: of the file.
@@ -76,10 +88,10 @@ def read_rows(path: Path, rows_per_block: int = ROWS_PER_BLOCK) -> Iterator[Rows
 
 def _is_data(line: str, number: int) -> bool:
     start = line[:1]
-    if start in DIGITS:
+    if start in _DIGITS:
         return True
     start = line.strip()[:1]
-    return start != "" and start not in "#%" and (number > 1 or start in DIGITS | {"+", "-", "."})
+    return start != "" and start not in "#%" and (number > 1 or start in _DIGITS | {"+", "-", "."})
 
 
 def parse(
@@ -94,12 +106,12 @@ def parse(
     Args:
         rows: what `read_rows` gave.
         dtype: of one row, as for `numpy.dtype`; without `columns` it must cover all columns.
-        what: the data in a few words, for the message (e.g. ``stamp, gyro xyz, accel xyz``).
+        what: the columns, for the message (e.g. ``stamp, gyro xyz, accel xyz``).
         columns: which columns to read, default all.
         delimiter: between columns; None for white space.
 
     Raises:
-        DataError: naming file and line of the first row that does not parse.
+        DataError: if a row does not parse; names file and line of the first.
     """
     try:
         return _loadtxt(rows.lines, dtype, columns, delimiter)
@@ -115,7 +127,7 @@ def parse(
 
 
 def _reason(message: str, line: str) -> str:
-    """What NumPy did not like about a row, in our words."""
+    """The reason why NumPy cannot parse a row."""
     cell = re.search(r"string '(.*)' to (\w+) at row \d+, column (\d+)", message)
     if cell is None:
         return f"cannot read the row '{line.strip()[:80]}'"
@@ -142,7 +154,7 @@ def stamp_from_seconds(text: bytes | str, rows: Rows, index: int) -> int:
 
     Args:
         text: e.g. ``1403715283.164630651`` or ``1.4e9``.
-        rows: where it stands, for the message.
+        rows: of which it is one, for the message.
         index: of its row.
 
     Raises:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What recordings of images share: a stream of images for each camera, brought together by time."""
+"""Sequences of images: a stream of images for each camera, grouped into frames by their stamps."""
 
 from __future__ import annotations
 
@@ -13,24 +13,39 @@ from pathlib import Path
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.datasets.sequence import Extent, FrameStream, RecordedSequence
+from slam_graph.arrays import IntArray
+from slam_graph.datasets.sequence import (
+    Extent,
+    FrameStream,
+    ReaderOptions,
+    RecordedSequence,
+)
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
-from slam_graph.datasets.streams.imu_stream import ImuFile
+from slam_graph.datasets.streams.imu_stream import ImuSource
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, group_by_time
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
+__all__ = [
+    "LOOKED_AT",
+    "STEREO_TOLERANCE_S",
+    "GroupedSequence",
+    "ImageSequence",
+    "ImageStream",
+    "check_size",
+    "require_size",
+]
+
 STEREO_TOLERANCE_S = 0.003
-"""Images at most this far apart are one frame; EuRoC's pairs differ by some hundred nanoseconds."""
+"""Images at most this far apart are one frame; EuRoC's pairs differ by a few hundred ns."""
 
 LOOKED_AT = 3
-"""How many images of a camera are looked at when a recording is opened: one of another size than
-the calibration is a fault of the image, three are a calibration for other images."""
+"""Images of a camera that are read when a recording is opened, to compare their size with the
+calibration: one of another size is a faulty image, three mean a calibration for other images."""
 
 
 class ImageStream(Protocol):
@@ -42,18 +57,18 @@ class ImageStream(Protocol):
     """
 
     name: str
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: IntArray
 
     def read(self, index: int) -> Image | Fault:
         """One image, of any size, or what is wrong with it; may be called in another thread."""
         ...
 
     def missing(self, index: int) -> Fault | None:
-        """What is wrong with one image as far as can be told without reading it."""
+        """What is wrong with one image as far as is known without reading it."""
         ...
 
     def where(self, index: int) -> str:
-        """Where one image stands, for messages."""
+        """The place of one image, for messages."""
         ...
 
 
@@ -68,8 +83,9 @@ class GroupedSequence(RecordedSequence):
         name: of the recording.
         rig: its calibration.
         camera_names: of the cameras of the rig, for messages.
-        groundtruth: file or folder with the ground truth, or None.
-        diagnostics: where faults are counted.
+        imu: its samples; None without an IMU.
+        options: what was asked for.
+        own_groundtruth: as for `RecordedSequence`.
 
     Attributes:
         decode: whether images are decoded; they are all None otherwise.
@@ -82,15 +98,18 @@ class GroupedSequence(RecordedSequence):
         name: str,
         rig: Rig,
         camera_names: Sequence[str],
-        groundtruth: Path | None,
-        diagnostics: Diagnostics | None,
+        imu: ImuSource | None,
+        options: ReaderOptions,
+        own_groundtruth: Path | Callable[[], Trajectory] | None = None,
     ) -> None:
-        super().__init__(name, rig, groundtruth, diagnostics)
+        super().__init__(name, rig, options, own_groundtruth)
         self.decode = True
+        self.has_imu = imu is not None
+        self._imu = imu
         self._camera_names = camera_names
 
     def without_images(self) -> GroupedSequence:
-        """The same recording, its frames without images: quick to run through."""
+        """The same recording with frames without images, which is quick to run through."""
         twin = copy(self)
         twin.decode = False
         return twin
@@ -100,6 +119,19 @@ class GroupedSequence(RecordedSequence):
     def groups(self) -> Groups:
         """Which images belong together."""
 
+    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
+        """The cleaned IMU stream from `after_ns` on."""
+        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
+
+    def measure(self) -> Extent:
+        """Count frames and IMU samples."""
+        samples = 0 if self._imu is None else self._imu.count()
+        stamps = self.groups.stamps_ns
+        if len(stamps):
+            return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
+        assert self._imu is not None
+        return Extent(0, *self._imu.ends_ns(), samples)
+
     def _range(self, start_ns: int | None, end_ns: int | None) -> range:
         """The frames within [start_ns, end_ns]."""
         stamps = self.groups.stamps_ns
@@ -107,7 +139,7 @@ class GroupedSequence(RecordedSequence):
         last = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
         return range(first, last)
 
-    def _group(self, stamps: Sequence[NDArray[np.int64]], tolerance_s: float) -> Groups:
+    def _group(self, stamps: Sequence[IntArray], tolerance_s: float) -> Groups:
         groups = group_by_time(stamps, round(tolerance_s * 1e9))
         for stamp in groups.skipped:
             self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
@@ -133,12 +165,14 @@ class ImageSequence(GroupedSequence):
         name: of the recording.
         rig: its calibration.
         streams: the images of each camera of the rig.
-        groundtruth: file or folder with the ground truth, or None.
-        diagnostics: where faults are counted.
+        imu: its samples; None without an IMU.
+        options: what was asked for.
+        own_groundtruth: as for `RecordedSequence`.
         stereo_tolerance_s: largest time difference of images that are one frame.
 
     Raises:
-        DataError: if the calibration is for images of another size.
+        DataError: if there are neither images nor an IMU, or the calibration is for images of
+            another size.
     """
 
     def __init__(
@@ -146,17 +180,20 @@ class ImageSequence(GroupedSequence):
         name: str,
         rig: Rig,
         streams: Sequence[ImageStream],
-        groundtruth: Path | None,
-        diagnostics: Diagnostics | None,
+        imu: ImuSource | None,
+        options: ReaderOptions,
+        own_groundtruth: Path | Callable[[], Trajectory] | None = None,
         stereo_tolerance_s: float = STEREO_TOLERANCE_S,
     ) -> None:
-        super().__init__(name, rig, [s.name for s in streams], groundtruth, diagnostics)
+        super().__init__(name, rig, [s.name for s in streams], imu, options, own_groundtruth)
         self._streams = streams
         for mounted, stream in zip(rig.cameras, streams, strict=True):
             count = min(len(stream.stamps_ns), LOOKED_AT)
             images = (stream.read(k) for k in range(count))
             require_size(images, mounted.camera, stream.name)
         self._groups = self._group([s.stamps_ns for s in streams], stereo_tolerance_s)
+        if imu is None and len(self._groups.stamps_ns) == 0:
+            raise DataError(f"{name}: neither images nor an IMU in this recording")
 
     @property
     def groups(self) -> Groups:
@@ -172,7 +209,7 @@ class ImageSequence(GroupedSequence):
                 yield self._report(k, images)
 
     def _read_frame(self, index: int) -> list[Image | Fault | None]:
-        """The images of one frame; runs in the thread, so it counts nothing itself."""
+        """The images of one frame; runs in a thread, so it counts no faults."""
         images: list[Image | Fault | None] = []
         for camera, member in enumerate(self._groups.members[index].tolist()):
             if member == ABSENT:
@@ -188,51 +225,6 @@ class ImageSequence(GroupedSequence):
         return check_size(stream.read(member), model, partial(stream.where, member))
 
 
-class FileImageSequence(ImageSequence):
-    """A recording of images whose IMU, if it has one, is a CSV file.
-
-    Args:
-        name: of the recording.
-        rig: its calibration.
-        streams: the images of each camera of the rig.
-        imu: its file; None without an IMU.
-        groundtruth: file or folder with the ground truth, or None.
-        diagnostics: where faults are counted.
-        stereo_tolerance_s: largest time difference of images that are one frame.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        rig: Rig,
-        streams: Sequence[ImageStream],
-        imu: ImuFile | None,
-        groundtruth: Path | None,
-        diagnostics: Diagnostics | None,
-        stereo_tolerance_s: float = STEREO_TOLERANCE_S,
-    ) -> None:
-        super().__init__(name, rig, streams, groundtruth, diagnostics, stereo_tolerance_s)
-        self.has_imu = imu is not None
-        self._imu = imu
-        if imu is not None:
-            imu.require()
-        elif len(self._groups.stamps_ns) == 0:
-            raise DataError(f"{name}: neither images nor an IMU in this recording")
-
-    def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
-        """The cleaned IMU stream from `after_ns` on."""
-        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
-
-    def measure(self) -> Extent:
-        """Count frames and IMU samples."""
-        samples = 0 if self._imu is None else self._imu.count()
-        stamps = self._groups.stamps_ns
-        if len(stamps):
-            return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
-        assert self._imu is not None
-        return Extent(0, *self._imu.ends_ns(), samples)
-
-
 def check_size(image: Image | Fault, camera: Camera, where: Callable[[], str]) -> Image | Fault:
     """The image, or a fault if it is not of the size that its camera is calibrated for."""
     if isinstance(image, Fault) or image.shape == (camera.height, camera.width):
@@ -244,7 +236,7 @@ def check_size(image: Image | Fault, camera: Camera, where: Callable[[], str]) -
 def require_size(images: Iterable[Image | Fault], camera: Camera, name: str) -> None:
     """Refuse a calibration for images of another size.
 
-    Nobody can tell whether smaller images were scaled or cut out, so nothing is guessed.
+    Smaller images may have been scaled or cropped, so the calibration is not adapted.
 
     Args:
         images: the first ones of a recording.
@@ -268,6 +260,6 @@ def require_size(images: Iterable[Image | Fault], camera: Camera, name: str) -> 
     hint = f" ({scales.pop():g} times as large)" if len(scales) == 1 else ""
     raise DataError(
         f"{name}: images are {size[0]}x{size[1]}{hint}, the calibration is for "
-        f"{calibrated[0]}x{calibrated[1]}; it is not rescaled by guess: give the one of these "
+        f"{calibrated[0]}x{calibrated[1]}; give the calibration of these "
         "images with --calibration"
     )

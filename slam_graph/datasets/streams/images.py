@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Grey images from files: damaged ones refused, the next ones decoded ahead of time."""
+"""Grey images from files: damaged ones are refused, the next ones are decoded in a thread."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
+
+__all__ = ["Fault", "FileImages", "Image", "decode_grey", "find_damage", "prefetch"]
+
 T = TypeVar("T")
 
 Image = NDArray[np.uint8]
@@ -25,7 +29,7 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 FRAMES_AHEAD = 3
-"""How many frames are decoded ahead: enough to hide decoding, little enough to not cost memory."""
+"""Frames decoded ahead: enough to hide the time of decoding, few enough to save memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +48,11 @@ class FileImages:
         name: of the camera.
         stamps_ns: (N,) int64, strictly increasing.
         paths: N files.
-        process: what is done to each image once it is decoded, e.g. rectification.
+        process: applied to each decoded image, e.g. rectification.
     """
 
     name: str
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: IntArray
     paths: Sequence[Path]
     process: Callable[[Image], Image] | None = None
 
@@ -75,12 +79,12 @@ class FileImages:
 def decode_grey(data: bytes, where: str) -> Image | Fault:
     """Decode an image file as 8 bit grey; of 16 bits the upper 8 are kept.
 
-    A damaged file is found before it is decoded: decoders fill the rows that they cannot read with
-    anything, and complain on stderr.
+    A damaged file is recognised before decoding: decoders fill rows that they cannot read with
+    arbitrary values, and write to stderr.
 
     Args:
         data: bytes of the file.
-        where: it comes from, for the message.
+        where: its place, for the message.
 
     Returns:
         (height, width) uint8, or a fault of kind `image_unreadable`.
@@ -98,7 +102,7 @@ def decode_grey(data: bytes, where: str) -> Image | Fault:
 
 
 def find_damage(data: bytes) -> str | None:
-    """What is wrong with the bytes of an image file, as far as can be told without decoding it."""
+    """What is wrong with the bytes of an image file, as far as is known without decoding it."""
     if not data:
         return "empty file"
     if data.startswith(PNG_SIGNATURE):
@@ -109,7 +113,7 @@ def find_damage(data: bytes) -> str | None:
 
 
 def _find_png_damage(data: bytes) -> str | None:
-    """Walk over the chunks of a PNG file and compare their checksums (0.1 ms for EuRoC's)."""
+    """Compare the checksums of the chunks of a PNG file (0.1 ms for EuRoC's)."""
     view = memoryview(data)
     position = len(PNG_SIGNATURE)
     while position + 12 <= len(data):
@@ -127,13 +131,13 @@ def _find_png_damage(data: bytes) -> str | None:
 def prefetch(
     jobs: Iterable[Callable[[], T]], ahead: int = FRAMES_AHEAD
 ) -> Generator[T, None, None]:
-    """Results of jobs in their order, the next ones computed in a thread meanwhile.
+    """Results of jobs in their order, the next ones computed in a thread.
 
-    Closing the generator cancels what has not begun, and waits for what has.
+    Closing the generator cancels the jobs that have not begun, and waits for the one that has.
 
     Args:
-        jobs: taken from as needed, never more than `ahead` in advance.
-        ahead: how many results to have ready at most.
+        jobs: iterated as needed, at most `ahead` in advance.
+        ahead: most results that are computed in advance.
     """
     pending: deque[Future[T]] = deque()
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="slam_graph-images")

@@ -1,24 +1,40 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The IMU stream of a recording: blocks of samples, cleaned of what cannot be integrated."""
+"""IMU streams: blocks of samples from a CSV file or from memory, without unusable samples."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, count_rows, parse, read_rows, require_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import ImuData
 
+__all__ = [
+    "INTEGER_STAMPS",
+    "ImuArrays",
+    "ImuCleaner",
+    "ImuFile",
+    "ImuSource",
+    "clean_blocks",
+    "parse_imu_rows",
+]
+
 GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not
 hurt preintegration; five are 25 ms at 200 Hz, half the time between two frames."""
+
+SAMPLES_PER_BLOCK = 1024
+"""Samples in memory that are cleaned at a time."""
 
 INTEGER_STAMPS = [("stamp", "i8"), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
 
@@ -32,9 +48,9 @@ class ImuCleaner:
 
     Attributes:
         diagnostics: where faults are counted.
-        after_ns: samples before this time are left out without a word.
+        after_ns: samples before this time are left out and not counted.
         latest_ns: stamp of the last sample that was kept.
-        period_ns: median sampling period of the first block, what gaps are measured by.
+        period_ns: median sampling period of the first block, which defines what a gap is.
     """
 
     diagnostics: Diagnostics
@@ -46,8 +62,8 @@ class ImuCleaner:
         """The usable samples of the next block.
 
         Args:
-            data: samples in the order of the file, stamps in any order.
-            where: gives file and line of a sample, for the log.
+            data: samples in the order of the recording, stamps in any order.
+            where: gives the place of a sample, such as file and line, for the log.
         """
         wanted = np.ones(len(data), bool)
         if self.after_ns is not None:
@@ -62,11 +78,11 @@ class ImuCleaner:
 
     def _in_order(
         self,
-        stamps_ns: NDArray[np.int64],
+        stamps_ns: IntArray,
         candidates: NDArray[np.intp],
         where: Callable[[int], str],
     ) -> NDArray[np.intp]:
-        """The candidates without those that break the order of time."""
+        """The candidates whose stamps increase; the others are counted."""
         stamps = stamps_ns[candidates]
 
         def dropped(k: int, latest: int) -> None:
@@ -76,7 +92,7 @@ class ImuCleaner:
 
         return candidates[in_order(stamps, dropped, self.latest_ns)]
 
-    def _report_gaps(self, stamps: NDArray[np.int64], where: Callable[[int], str]) -> None:
+    def _report_gaps(self, stamps: IntArray, where: Callable[[int], str]) -> None:
         if len(stamps) == 0:
             return
         if not np.isfinite(self.period_ns) and len(stamps) > 1:
@@ -92,19 +108,79 @@ class ImuCleaner:
 
 
 def clean_blocks(
-    blocks: Iterator[tuple[Rows, ImuData]], diagnostics: Diagnostics, after_ns: int | None
+    blocks: Iterable[tuple[Callable[[int], str], ImuData]],
+    diagnostics: Diagnostics,
+    after_ns: int | None,
 ) -> Iterator[ImuData]:
-    """Run a stream of parsed blocks through one `ImuCleaner`."""
+    """Run a stream of blocks through one `ImuCleaner`.
+
+    Args:
+        blocks: samples, each block after a function that gives the place of its samples.
+        diagnostics: where faults are counted.
+        after_ns: samples before this time are left out; None for all.
+    """
     cleaner = ImuCleaner(diagnostics, after_ns)
-    for rows, data in blocks:
-        cleaned = cleaner.clean(data, rows.where)
+    for where, data in blocks:
+        cleaned = cleaner.clean(data, where)
         if len(cleaned):
             yield cleaned
 
 
+class ImuSource(Protocol):
+    """The samples of an IMU, wherever they are kept."""
+
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned samples from `after_ns` on."""
+        ...
+
+    def count(self) -> int:
+        """Number of samples, before faulty ones are dropped."""
+        ...
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        ...
+
+
+@dataclass(frozen=True)
+class ImuArrays:
+    """The samples of an IMU in memory, an `ImuSource`.
+
+    Attributes:
+        data: all samples, also faulty ones.
+    """
+
+    data: ImuData
+
+    def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
+        """The cleaned samples from `after_ns` on."""
+        starts = range(0, len(self.data), SAMPLES_PER_BLOCK)
+        blocks = (
+            (partial(_sample, first), self.data[first : first + SAMPLES_PER_BLOCK])
+            for first in starts
+        )
+        return clean_blocks(blocks, diagnostics, after_ns)
+
+    def count(self) -> int:
+        """Number of samples, before faulty ones are dropped."""
+        return len(self.data)
+
+    def ends_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last sample."""
+        return int(self.data.stamps_ns[0]), int(self.data.stamps_ns[-1])
+
+
+def _sample(first: int, index: int) -> str:
+    """The place of a sample in a block that begins with sample `first`."""
+    return f"IMU sample {first + index}"
+
+
 @dataclass(frozen=True)
 class ImuFile:
-    """The samples of an IMU in a CSV file.
+    """The samples of an IMU in a CSV file, an `ImuSource`.
+
+    Raises:
+        DataError: if the file cannot be read or has no samples.
 
     Attributes:
         path: of the file.
@@ -114,17 +190,16 @@ class ImuFile:
     path: Path
     parse: Callable[[Rows], ImuData]
 
-    def require(self) -> None:
-        """Refuse a file that cannot be read or has no samples."""
+    def __post_init__(self) -> None:
         require_rows(self.path)
 
     def blocks(self, diagnostics: Diagnostics, after_ns: int | None) -> Iterator[ImuData]:
         """The cleaned samples from `after_ns` on."""
-        blocks = ((rows, self.parse(rows)) for rows in read_rows(self.path))
+        blocks = ((rows.where, self.parse(rows)) for rows in read_rows(self.path))
         return clean_blocks(blocks, diagnostics, after_ns)
 
     def count(self) -> int:
-        """How many samples there are, before faulty ones are dropped."""
+        """Number of samples, before faulty ones are dropped."""
         return count_rows(self.path)[0]
 
     def ends_ns(self) -> tuple[int, int]:

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which images of several cameras belong together: by time, not by index.
-
-Time that runs backwards: which of some stamps to keep so that they increase.
-"""
+"""Stamps: images of several cameras grouped into frames, and stamps out of order left out."""
 
 from __future__ import annotations
 
@@ -22,12 +19,12 @@ def in_order(
 ) -> NDArray[np.intp]:
     """Indices of stamps that increase.
 
-    Of two stamps in the wrong order the second goes, unless it continues those before them: then
-    the first one is from the future, and must not block all that follow.
+    Of two stamps in the wrong order the second is dropped, unless it continues those before them:
+    then the first is too late, and would block all that follow.
 
     Args:
         stamps_ns: (N,) in the order of the recording.
-        dropped: is told the index of each stamp that is left out, and the last one kept before it.
+        dropped: called with the index of each stamp that is left out, and the last one kept.
         latest_ns: the last stamp before these.
     """
     latest = int(np.iinfo(np.int64).min) if latest_ns is None else latest_ns
@@ -48,7 +45,7 @@ ABSENT = -1
 """Stands in a group for a camera that has no image in it."""
 
 LARGEST_TOLERANCE_PERIODS = 0.4
-"""The tolerance is cut to this share of a camera's period, so that neighbours are never paired."""
+"""The tolerance is at most this share of a camera's period, so that neighbours are never paired."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +55,7 @@ class Groups:
     Attributes:
         stamps_ns: (F,) int64, strictly increasing: the stamp of the first camera in each group.
         members: (F, C) int64: index of the image of each camera, `ABSENT` where it has none.
-        skipped: stamps of groups left out, because they would not follow the group before them.
+        skipped: stamps of groups left out, because they are not later than the one before.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -69,12 +66,12 @@ class Groups:
 def group_by_time(cameras: Sequence[NDArray[np.int64]], tolerance_ns: int) -> Groups:
     """Group the stamps of C cameras.
 
-    A group begins with the earliest image that is in no group yet, and takes from each other camera
-    its next image if that is at most `tolerance_ns` later.
+    A group begins with the earliest image that is in no group, and takes from each other camera its
+    next image if that is at most `tolerance_ns` later.
 
     Args:
         cameras: C arrays of strictly increasing stamps.
-        tolerance_ns: largest difference within a group; it is cut to 0.4 periods of the cameras.
+        tolerance_ns: largest difference within a group; at most 0.4 periods of the cameras.
     """
     tolerance_ns = min(tolerance_ns, *(_largest_tolerance(stamps) for stamps in cameras))
     stamps = np.concatenate(cameras)
@@ -94,7 +91,7 @@ def group_by_time(cameras: Sequence[NDArray[np.int64]], tolerance_ns: int) -> Gr
 
 
 def _name_groups(cameras: Sequence[NDArray[np.int64]], members: NDArray[np.int64]) -> Groups:
-    """Give each group the stamp of its first camera, and leave out what runs backwards."""
+    """Give each group the stamp of its first camera, and leave out groups out of order."""
     stamps = np.zeros(len(members), np.int64)
     for camera in reversed(range(len(cameras))):
         there = members[:, camera] != ABSENT

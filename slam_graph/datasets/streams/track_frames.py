@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Feature frames out of tables of tracks: one row for each feature, camera and time."""
+"""Feature frames from tables of tracks: one row for each feature, camera and time."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def frames_from_tables(
     `track_not_finite` and `track_duplicate` (an id twice in a camera and frame; the first is kept).
 
     Args:
-        tables: arrays of `TRACK_ROW`; a frame may run over the end of one into the next.
-        cameras: number of cameras; rows of further ones are left out.
+        tables: arrays of `TRACK_ROW`; a frame may begin in one and end in the next.
+        cameras: number of cameras; rows of others are left out.
         diagnostics: where faults are counted.
         where: name of the file, for the log.
     """
@@ -79,7 +79,7 @@ def frames_from_tables(
 
 
 def _whole_frames(tables: Iterable[TrackTable]) -> Iterator[TrackTable]:
-    """Cut tables where the stamp changes; the last frame of each waits for the next table."""
+    """Split tables where the stamp changes; a frame may go on in the next table."""
     rest = np.zeros(0, TRACK_ROW)
     for table in tables:
         joined = np.concatenate([rest, table]) if len(rest) else table
@@ -96,7 +96,7 @@ def _whole_frames(tables: Iterable[TrackTable]) -> Iterator[TrackTable]:
 def _observations(
     table: TrackTable, camera: int, diagnostics: Diagnostics, where: str
 ) -> FeatureObservations:
-    """What one camera sees in one frame, without what cannot be used."""
+    """The observations of one camera in one frame, without unusable ones."""
     rows = table[table["camera"] == camera]
     finite = np.isfinite(rows["pixel"]).all(axis=1) & np.isfinite(rows["normalized"]).all(axis=1)
     for row in rows[~finite]:

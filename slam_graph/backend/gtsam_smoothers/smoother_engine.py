@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""GTSAM's own smoothers as an estimator: the same start, input and output, another engine.
+"""GTSAM's smoothers as an engine: the same start, input and output as the package's own loop.
 
 Everything in the graph is a factor of GTSAM: preintegrated IMU measurements, projections, zero
 velocities, and one prior. See docs/engine.md.
@@ -13,106 +13,107 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost
-from slam_graph.backend.cost.feature_tracks import TrackWindow
-from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
+from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
 from slam_graph.backend.gtsam_smoothers.smoother_features import NewObservations, SmootherFeatures
-from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, NativeSolver
-from slam_graph.backend.initialization.initializer import prior_of
-from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
+from slam_graph.backend.initialization.first_state import prior_of
+from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
-from slam_graph.sensors.rig import Rig
+
+__all__ = ["SmootherEngine"]
 
 
-class SmootherEstimator(Estimator):
-    """An estimator whose steps are updates of one of GTSAM's smoothers.
+class SmootherEngine:
+    """Steps that are updates of one of GTSAM's smoothers; see `Engine` for the methods.
 
-    Its window holds no more than the newest state in the graph, with its marginal covariance; the
+    The window holds no more than the newest state in the graph, with its marginal covariance; the
     smoother holds the rest.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        algorithm: AlgorithmConfig,
-        config: BackendConfig | None = None,
-        diagnostics: Diagnostics | None = None,
-    ) -> None:
-        if config is not None and config.calibration.anything:
+    def __init__(self, context: EngineContext) -> None:
+        """Prepare the smoother that `algorithm.engine` names.
+
+        Raises:
+            ConfigError: if parameters of the calibration are to be estimated.
+        """
+        if context.config.calibration.anything:
             raise ConfigError(
-                f"backend.calibration is not for '{algorithm.name}': GTSAM's smoothers take the "
-                "calibration as it is; use msckf, swf, okvis, ekf or iekf"
+                f"backend.calibration is not for '{context.algorithm.name}': GTSAM's smoothers "
+                "take the calibration as it is; use msckf, swf, okvis, ekf or iekf"
             )
-        super().__init__(rig, algorithm, config, diagnostics)
-        self._policy = algorithm.smoother
-        self._projection = RigProjection(rig)
-        self._features = SmootherFeatures(rig, self._policy, self.config, self.diagnostics)
-        self._solver: NativeSolver | None = None
+        self._context = context
+        self._policy = context.algorithm.smoother
+        self._features = SmootherFeatures(
+            context.rig, self._policy, context.config, context.diagnostics
+        )
+        self._solver: SmootherSolver | None = None
         self._estimate = gtsam.Values()
-        self._frames: dict[int, int] = {}  # the states in the lag: index and stamp
+        self._frames: dict[int, int] = {}  # indices and stamps of the states in the lag
         self._origin_ns = 0
 
-    def landmarks(self) -> tuple[IntArray, FloatArray]:
+    def information(self, window: Window) -> SquareRootInformation:
+        """What is known of the newest state in the graph."""
+        return window.prior
+
+    def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
         return self._features.active, stacked_points(self._estimate, self._features.active.tolist())
 
-    @property
-    def rejected(self) -> IntArray:
-        """Ids (N,) of the features that the gate rejected when a state was last added."""
-        return self._features.rejected
-
-    def _step(self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool) -> NavState:
+    def step(
+        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+    ) -> NavState:
         """Predict the state, and add it to the graph if it is time for one."""
-        with self._timed("propagation"):
+        propagation = self._context.propagation
+        with report.timed("propagation"):
             ahead = Window(window.frame, window.stamp_ns, window.state.copy(), window.prior)
-            self._propagation.append_frame(ahead, self._imu, stamp_ns, still)
+            propagation.append_frame(ahead, self._context.imu, stamp_ns, still)
             predicted = self._predicted(ahead)
         if stamp_ns - window.stamp_ns < self._policy.spacing_s * 1e9:
             return predicted
-        with self._timed("cost"):
-            new = self._observations(window.tracks, ahead, predicted, frame, still)
-        with self._timed("smoother"):
+        with report.timed("cost"):
+            if still:
+                new = self._pause(window.tracks, ahead, frame)
+            else:
+                new = self._observations(window.tracks, ahead, predicted, frame)
+                report.innovations = self._features.innovations
+                report.rejected = self._features.rejected
+        with report.timed("smoother"):
             self._solve(window, ahead, new)
-        with self._timed("covariance"):
+        with report.timed("covariance"):
             state = self._advance(window, ahead, predicted)
-        self._propagation.learn(state)
+        propagation.learn(state)
         return state
 
     def _predicted(self, ahead: Window) -> NavState:
         """The new state and its covariance before any image is used."""
-        cost = Cost(ahead.state, self._projection, self.config, ahead.prior, ahead.factors)
+        context = self._context
+        cost = Cost(ahead.state, context.projection, context.config, ahead.prior, ahead.factors)
         return ahead.current(cost.prior_at_estimate().updated(cost.factor_rows(cost.layout())))
 
+    def _pause(self, tracks: FeatureTracks, ahead: Window, frame: FeatureFrame) -> NewObservations:
+        """At a standstill images only add errors: no factors, and tracks begin again."""
+        tracks.keep_frames([])
+        tracks.add(ahead.frame, frame)
+        tracks.remove(Outcome.STANDSTILL, self._features.active)
+        return NewObservations()
+
     def _observations(
-        self,
-        tracks: TrackWindow,
-        ahead: Window,
-        predicted: NavState,
-        frame: FeatureFrame,
-        still: bool,
+        self, tracks: FeatureTracks, ahead: Window, predicted: NavState, frame: FeatureFrame
     ) -> NewObservations:
-        """What the images add; nothing at a standstill, of which they only bring their errors."""
-        if still:
-            tracks.retain([])
-            tracks.add(ahead.frame, frame)  # where a later feature may begin
-            tracks.consume(self._features.active)
-            return NewObservations()
-        tracks.retain(list(self._frames))
+        """What the images add to the graph at the new state."""
+        tracks.keep_frames(list(self._frames))
         tracks.add(ahead.frame, frame)
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)
         assert predicted.covariance is not None
-        new = self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
-        self.innovations = self._features.innovations
-        return new
+        return self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
 
     # --- the smoother ----------------------------------------------------------------------------
 
@@ -120,9 +121,9 @@ class SmootherEstimator(Estimator):
         return (stamp_ns - self._origin_ns) * 1e-9
 
     def _solve(self, window: Window, ahead: Window, new: NewObservations) -> None:
-        """Update the smoother; if it fails, without this step's features, at last from anew."""
+        """Update the smoother; without new features if that fails, then from the last state."""
         if self._solver is None:
-            self._solver = self._begun(window)
+            self._solver = self._begin(window)
         stamps = dict.fromkeys(imu_state_keys(ahead.frame), self._seconds(ahead.stamp_ns))
         values = _values_of(ahead.state, ahead.frame)
         old_factors, (old_values, old_stamps) = self._solver.factors(), self._solver.everything()
@@ -134,10 +135,10 @@ class SmootherEstimator(Estimator):
             return
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:120]
-            message = f"one frame goes without its features ({reason})"
-            self.diagnostics.warn("features_degenerate", message)
+            message = f"the features of one frame are not used ({reason})"
+            self._context.diagnostics.warn("features_degenerate", message)
         try:
-            self._solver = SOLVERS[self.algorithm.engine](self._policy)
+            self._solver = SOLVERS[self._context.algorithm.engine](self._policy)
             old_values.insert(values)
             rebuilt = [old_factors.at(k) for k in range(old_factors.size())]
             factors = [
@@ -146,19 +147,19 @@ class SmootherEstimator(Estimator):
             self._solver.update([*factors, *ahead.factors], old_values, {**old_stamps, **stamps})
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:120]
-            message = f"all but the last state is given up ({reason})"
-            self.diagnostics.warn("smoother_restarted", message)
-            self._solver = self._begun(window)
+            message = f"the graph is restarted from the last state ({reason})"
+            self._context.diagnostics.warn("smoother_restarted", message)
+            self._solver = self._begin(window)
             self._solver.update(ahead.factors, values, stamps)
 
-    def _begun(self, window: Window) -> NativeSolver:
-        """A smoother of nothing but the state of a window."""
+    def _begin(self, window: Window) -> SmootherSolver:
+        """A smoother that holds the state of a window only."""
         keys = imu_state_keys(window.frame)
         if not self._frames:
             self._origin_ns = window.stamp_ns
         self._frames = {window.frame: window.stamp_ns}
         prior = joint_prior(window.prior.marginal(keys), window.state.first)
-        solver: NativeSolver = SOLVERS[self.algorithm.engine](self._policy)
+        solver = SOLVERS[self._context.algorithm.engine](self._policy)
         values = _values_of(window.state, window.frame)
         solver.update([prior], values, dict.fromkeys(keys, self._seconds(window.stamp_ns)))
         return solver
@@ -177,7 +178,9 @@ class SmootherEstimator(Estimator):
             state = estimate.nav_state(ahead.frame, ahead.stamp_ns, covariance)
             window.prior = prior_of(state, ahead.frame)
         except (RuntimeError, np.linalg.LinAlgError):
-            self.diagnostics.warn("covariance_predicted", "the graph does not give a covariance")
+            self._context.diagnostics.warn(
+                "covariance_predicted", "the graph does not give a covariance"
+            )
             state = estimate.nav_state(ahead.frame, ahead.stamp_ns, predicted.covariance)
             window.prior = prior_of(state, ahead.frame)
         window.state = State()
@@ -186,7 +189,7 @@ class SmootherEstimator(Estimator):
         return state
 
     def _read(self, ahead: Window) -> None:
-        """Read from the smoother what the next steps need, and forget what has left."""
+        """Read the estimates that the next steps need, and forget what was marginalised."""
         assert self._solver is not None
         oldest_ns = ahead.stamp_ns - round(self._policy.lag_s * 1e9)
         self._frames[ahead.frame] = ahead.stamp_ns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A piece of a recording: its frames and keyframes, their observations, its IMU samples."""
+"""Segments of a recording: frames and keyframes, their observations, the IMU samples."""
 
 from __future__ import annotations
 
@@ -11,31 +11,40 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import ImuBuffer
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.smoothing.frame_log import FrameLog
 
-MAX_START_ERROR_PX = 30.0
-"""Features with a larger root mean square reprojection error do not begin, in units of σ."""
-RECENT_NS = 10_000_000_000
-"""How much of the IMU is looked through for standing still."""
+__all__ = [
+    "RecordingSegment",
+    "longest_tracks",
+    "read_segment",
+    "triangulated",
+    "views",
+    "with_gtsam_cameras",
+]
+
+_MAX_INITIAL_ERROR = 30.0
+"""Features with a larger root-mean-square reprojection error are left out, in units of σ."""
+_RECENT_NS = 10_000_000_000
+"""Length of the IMU buffer in which a standstill is detected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class RecordingSegment:
     """Consecutive frames, numbered from 0; the first and the last are keyframes.
 
     Attributes:
         stamps_ns: (N,) of all frames, on the clock of the IMU.
         keyframes: (K,) numbers of the frames that are keyframes.
-        noise: (N, 2) factors on the white noise of gyroscope and accelerometer; one while it moves.
+        noise: (N, 2) factors on the white noise of gyroscope and accelerometer.
         still: (N,) whether the platform stands still.
-        imu: all samples.
-        seen: all observations of all frames; frame f of it is frame f.
+        imu: all IMU samples.
+        seen: all observations; its frame indices are those of the frames.
     """
 
     stamps_ns: IntArray
@@ -51,7 +60,7 @@ class Piece:
         return self.stamps_ns[self.keyframes]
 
     def seen_by_keyframes(self) -> Observations:
-        """The observations of the keyframes; frame k of it is keyframe k."""
+        """The observations of the keyframes; frame indices are those of keyframes."""
         number = np.full(len(self.stamps_ns), -1)
         number[self.keyframes] = np.arange(len(self.keyframes))
         frame = number[self.seen.frame]
@@ -59,16 +68,16 @@ class Piece:
         return seen.rows(frame >= 0)
 
 
-def read_piece(
+def read_segment(
     log: FrameLog, keyframes: IntArray, rig: Rig, standstill: ZeroVelocityConfig
-) -> Piece:
+) -> RecordingSegment:
     """Read the frames from the first of some keyframes to the last.
 
     Args:
-        log: of a run.
-        keyframes: (K,) consecutive ones of its keyframes.
-        rig: may be calibrated better than it was during the run.
-        standstill: when the platform stands still.
+        log: the frames of a run.
+        keyframes: (K,) consecutive keyframes of it (frame numbers).
+        rig: the calibration, which may be better than that of the log.
+        standstill: settings of the standstill detector.
     """
     first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
     offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
@@ -83,7 +92,7 @@ def read_piece(
         recent.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
         still.append(detector.is_still(recent, stamps[-1], frame))
-        recent.forget_before(stamps[-1] - RECENT_NS)
+        recent.forget_before(stamps[-1] - _RECENT_NS)
         for c, seen in enumerate(frame.cameras):
             columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
             points.append(np.hstack([seen.pixels, seen.normalized]))
@@ -91,21 +100,21 @@ def read_piece(
     imu.add(ImuData.concatenate(samples))
     ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
     places = np.concatenate(points)
-    return Piece(
+    return RecordingSegment(
         np.array(stamps),
         keyframes - first,
-        _over_the_flight(log.noise[first:stop], np.array(still)),
+        _smoothed_noise(log.noise[first:stop], np.array(still)),
         np.array(still),
         imu,
         _table(ids, frames, cameras, _recalibrated(places, cameras, log, rig), len(stamps)),
     )
 
 
-def _over_the_flight(noise: FloatArray, still: BoolArray) -> FloatArray:
-    """Factors (N, 2) on the noise of the IMU without the delay with which they were learned.
+def _smoothed_noise(noise: FloatArray, still: BoolArray) -> FloatArray:
+    """Noise factors (N, 2) of the IMU without the delay of the causal estimate.
 
-    A causal estimate learns after some seconds that an airframe has begun to shake, and forgets it
-    at every calm moment. Here all of the motion is known: it is given the root mean square.
+    The causal estimate follows vibration with a delay of seconds, and forgets it at every calm
+    moment. In hindsight all frames in motion get the root mean square of their factors.
     """
     noise, moving = noise.copy(), ~still
     if moving.any():
@@ -113,17 +122,17 @@ def _over_the_flight(noise: FloatArray, still: BoolArray) -> FloatArray:
     return noise
 
 
-def with_native_cameras(rig: Rig) -> Rig:
-    """The rig with a pinhole in place of each camera that GTSAM has no model of.
+def with_gtsam_cameras(rig: Rig) -> Rig:
+    """The rig with a pinhole camera in place of each model that GTSAM does not have.
 
-    Its focal lengths are those of the camera near its axis.
+    Its focal lengths are those of the camera at its optical axis.
     """
-    return replace(rig, cameras=tuple(_native(mounted) for mounted in rig.cameras))
+    return replace(rig, cameras=tuple(_gtsam_camera(mounted) for mounted in rig.cameras))
 
 
-def _native(mounted: RigCamera) -> RigCamera:
+def _gtsam_camera(mounted: RigCamera) -> RigCamera:
     camera = mounted.camera
-    if camera.distortion != "double_sphere":
+    if camera.gtsam_calibration() is not None:
         return mounted
     middle, slope = (values[0] for values in camera.distort(np.zeros((1, 2))))
     fx, fy, cx, cy = slope[0, 0], slope[1, 1], middle[0], middle[1]
@@ -132,22 +141,22 @@ def _native(mounted: RigCamera) -> RigCamera:
 
 
 def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig) -> FloatArray:
-    """Pixels of native cameras, and normalised coordinates by the calibration of a rig (N, 4)."""
-    for c, (mounted, native) in enumerate(
-        zip(rig.cameras, with_native_cameras(rig).cameras, strict=True)
+    """(N, 4) pixels of cameras that GTSAM has, and normalised coordinates, by a new calibration."""
+    for c, (mounted, supported) in enumerate(
+        zip(rig.cameras, with_gtsam_cameras(rig).cameras, strict=True)
     ):
         rows = cameras == c
         if rig is not log.rig:
             points[rows, 2:] = mounted.camera.undistort(points[rows, :2])
-        if native is not mounted:
-            points[rows, :2] = native.camera.distort(points[rows, 2:])[0]
+        if supported is not mounted:
+            points[rows, :2] = supported.camera.distort(points[rows, 2:])[0]
     return points
 
 
 def _table(
     ids: IntArray, frames: IntArray, cameras: IntArray, points: FloatArray, count: int
 ) -> Observations:
-    """The observations in `count` frames that are finite, by feature, then frame, then camera."""
+    """The finite observations in `count` frames, sorted by feature, frame and camera."""
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     order = finite[np.lexsort((cameras[finite], frames[finite], ids[finite]))]
     features, feature = np.unique(ids[order], return_inverse=True)
@@ -164,32 +173,32 @@ def _table(
 
 
 def views(seen: Observations) -> tuple[IntArray, IntArray]:
-    """Which feature (V,) was seen in which frame (V,) by any camera, sorted by feature."""
+    """Feature (V,) and frame (V,) of each view: a feature in a frame, by any camera; sorted."""
     new = np.ones(len(seen), np.bool_)
     new[1:] = (np.diff(seen.feature) != 0) | (np.diff(seen.frame) != 0)
     return seen.feature[new], seen.frame[new]
 
 
 def longest_tracks(seen: Observations, per_keyframe: int, least: int) -> BoolArray:
-    """Which features (J,) to use: the longest, until every keyframe has enough.
+    """(J,) which features to use: those of the longest tracks, until every keyframe has enough.
 
     Args:
         seen: all observations.
-        per_keyframe: how many features each keyframe is given, if it has as many.
-        least: how many keyframes a feature must be seen in.
+        per_keyframe: features that each keyframe gets, if it has as many.
+        least: keyframes in which a feature must be seen.
     """
     feature, frame = views(seen)
     lengths = np.bincount(feature, minlength=len(seen.ids))
     starts = np.cumsum(lengths) - lengths
-    given = np.zeros(len(seen.frames), np.int64)
+    counts = np.zeros(len(seen.frames), np.int64)
     chosen = np.zeros(len(seen.ids), np.bool_)
     for j in np.argsort(-lengths, kind="stable"):
         if lengths[j] < least:
             break
         frames = frame[starts[j] : starts[j] + lengths[j]]
-        if given[frames].min() < per_keyframe:
+        if counts[frames].min() < per_keyframe:
             chosen[j] = True
-            given[frames] += 1
+            counts[frames] += 1
     return chosen
 
 
@@ -199,7 +208,7 @@ def triangulated(
     projection: RigProjection,
     backend: BackendConfig,
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (J, 3) of features, and which of them (J,) are usable.
+    """Triangulated points (J, 3) of features, and which of them (J,) are usable.
 
     Args:
         obs: at least two observations of every feature.
@@ -208,5 +217,5 @@ def triangulated(
         backend: noise and thresholds.
     """
     found = triangulate(obs, projection, *poses, backend.triangulation)
-    limit_px = MAX_START_ERROR_PX * backend.noise.pixel_sigma
+    limit_px = _MAX_INITIAL_ERROR * backend.noise.pixel_sigma
     return found.points, found.good & (found.reprojection_px < limit_px)

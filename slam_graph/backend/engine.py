@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The engine: one loop of cost construction, Gauss-Newton steps and marginalization.
+
+Every recursive algorithm is this loop under its own policies (`policies.py`). See docs/engine.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.engine_protocol import EngineContext, StepReport
+from slam_graph.backend.marginalization.marginalize import marginalize_step
+from slam_graph.backend.solve.gauss_newton import Minimum, minimize
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.window import Window
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import FeatureFrame
+
+__all__ = ["SquareRootEngine"]
+
+
+class SquareRootEngine:
+    """The three modules under the policies of one algorithm; see `Engine` for the methods."""
+
+    def __init__(self, context: EngineContext) -> None:
+        self._context = context
+        self._policies = context.algorithm
+        self._construction = CostConstruction(
+            context.algorithm.cost, context.projection, context.config, context.diagnostics
+        )
+        self._posterior: SquareRootInformation | None = None
+
+    def step(
+        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+    ) -> NavState:
+        """One turn of the loop: the three modules, in order."""
+        context = self._context
+        with report.timed("propagation"):
+            context.propagation.append_frame(window, context.imu, stamp_ns, still)
+            context.add_observations(window, frame)
+        with report.timed("cost"):
+            if not still:
+                window.recall_features()
+            constructed = self._construction.construct(window, still)
+        with report.timed("gauss_newton"):
+            constructed, minimum = self._minimize(window, constructed)
+            self._construction.reject_residuals(window, constructed)
+            self._describe(window, constructed, minimum, report)
+        with report.timed("marginalization"):
+            marginalize_step(window, constructed, minimum, self._policies)
+        self._posterior = minimum.posterior
+        state = window.current(minimum.posterior)
+        context.propagation.learn(state)
+        return state
+
+    def _minimize(
+        self, window: Window, constructed: ConstructedCost
+    ) -> tuple[ConstructedCost, Minimum]:
+        """Take the steps; without the features if these leave something undetermined."""
+        policy, calibration = self._policies.gauss_newton, self._context.calibration
+        again = calibration.moved_far if calibration.keys else None
+        try:
+            return constructed, minimize(constructed.cost, policy, constructed.linear, again)
+        except np.linalg.LinAlgError:
+            warning = "the features of one frame are not used, and go on waiting"
+            self._context.diagnostics.warn("features_degenerate", warning)
+            constructed = constructed.without_features(window)
+            return constructed, minimize(constructed.cost, policy)
+
+    def _describe(
+        self, window: Window, constructed: ConstructedCost, minimum: Minimum, report: StepReport
+    ) -> None:
+        report.costs = minimum.costs
+        report.columns = minimum.posterior.layout.size + window.archive.size
+        report.innovations = constructed.innovations_under(minimum.posterior)
+        report.rejected = self._construction.rejected
+
+    def information(self, window: Window) -> SquareRootInformation:
+        """The posterior of the last step, or what the start left behind."""
+        return self._posterior or window.prior
+
+    def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
+        return window.points()

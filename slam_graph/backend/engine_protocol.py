@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What an engine is: it turns the measurements of one frame into a state.
+
+`Estimator` does what all algorithms have in common: it takes the input, checks it, detects
+standstill and finds the first state. Its engine does the rest, frame by frame. There are two: this
+package's own (`engine.py`) and GTSAM's smoothers (`gtsam_smoothers/`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.gating import Innovations
+from slam_graph.backend.cost.imu_factor import Propagation
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.online_calibration import CalibrationVariables
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.window import Window
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import ImuBuffer
+from slam_graph.sensors.measurements import FeatureFrame
+from slam_graph.sensors.rig import Rig
+
+__all__ = ["Engine", "EngineContext", "StepReport"]
+
+
+@dataclass(eq=False)
+class StepReport:
+    """What is known of one step besides the state.
+
+    Attributes:
+        timings: seconds that each module took.
+        costs: the cost before the first Gauss-Newton step and after each; empty if not known.
+        columns: dimension of the state, with the features that are put aside; 0 without costs.
+        innovations: how far the measurements were from what was predicted.
+        rejected: ids (N,) of the features that the gate rejected, ascending.
+    """
+
+    timings: dict[str, float] = field(default_factory=dict)
+    costs: tuple[float, ...] = ()
+    columns: int = 0
+    innovations: Innovations = field(default_factory=Innovations)
+    rejected: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @contextmanager
+    def timed(self, module: str) -> Iterator[None]:
+        """Measure how long the block takes."""
+        start = time.perf_counter()
+        yield
+        self.timings[module] = time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class EngineContext:
+    """What an engine works with; the estimator shares it with its own start and input.
+
+    Attributes:
+        rig: the sensors as they were calibrated.
+        algorithm: the policies.
+        config: settings that do not depend on the algorithm.
+        diagnostics: counts warnings.
+        calibration: which parameters of the rig are variables.
+        projection: into the cameras of the rig.
+        propagation: predicts a new frame's state by the IMU.
+        imu: the recent samples.
+    """
+
+    rig: Rig
+    algorithm: AlgorithmConfig
+    config: BackendConfig
+    diagnostics: Diagnostics
+    calibration: CalibrationVariables
+    projection: RigProjection
+    propagation: Propagation
+    imu: ImuBuffer = field(default_factory=ImuBuffer)
+
+    def add_observations(self, window: Window, frame: FeatureFrame) -> None:
+        """Add the observations of the window's current frame to its tracks."""
+        window.tracks.add(window.frame, frame)
+        self.calibration.note_motion(
+            window.state, window.frame, window.stamp_ns, frame.stamp_ns, self.imu
+        )
+
+
+class Engine(Protocol):
+    """Estimates a state for each frame, once there is a first one."""
+
+    def step(
+        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+    ) -> NavState:
+        """Take the measurements of one frame.
+
+        Args:
+            window: the variables; the step changes it.
+            stamp_ns: time of the frame on the clock of the IMU, after that of the window.
+            frame: the observations, all cameras of the rig, finite.
+            still: whether the platform has not moved.
+            report: gets what is known of this step.
+
+        Returns:
+            The state of the frame with its covariance.
+        """
+        ...
+
+    def information(self, window: Window) -> SquareRootInformation:
+        """What the last step knew of the variables, the calibration among them."""
+        ...
+
+    def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
+        ...

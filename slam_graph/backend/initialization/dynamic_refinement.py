@@ -1,0 +1,267 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Refinement of a start in motion: a batch problem over its frames, under the engine's own cost.
+
+All states of the window and all features they see are estimated together by Levenberg-Marquardt,
+once more after outliers are removed; all but the last state is then marginalised. The result is
+refused if it does not fit, or does not determine velocity and scale well enough.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.backend_config import PriorConfig
+from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.feature_factors import ReducedFeatures
+from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
+from slam_graph.backend.cost.imu_factor import imu_factor
+from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.cost.triangulation import Triangulation, triangulate
+from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.dynamic_start import (
+    MIN_FEATURES,
+    OUTLIER_SIGMAS,
+    StartFrames,
+    StartGuess,
+)
+from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance
+from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
+from slam_graph.backend.policies import GaussNewtonPolicy
+from slam_graph.backend.solve.gauss_newton import minimize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
+from slam_graph.backend.window import Window
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.imu_buffer import preintegrate
+
+__all__ = ["DynamicRefinement"]
+
+BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
+"""How the batch problem is solved."""
+FINAL = GaussNewtonPolicy(max_steps=1)
+"""The last step, whose linear system becomes the prior."""
+MAX_FEATURES = 150
+"""How many features the batch problem has at most, those with the longest tracks."""
+MOTION_PRIOR = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
+"""Uncertainty of the first state of the guess."""
+MIN_INLIERS = 0.5
+"""Smallest share of the features that must fit the motion."""
+MAX_NORMALIZED_COST = 3.0
+"""Largest accepted mean squared residual, in σ²."""
+MAX_VELOCITY_SIGMA = 0.1
+"""Largest accepted standard deviation of the velocity, m/s."""
+MAX_SCALE_SIGMA = 0.15
+"""Largest accepted standard deviation of the scale, relative to it."""
+MAX_COST_CHANGE = 0.1
+"""Largest accepted relative change of the cost by the last step: beyond it, the steps have not
+converged."""
+BEST_FEATURES = 0.1
+"""Quantile of the features' relative distance errors that is taken for the error of the scale."""
+
+
+class DynamicRefinement:
+    """The batch problem of a start in motion.
+
+    Attributes:
+        outliers: ids (N,) of the features that did not fit the last solution, ascending.
+    """
+
+    def __init__(self, context: EngineContext, params: gtsam.PreintegrationCombinedParams) -> None:
+        """Prepare for attempts.
+
+        Args:
+            context: shared with the engine.
+            params: noise of the IMU.
+        """
+        self.outliers = np.zeros(0, np.int64)
+        self._context = context
+        self._params = params
+
+    def refine(self, frames: StartFrames, guess: StartGuess) -> Window | str:
+        """The window that begins with the last frame, or what is missing for it.
+
+        Args:
+            frames: what they observed.
+            guess: their states, and which features are static.
+        """
+        cost = self._batch_cost(frames, guess)
+        try:
+            minimize(cost, BATCH)
+            if not self._remove_outliers(cost, frames):
+                return "features that fit the motion"
+            minimize(cost, BATCH)
+            features = self._keep_features(cost, frames)
+            final = minimize(cost, FINAL)
+            before, after = final.costs
+            normalized_cost = _normalized_cost(cost)
+            scale_sigma = _scale_sigma(cost, final.posterior)
+        except np.linalg.LinAlgError:
+            return "motion that determines gravity and scale"
+        if not abs(after - before) < MAX_COST_CHANGE * max(before, 1.0):
+            return "steps that converge"
+        last, calibration = len(frames.frames) - 1, self._context.calibration.keys
+        keep = [L(j) for j in features.tolist()]
+        keep += [*calibration, *imu_state_keys(last)]
+        points: LinearizationPoints = "current"
+        if self._context.algorithm.marginalization.first_estimates:
+            points = "first"
+        prior = marginalize(final.posterior, cost.state, keep, points)
+        start = Window(
+            last,
+            frames.stamps_ns[-1],
+            cost.state,
+            prior,
+            features=features,
+            calibration=calibration,
+        )
+        covariance = prior.covariance_of(imu_state_keys(last))
+        return _doubt(normalized_cost, scale_sigma, covariance) or start
+
+    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> Cost:
+        """All states of the window, a prior on the first, and the static features they see."""
+        context = self._context
+        state = State()
+        factors: list[gtsam.NonlinearFactor] = []
+        for k, nav in enumerate(guess.states):
+            state.insert_imu_state(k, nav)
+        start = guess.states[0]
+        bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
+        for k, samples in enumerate(frames.imu_between(context.imu)):
+            factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
+        first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
+        first = fix_gauge(first, MOTION_PRIOR)
+        factors += _prior_factors(first)
+        known = context.calibration.enter(state, SquareRootInformation.empty())
+        for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
+            context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
+        loss = RobustLoss(context.config.gating.robust_loss)
+        cost = Cost(state, context.projection, context.config, known, factors, loss=loss)
+        obs = _lasting(frames)
+        result = self._triangulated(cost, obs)
+        _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
+        return cost
+
+    def _triangulated(self, cost: Cost, obs: Observations) -> Triangulation:
+        """Features from the current estimates of the poses."""
+        rig = cost.rig.at(cost.state)
+        poses = rig.poses(cost.state.estimate, obs.frames)
+        return triangulate(rig.renormalized(obs), rig, *poses, self._context.config.triangulation)
+
+    def _remove_outliers(self, cost: Cost, frames: StartFrames) -> bool:
+        """Triangulate all features again and keep those that fit; whether these are enough.
+
+        Features that the guess took for dynamic count too: a motion that only few features support
+        is wrong.
+        """
+        obs = _lasting(frames)
+        result = self._triangulated(cost, obs)
+        fits = result.reprojection_px < OUTLIER_SIGMAS * self._context.config.noise.pixel_sigma
+        good = result.good & fits
+        self.outliers = obs.ids[~fits]
+        _set_features(cost, obs, result, good)
+        return bool(np.sum(good) >= max(MIN_FEATURES, MIN_INLIERS * len(good)))
+
+    def _keep_features(self, cost: Cost, frames: StartFrames) -> IntArray:
+        """Make variables of the features that the last frame still sees."""
+        assert cost.fresh is not None
+        fresh, room = cost.fresh, self._context.algorithm.cost.max_state_features
+        seen = sorted_unique(np.sort(np.concatenate([c.ids for c in frames.frames[-1].cameras])))
+        live = is_in(fresh.obs.ids, seen)
+        order = np.argsort(-np.where(live, fresh.obs.counts, 0), kind="stable")[:room]
+        chosen = np.zeros(len(live), np.bool_)
+        chosen[order] = True
+        chosen &= live
+        for j in np.flatnonzero(chosen):
+            cost.state.insert_point(int(fresh.obs.ids[j]), fresh.points[j])
+        cost.fresh = replace(fresh, in_state=chosen)
+        return fresh.obs.ids[chosen]
+
+
+def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: BoolArray) -> None:
+    """Put the good features (J,) into the cost; if they are too many, those with long tracks."""
+    length = np.where(good, obs.counts, 0)
+    order = np.argsort(-length, kind="stable")[:MAX_FEATURES]
+    chosen = np.zeros(len(good), np.bool_)
+    chosen[order] = good[order]
+    nothing = np.zeros(len(good), np.bool_)
+    cost.fresh = NewFeatures(obs, result.points, nothing).subset(chosen)
+
+
+def _doubt(normalized_cost: float, scale_sigma: float, covariance: FloatArray) -> str | None:
+    """What is missing if the solution cannot be trusted; None if it can.
+
+    Args:
+        normalized_cost: mean squared residual, σ².
+        scale_sigma: relative standard deviation of the scale.
+        covariance: (15, 15) of the last state.
+    """
+    velocity_sigma = float(np.sqrt(np.max(np.diag(covariance)[6:9])))
+    if normalized_cost > MAX_NORMALIZED_COST:
+        return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
+    if velocity_sigma > MAX_VELOCITY_SIGMA:
+        return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+    if scale_sigma > MAX_SCALE_SIGMA:
+        return f"more motion (scale is known to {scale_sigma:.0%} only)"
+    return None
+
+
+def _prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:
+    """The prior on frame 0 as factors, so that it is linearised at every step."""
+    assert first.covariance is not None
+    x, v, b = imu_state_keys(0)
+    noise = [
+        gtsam.noiseModel.Gaussian.Covariance(first.covariance[block, block])
+        for block in (slice(0, 6), slice(6, 9), slice(9, 15))
+    ]
+    bias = gtsam.imuBias.ConstantBias(first.accel_bias, first.gyro_bias)
+    return [
+        gtsam.PriorFactorPose3(x, first.world_T_body, noise[0]),
+        gtsam.PriorFactorVector(v, first.velocity, noise[1]),
+        gtsam.PriorFactorConstantBias(b, bias, noise[2]),
+    ]
+
+
+def _lasting(frames: StartFrames) -> Observations:
+    """Observations of the features that at least three frames see."""
+    tracks = frames.tracks()
+    ids, lengths = tracks.lengths()
+    return tracks.observations(ids[lengths >= 3])
+
+
+def _normalized_cost(cost: Cost) -> float:
+    """Mean squared residual of the features after their positions are eliminated, σ²."""
+    fresh = cost.linearize().fresh
+    if not isinstance(fresh, ReducedFeatures):
+        return float("inf")
+    return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
+
+
+def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
+    """Relative standard deviation of the scale: that of the best determined distances.
+
+    A distance to a feature is scale times shape, so no distance has a smaller relative error than
+    the scale. Absolute errors are no measure: if the scale is estimated too small, so are they.
+    """
+    fresh, features = cost.linearize().fresh, cost.fresh
+    if not isinstance(fresh, ReducedFeatures) or features is None or not len(features.points):
+        return float("inf")
+    keys = cost.rig.keys_of(features.obs)
+    last = X(features.obs.frames[-1])
+    pose = cost.state.estimate.atPose3(last)
+    away = features.points - pose.translation()
+    distances = np.linalg.norm(away, axis=1)
+    toward = away / distances[:, None]
+    # δf = R_f⁻¹ (r₁ - T δx), and the body moves by R δp
+    by_r_1 = np.linalg.solve(fresh.R_f.transpose(0, 2, 1), toward[:, :, None])[:, :, 0]
+    by_state = -np.einsum("ji,jin->jn", by_r_1, fresh.T)
+    position = Layout(dims_of(keys)).columns[last].start + np.arange(3, 6)
+    by_state[:, position] -= toward @ pose.rotation().matrix()
+    variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)
+    variances += np.sum(by_r_1**2, axis=1)
+    return float(np.quantile(np.sqrt(variances) / distances, BEST_FEATURES))

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Camera models of a pinhole: no distortion, radial-tangential, and equidistant (fisheye)."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import cv2
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.sensors.camera_model import CameraModel, Coefficients, register_camera_model
+
+__all__ = ["RadialTangential"]
+
+_OPENCV_ITERATIONS = 20
+_OPENCV_EPSILON = 1e-9
+_STEPS_FROM_OPENCV = 3
+"""OpenCV's solution is accurate to some 1e-5; Newton's method doubles the digits in a step."""
+
+
+@register_camera_model
+class Pinhole(CameraModel):
+    """No distortion: q = m."""
+
+    name = "none"
+    coefficient_names = ()
+
+    def distort(self, m: FloatArray, coefficients: Coefficients) -> tuple[FloatArray, FloatArray]:
+        """The points themselves, and identities."""
+        return m, np.broadcast_to(np.eye(2), (len(m), 2, 2))
+
+    def by_coefficients(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """Empty derivatives (N, 2, 0)."""
+        return np.zeros((len(m), 2, 0))
+
+    def undistort(
+        self, q: FloatArray, coefficients: Coefficients, near: FloatArray | None = None
+    ) -> FloatArray:
+        """The points themselves."""
+        return q
+
+    def gtsam_calibration(self, intrinsics: FloatArray, coefficients: Coefficients) -> Any:
+        """A `gtsam.Cal3_S2`."""
+        fx, fy, cx, cy = intrinsics
+        return gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
+
+
+class _SolvedByOpenCv(CameraModel):
+    """A model that OpenCV inverts roughly; Newton's method does the rest."""
+
+    def undistort(
+        self, q: FloatArray, coefficients: Coefficients, near: FloatArray | None = None
+    ) -> FloatArray:
+        """Newton's method from a guess, or from OpenCV's solution."""
+        if near is None:
+            start = self._opencv(np.ascontiguousarray(q[:, None, :]), np.array(coefficients))
+            near = np.asarray(start, dtype=np.float64)[:, 0, :]
+        return self._newton(q, coefficients, near, _STEPS_FROM_OPENCV)
+
+    @abstractmethod
+    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
+        """OpenCV's solution (N, 1, 2) for points (N, 1, 2)."""
+
+
+_CRITERIA = (
+    cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
+    _OPENCV_ITERATIONS,
+    _OPENCV_EPSILON,
+)
+
+
+@register_camera_model
+class RadialTangential(_SolvedByOpenCv):
+    """Brown's model, as OpenCV has it with four coefficients.
+
+    Brown, "Decentering Distortion of Lenses", Photogrammetric Engineering 1966.
+    """
+
+    name = "radtan"
+    coefficient_names = ("k1", "k2", "p1", "p2")
+    distortion_names = ("radtan", "radial-tangential")
+    ros_names = ("plumb_bob", "rational_polynomial")
+
+    def distort(self, m: FloatArray, coefficients: Coefficients) -> tuple[FloatArray, FloatArray]:
+        """Points q (N, 2) of normalised points m (N, 2), and the derivatives dq/dm (N, 2, 2)."""
+        k1, k2, p1, p2 = coefficients
+        x, y = m[:, 0], m[:, 1]
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + k2 * r2)
+        slope = 2.0 * k1 + 4.0 * k2 * r2  # d radial / d x = slope * x
+        q = np.empty_like(m)
+        q[:, 0] = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
+        q[:, 1] = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
+        jacobian = np.empty((len(m), 2, 2))
+        jacobian[:, 0, 0] = radial + slope * xx + 2.0 * p1 * y + 6.0 * p2 * x
+        jacobian[:, 0, 1] = slope * xy + 2.0 * p1 * x + 2.0 * p2 * y
+        jacobian[:, 1, 0] = jacobian[:, 0, 1]
+        jacobian[:, 1, 1] = radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x
+        return q, jacobian
+
+    def by_coefficients(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """Derivatives (N, 2, 4) of q by k1, k2, p1, p2."""
+        x, y = m[:, 0], m[:, 1]
+        r2, xy = x * x + y * y, 2.0 * x * y
+        columns_x = [x * r2, x * r2 * r2, xy, r2 + 2.0 * x * x]
+        columns_y = [y * r2, y * r2 * r2, r2 + 2.0 * y * y, xy]
+        return np.stack([np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)], axis=1)
+
+    def gtsam_calibration(self, intrinsics: FloatArray, coefficients: Coefficients) -> Any:
+        """A `gtsam.Cal3DS2`."""
+        fx, fy, cx, cy = intrinsics
+        return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, *coefficients)
+
+    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
+        eye = np.eye(3)
+        return cv2.undistortPointsIter(q, eye, coefficients, eye, eye, _CRITERIA)
+
+
+@register_camera_model
+class Equidistant(_SolvedByOpenCv):
+    """Kannala and Brandt's model of a fisheye lens, as OpenCV has it.
+
+    A ray at the angle θ to the axis meets the image plane at the radius
+    θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸). Kannala and Brandt, "A Generic Camera Model and
+    Calibration Method for Conventional, Wide-Angle, and Fish-Eye Lenses", PAMI 2006.
+    """
+
+    name = "equidistant"
+    coefficient_names = ("k1", "k2", "k3", "k4")
+    sees_sideways = True
+    ros_names = ("equidistant", "fisheye")
+
+    def distort(self, m: FloatArray, coefficients: Coefficients) -> tuple[FloatArray, FloatArray]:
+        """Points q (N, 2) of normalised points m (N, 2), and the derivatives dq/dm (N, 2, 2)."""
+        k1, k2, k3, k4 = coefficients
+        r = np.hypot(m[:, 0], m[:, 1])
+        safe = np.maximum(r, 1e-9)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        theta_d_slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        scale = np.where(r > 1e-9, theta_d / safe, 1.0)
+        # d(scale)/dr / r, with d(theta_d)/dr = slope / (1 + r²); zero at the centre
+        radial = np.where(r > 1e-6, (theta_d_slope / (1.0 + r * r) - scale) / (safe * safe), 0.0)
+        jacobian = scale[:, None, None] * np.eye(2) + radial[:, None, None] * (
+            m[:, :, None] * m[:, None, :]
+        )
+        return m * scale[:, None], jacobian
+
+    def by_coefficients(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """Derivatives (N, 2, 4) of q by k1 to k4."""
+        r = np.hypot(m[:, 0], m[:, 1])
+        powers = np.arctan(r)[:, None] ** np.array([3, 5, 7, 9]) / np.maximum(r, 1e-9)[:, None]
+        by_coefficients: FloatArray = m[:, :, None] * powers[:, None, :]
+        return by_coefficients
+
+    def gtsam_calibration(self, intrinsics: FloatArray, coefficients: Coefficients) -> Any:
+        """A `gtsam.Cal3Fisheye`."""
+        fx, fy, cx, cy = intrinsics
+        return gtsam.Cal3Fisheye(fx, fy, 0.0, cx, cy, *coefficients)
+
+    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
+        return cv2.fisheye.undistortPoints(q, np.eye(3), coefficients, criteria=_CRITERIA)

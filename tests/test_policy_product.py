@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The law of the table: under no combination of policies does a measurement count twice.
+
+Without any error, all linearisation points are true, and so the problem is linear. There the
+posterior of every combination that is accepted holds no more information than the batch solution
+of all measurements so far, and as much where nothing is thrown away. The combinations are generated
+from the policies' own types and registries; two policies that are registered here are among them.
+"""
+
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from flight import rig, room
+from gtsam.symbol_shorthand import B, V, X
+from linear_flight import CONFIG, batch_problem, exact_recording
+from pydantic import ValidationError
+from scipy.linalg import eigvalsh, solve_triangular
+
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.backend_config import BackendConfig, TriangulationConfig
+from slam_graph.backend.cost.feature_policies import (
+    FEATURE_POLICIES,
+    FeaturePolicy,
+    WaitingTracks,
+)
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
+from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.policies import AlgorithmConfig, CostPolicy
+from slam_graph.backend.solve.state import dims_of
+from slam_graph.backend.window import Window
+from slam_graph.sensors.rig import Rig
+
+FRAMES, POINTS = 8, 25
+CHECKED_FRAMES = (4, 7)
+TOLERANCE = 1e-5
+"""Relative error of variances that rounding leaves."""
+FEW, MANY = 3, 1000
+TRIANGULATION = TriangulationConfig(min_parallax_rad=0.0, max_depth_m=1e6)
+LOOSE = BackendConfig(
+    gating=CONFIG.gating, initialization=CONFIG.initialization, triangulation=TRIANGULATION
+)
+
+
+@POSE_SELECTIONS.register("test_without_second_newest")
+def without_second_newest(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
+    """Drops a pose out of the middle; what it saw is used."""
+    past = window.past
+    return PoseSelection(past if len(past) <= policy.max_past_poses else [*past[:-2], past[-1]])
+
+
+def _seen_thrice(tracks: WaitingTracks) -> BoolArray:
+    return (tracks.lengths >= 3) | tracks.leaving
+
+
+FEATURE_POLICIES.register("test_seen_thrice")(FeaturePolicy(_seen_thrice))
+
+CHOICES: dict[str, list[Any]] = {
+    "max_past_poses": [FEW, MANY],
+    "recent_frames": [1, 3],
+    "max_state_features": [0, 5, None],
+    "keep_lost_features": [False, True],
+    "max_features_per_step": [4, MANY],
+}
+STEPS: list[dict[str, Any]] = [
+    {"max_steps": 1},
+    {"max_steps": 3},
+    {"max_steps": 3, "damping": "levenberg_marquardt"},
+]
+
+
+def combinations(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
+    """All algorithms that are accepted with a selection of poses and a feature policy."""
+    for values in itertools.product(*CHOICES.values()):
+        cost = dict(zip(CHOICES, values, strict=True))
+        cost |= {"past_poses": past_poses, "features": features}
+        if cost["max_state_features"] != 0:
+            cost["state_feature_frames"] = 3
+        steps_and_points = itertools.product(STEPS, (True, False))
+        if "test" in past_poses + features:  # for policies from outside, one kind of step
+            steps_and_points = itertools.product(STEPS[:1], (True,))
+        for steps, first in steps_and_points:
+            table = {
+                "name": "product",
+                "cost": cost,
+                "gauss_newton": steps,
+                "marginalization": {"first_estimates": first},
+            }
+            with contextlib.suppress(ValidationError):
+                yield AlgorithmConfig.model_validate(table)
+
+
+def throws_nothing_away(algorithm: AlgorithmConfig) -> bool:
+    """Whether every measurement is used in the end."""
+    cost = algorithm.cost
+    return (
+        cost.max_past_poses == MANY
+        and cost.max_features_per_step == MANY
+        and cost.features in ("once", "every_step")
+        and cost.past_poses != "keyframes"
+    )
+
+
+class Batch:
+    """What all measurements up to a frame say, linearised by GTSAM at the truth."""
+
+    def __init__(self, mounted: Rig) -> None:
+        self._points = room(POINTS, np.random.default_rng(3))
+        self._states, self.flown = exact_recording(mounted, FRAMES, self._points)
+        self.start = self._states[0]
+        self._roots = {i: self._root(mounted, i) for i in CHECKED_FRAMES}
+
+    def _root(self, mounted: Rig, frame: int) -> tuple[list[slice], list[int], FloatArray]:
+        flown = self.flown[: frame + 1]
+        graph, values = batch_problem(self.start, flown, mounted, self._points, self._states)
+        keys = list(values.keys())
+        ordering = gtsam.Ordering()
+        for key in keys:
+            ordering.push_back(key)
+        A, _ = graph.linearize(values).jacobian(ordering)
+        ends = np.cumsum([0, *dims_of(keys).values()]).tolist()
+        R = np.linalg.qr(A, mode="r")
+        inverse = solve_triangular(R, np.eye(len(R)))
+        return [slice(a, b) for a, b in itertools.pairwise(ends)], keys, inverse
+
+    def covariance(self, frame: int, keys: list[int]) -> FloatArray:
+        """(n, n) over some variables."""
+        slices, known, inverse = self._roots[frame]
+        rows = np.concatenate([inverse[slices[known.index(key)]] for key in keys])
+        return rows @ rows.T
+
+
+@pytest.fixture(scope="module")
+def batches() -> list[tuple[Rig, Batch]]:
+    """With one camera and with two."""
+    return [(mounted, Batch(mounted)) for mounted in (rig(1), rig(2))]
+
+
+def check_ledger(tracks: FeatureTracks) -> None:
+    """Every observation that came waits, or has exactly one outcome."""
+    assert tracks.added == len(tracks) + sum(tracks.outcomes.values())
+
+
+@pytest.mark.parametrize("features", list(FEATURE_POLICIES))
+@pytest.mark.parametrize("past_poses", list(POSE_SELECTIONS))
+def test_no_measurement_counts_twice(
+    past_poses: str, features: str, batches: list[tuple[Rig, Batch]]
+) -> None:
+    faults: list[str] = []
+    seen: Counter[str] = Counter()
+    for number, algorithm in enumerate(combinations(past_poses, features)):
+        mounted, truth = batches[number % 2]
+        estimator = Estimator(mounted, algorithm, LOOSE)
+        estimator.start(truth.start)
+        for i, packet in enumerate(truth.flown):
+            estimator.add_imu(packet.imu)
+            state = estimator.add_frame(packet.frame)
+            window = estimator.window
+            assert state is not None
+            assert window is not None
+            check_ledger(window.tracks)
+            if i not in CHECKED_FRAMES:
+                continue
+            keys = [X(k) for k in window.past] + [X(i), V(i), B(i)]
+            # variances over those of the batch, in any direction
+            ratios = eigvalsh(estimator.covariance_of(keys), truth.covariance(i, keys))
+            seen["checked"] += 1
+            if ratios[0] < 1.0 - TOLERANCE:
+                faults.append(f"frame {i}: variance x {ratios[0]:.6f} under {algorithm}")
+            complete = i == CHECKED_FRAMES[-1] and throws_nothing_away(algorithm)
+            if complete:
+                seen["complete"] += 1
+                if ratios[-1] > 1.0 + TOLERANCE:
+                    faults.append(f"frame {i}: variance x {ratios[-1]:.6f} under {algorithm}")
+    assert seen["checked"] > 0
+    assert not faults, "\n".join(faults[:5]) + f"\n{len(faults)} of {seen['checked']}"
