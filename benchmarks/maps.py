@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.metric import Metric, info
+from benchmarks.metric import EXACT, QUANTISED_TOLERANCE, Metric, info
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -90,7 +90,7 @@ def located(seeds: range, cameras: int, images: bool, judged: bool, folder: Path
         first.append(float(log.stamps_ns[log.located][0] - result.input.start_ns) * 1e-9)
     bar = SHARE_BAR if judged else None
     outcome.metrics += [
-        Metric("least_share", min(shares), "", "higher", bar),
+        Metric("least_share", min(shares), "", "higher", bar, QUANTISED_TOLERANCE),
         info("mean_share", float(np.mean(shares)), ""),
     ]
     if errors:
@@ -148,7 +148,7 @@ def merged(folder: Path) -> Outcome:
     outcome.metrics += [
         Metric("rmse_m", rms(after), "m", "lower", MERGED_BAR_M),
         info("apart_rmse_m", rms(before), "m"),
-        Metric("strangers_refused", refused / (len(halves) - 1), "", "higher", 1.0),
+        Metric("strangers_refused", refused / (len(halves) - 1), "", "higher", 1.0, EXACT),
     ]
     return outcome
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -16,12 +17,23 @@ DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
 Bar = float | tuple[float, float]
 
 TOLERANCE = 0.15
-"""By what share an accuracy may be worse than the baseline: seeded runs repeat exactly on one
+"""By what share an error may be worse than the baseline: seeded runs repeat exactly on one
 machine, but other versions of NumPy or OpenCV round otherwise, and the choices that an estimator
 makes amplify that."""
 
+EXACT = 0.0
+"""For what is counted or answered by yes and no."""
+
+QUANTISED_TOLERANCE = 0.05
+"""For times and shares of a recording, which change by whole frames."""
+
 TIMING_TOLERANCE = 0.30
-"""The same for ratios of times, which scatter with the load and the caches of a machine."""
+"""For ratios of times of one run, which scatter with the caches of a machine. Load makes it worse
+(a front end of 2.7 flows once came out at 4.3), so no quick benchmark judges a time."""
+
+COMPUTING_TIMES = ("ms", "ms CPU", "ms = 1 LK", "s CPU", "s wall", "× real time")
+"""Units of what a machine takes for something: another machine takes another time, so a figure in
+them is shown and never judged. A ratio of two times of one run may be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +48,8 @@ class Metric:
         bar: what must be reached: a limit (itself still good enough), the two ends of a band, or
             None.
         tolerance: by what share `value` may be worse than its baseline; None where an earlier value
-            says nothing, because it depends on the machine.
+            says nothing.
+        held_out: whether it was measured on what no parameter was chosen on.
     """
 
     key: str
@@ -45,6 +58,7 @@ class Metric:
     direction: Direction
     bar: Bar | None = None
     tolerance: float | None = TOLERANCE
+    held_out: bool = False
 
     def __post_init__(self) -> None:
         if self.direction not in DIRECTIONS:
@@ -53,6 +67,8 @@ class Metric:
             raise ValueError(f"{self.key}: a band has two ends, everything else at most one bar")
         if self.direction == "info" and self.bar is not None:
             raise ValueError(f"{self.key}: what is only shown has no bar")
+        if self.direction != "info" and self.unit in COMPUTING_TIMES:
+            raise ValueError(f"{self.key}: a time in {self.unit} depends on the machine; show it")
 
     @property
     def meets_bar(self) -> bool | None:
@@ -97,10 +113,25 @@ class Metric:
             "direction": self.direction,
             "bar": list(self.bar) if isinstance(self.bar, tuple) else self.bar,
             "tolerance": self.tolerance,
+            "held_out": self.held_out,
             "meets_bar": self.meets_bar,
         }
+
+    @staticmethod
+    def from_table(key: str, table: Mapping[str, Any]) -> Metric:
+        """The figure of a table as `to_table` makes it; fields that are left out are defaults."""
+        bar, value = table.get("bar"), table["value"]
+        return Metric(
+            key,
+            math.nan if value is None else float(value),
+            table["unit"],
+            table["direction"],
+            (bar[0], bar[1]) if isinstance(bar, list) else bar,
+            table["tolerance"],
+            table.get("held_out", False),
+        )
 
 
 def info(key: str, value: float, unit: str) -> Metric:
     """A figure that is only shown."""
-    return Metric(key, value, unit, "info")
+    return Metric(key, value, unit, "info", tolerance=None)

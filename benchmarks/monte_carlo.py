@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
-from benchmarks.metric import Metric, info
+from benchmarks.metric import EXACT, Metric, info
 from benchmarks.suite import RECURSIVE, Benchmark, Outcome
 from slam_graph.evaluation.consistency import average_nees, mean_bounds
 from slam_graph.experiment.comparison import WITHOUT_FEJ, Comparison, with_variants
@@ -53,7 +53,7 @@ def measure(data: Path) -> Outcome:
 def figures_of(comparison: Comparison, data: str, algorithm: str) -> list[Metric]:
     """What the runs of one algorithm say."""
     results = results_of(comparison, data, algorithm)
-    metrics = [Metric("finished", len(results), "runs", "higher", SEEDS)]
+    metrics = [Metric("finished", len(results), "runs", "higher", SEEDS, EXACT)]
     metrics += consistency([read_series(task.result) for task, _ in results])
     ran = [result["metrics"] for _, result in results]
     return [

@@ -12,7 +12,8 @@ import math
 from pathlib import Path
 
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
-from benchmarks.metric import Metric, info
+from benchmarks.metric import EXACT, Metric, info
+from benchmarks.recordings import is_held_out
 from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
 from slam_graph.experiment.comparison import Comparison
 from slam_graph.experiment.sources import find_sources
@@ -40,11 +41,13 @@ def measure(data: Path, duration_s: float | None = None) -> Outcome:
     sources = find_sources([f"sim:{data / flight}" for flight in FLIGHTS], duration_s, CAMERA)
     folder = folder_of("real_imu") / ("whole" if duration_s is None else f"{duration_s:g}s")
     comparison = compared(folder, sources, configs_of(names, CAMERAS, duration_s))
-    for source in sources:
+    for path, source in zip(FLIGHTS, sources, strict=True):
+        held_out = is_held_out(path)
         for name in names:
             label = f"{source.name.removeprefix('sim_')}.{name}"
             judged = name in ATE_BARS_M and duration_s is None
-            outcome.add(label, figures_of(comparison, source.name, name), judged)
+            figures = figures_of(comparison, source.name, name)
+            outcome.add(label, figures, judged, held_out)
     note_failures(outcome, comparison)
     return outcome
 
@@ -52,7 +55,7 @@ def measure(data: Path, duration_s: float | None = None) -> Outcome:
 def figures_of(comparison: Comparison, data: str, algorithm: str) -> list[Metric]:
     """Errors, consistency and time of one run; NaN if it did not come to a good end."""
     results = results_of(comparison, data, algorithm)
-    figures = [Metric("finished", len(results), "runs", "higher", 1.0)]
+    figures = [Metric("finished", len(results), "runs", "higher", 1.0, EXACT)]
     bar = ATE_BARS_M.get(algorithm)
     if not results:
         return [*figures, Metric("ate", math.nan, "m", "lower", bar)]

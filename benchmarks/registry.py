@@ -12,6 +12,7 @@ from benchmarks import (
     cost_over_time,
     final_ba,
     frontend,
+    held_out,
     loop_closure,
     maps,
     memory,
@@ -27,6 +28,7 @@ from benchmarks import (
 from benchmarks.suite import Benchmark
 
 BENCHMARKS: dict[str, Benchmark] = {
+    **held_out.BENCHMARKS,  # first: it says most, and is the longest of the quick ones
     **wheel.BENCHMARKS,
     **mh01.BENCHMARKS,
     **openvins_sim.BENCHMARKS,

@@ -7,17 +7,20 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from benchmarks.baseline import Baseline
+from benchmarks.baseline import Baseline, value_of
 from benchmarks.metric import Metric
 from benchmarks.suite import Outcome
 from slam_graph.results.metrics import versions
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 HEADER = ("figure", "value", "unit", "bar", "verdict", "baseline", "change")
+
+HELD_OUT = "held out of every choice:"
+"""Before the figures that were measured where no parameter was chosen (`benchmarks.recordings`)."""
 
 Results = Mapping[str, Outcome]
 """What each benchmark found, by its name, in the order of running."""
@@ -25,7 +28,11 @@ Results = Mapping[str, Outcome]
 
 def lines(results: Results, baseline: Baseline) -> Iterator[str]:
     """An aligned table of all benchmarks, each followed by its notes."""
-    tables = {name: rows(name, outcome, baseline) for name, outcome in results.items()}
+    tables = {
+        (name, held_out): rows(name, metrics, baseline)
+        for name, outcome in results.items()
+        for held_out, metrics in parted(outcome)
+    }
     everything = [HEADER, *(row for table in tables.values() for row in table)]
     widths = [max(len(row[column]) for row in everything) for column in range(len(HEADER))]
 
@@ -35,11 +42,14 @@ def lines(results: Results, baseline: Baseline) -> Iterator[str]:
         return "  ".join(cells).rstrip()
 
     yield aligned(HEADER)
-    for name, table in tables.items():
+    for name, outcome in results.items():
         yield ""
         yield name
-        yield from map(aligned, table)
-        yield from (f"  note: {note}" for note in remarks(results[name]))
+        for held_out, _ in parted(outcome):
+            if held_out:
+                yield HELD_OUT
+            yield from map(aligned, tables[name, held_out])
+        yield from (f"  note: {note}" for note in remarks(outcome))
 
 
 def markdown(results: Results, baseline: Baseline) -> Iterator[str]:
@@ -47,11 +57,14 @@ def markdown(results: Results, baseline: Baseline) -> Iterator[str]:
     for name, outcome in results.items():
         yield f"### {name}"
         yield ""
-        yield "| " + " | ".join(HEADER) + " |"
-        yield "|---|---:|---|---|---|---:|---:|"
-        for row in rows(name, outcome, baseline):
-            yield "| " + " | ".join(cell.strip() for cell in row) + " |"
-        yield ""
+        for held_out, metrics in parted(outcome):
+            if held_out:
+                yield from (HELD_OUT, "")
+            yield "| " + " | ".join(HEADER) + " |"
+            yield "|---|---:|---|---|---|---:|---:|"
+            for row in rows(name, metrics, baseline):
+                yield "| " + " | ".join(cell.strip() for cell in row) + " |"
+            yield ""
         yield from (f"- {note}" for note in remarks(outcome))
         if remarks(outcome):
             yield ""
@@ -83,9 +96,15 @@ def remarks(outcome: Outcome) -> list[str]:
     return [f"FAILED: {outcome.failure}", *outcome.notes] if outcome.failure else outcome.notes
 
 
-def rows(name: str, outcome: Outcome, baseline: Baseline) -> list[tuple[str, ...]]:
-    """The cells of the table of a benchmark."""
-    return [_row(metric, baseline.get(f"{name}.{metric.key}")) for metric in outcome.metrics]
+def parted(outcome: Outcome) -> list[tuple[bool, list[Metric]]]:
+    """The figures on what parameters were chosen on, then those on what is held out, if any."""
+    parts = [(held, [m for m in outcome.metrics if m.held_out is held]) for held in (False, True)]
+    return [part for part in parts if part[1]]
+
+
+def rows(name: str, metrics: Sequence[Metric], baseline: Baseline) -> list[tuple[str, ...]]:
+    """The cells of the table of figures of a benchmark."""
+    return [_row(metric, value_of(baseline, f"{name}.{metric.key}")) for metric in metrics]
 
 
 def _row(metric: Metric, before: float | None) -> tuple[str, ...]:

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run benchmarks: `SLAM_GRAPH_DATA=FOLDER python -m benchmarks.run [--only NAME ...] [--gate]`."""
+"""Run benchmarks: `SLAM_GRAPH_DATA=FOLDER python -m benchmarks.run [--quick] [--gate]`."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
+import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from benchmarks import baseline, report
@@ -30,11 +33,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         width = max(map(len, BENCHMARKS))
         for name, benchmark in BENCHMARKS.items():
-            print(f"{name:{width}}  {benchmark.summary}")
+            print(f"{name:{width}}  {'quick' if benchmark.quick else '     '}  {benchmark.summary}")
         return 0
     try:
         before = baseline.read_baseline(options.baseline)
-        results = execute(options.only or list(BENCHMARKS))
+        results = execute(chosen(options), options.workers)
     except SlamGraphError as error:
         print(f"error: {error}", file=sys.stderr)
         return FAILED
@@ -50,10 +53,14 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m benchmarks.run", description=__doc__)
     add = made.add_argument
     add("--list", action="store_true", help="list the benchmarks and leave")
-    add("--only", nargs="+", metavar="NAME", choices=list(BENCHMARKS), help="run only these")
+    some = made.add_mutually_exclusive_group()
+    names = list(BENCHMARKS)
+    some.add_argument("--only", nargs="+", metavar="NAME", choices=names, help="run only these")
+    some.add_argument("--quick", action="store_true", help="run those that judge every change")
+    add("--workers", type=int, default=1, metavar="N", help="benchmarks at a time (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write all figures as JSON")
     add("--markdown", type=Path, metavar="FILE", help="write the tables as Markdown")
-    add("--gate", action="store_true", help="exit 1 if a bar is missed or a figure got worse")
+    add("--gate", action="store_true", help="exit 1 if a bar is missed or a figure is worse or new")
     add("--update-baseline", action="store_true", help="make what is measured the baseline")
     add(
         "--baseline",
@@ -65,8 +72,19 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def execute(names: Sequence[str]) -> dict[str, Outcome]:
+def chosen(options: argparse.Namespace) -> list[str]:
+    """The names of the benchmarks that are asked for; all if none are."""
+    if options.quick:
+        return [name for name, benchmark in BENCHMARKS.items() if benchmark.quick]
+    return list(options.only or BENCHMARKS)
+
+
+def execute(names: Sequence[str], workers: int = 1) -> dict[str, Outcome]:
     """Run benchmarks by their names, after a look whether all that they need is there.
+
+    Args:
+        names: of the benchmarks.
+        workers: processes at a time; 1 runs them here, one after the other.
 
     Raises:
         DataError: if a recording is missing. What fails later is told in its outcome, so that the
@@ -75,14 +93,24 @@ def execute(names: Sequence[str]) -> dict[str, Outcome]:
     data = data_folder()
     for name in names:
         require(BENCHMARKS[name], data)
-    results = {}
-    for name in names:
-        print(f"{name} …", file=sys.stderr, flush=True)
-        try:
-            results[name] = BENCHMARKS[name].run(data)
-        except SlamGraphError as error:
-            results[name] = Outcome(failure=str(error))
-    return results
+    if workers == 1:
+        return {name: measured(name, data) for name in names}
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        outcomes = [pool.submit(measured, name, data) for name in names]
+        return {name: done.result() for name, done in zip(names, outcomes, strict=True)}
+
+
+def measured(name: str, data: Path) -> Outcome:
+    """What a benchmark finds, or why it does not."""
+    print(f"{name} …", file=sys.stderr, flush=True)
+    wall_s, cpu_s = time.monotonic(), time.process_time()
+    try:
+        outcome = BENCHMARKS[name].run(data)
+    except SlamGraphError as error:
+        outcome = Outcome(failure=str(error))
+    wall_s, cpu_s = time.monotonic() - wall_s, time.process_time() - cpu_s
+    print(f"{name}: {wall_s:.0f} s, {cpu_s:.0f} s of CPU", file=sys.stderr, flush=True)
+    return outcome
 
 
 def write(options: argparse.Namespace, results: report.Results, before: baseline.Baseline) -> None:

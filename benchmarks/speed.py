@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The speed of the whole stereo pipeline on one core, and the memory that it takes.
 
-Two runs for each algorithm, each in a fresh process (`speed_worker`): one as it ships, with images
-decoded in a thread on the same core, for the real-time factor and the peak of memory; and one that
-decodes in turn and is interleaved with a reference computation (one Lucas-Kanade flow of 200
-points on the same images), whose median time is the unit in which all else is told. That unit and
-the costs of frames are CPU times, so that other programs lengthen neither.
+Three runs for each algorithm, each in a fresh process (`speed_worker`). Two are of the causal part,
+start-up included, the final bundle adjustment not: one as it ships, with images decoded in a thread
+on the same core, for the real-time factor and the peak of memory; and one that decodes in turn and
+is interleaved with a reference computation (one Lucas-Kanade flow of 200 points on the same
+images), whose median time is the unit in which all else is told. That unit and the costs of frames
+are CPU times, so that other programs lengthen neither. The third run is the first one with the
+final bundle adjustment at its end.
 """
 
 from __future__ import annotations
@@ -27,7 +29,6 @@ from slam_graph.errors import EstimationError
 
 RECORDING = "euroc/MH_01_easy_17s"
 
-REAL_TIME_BAR = 1.0
 COST_BAR = 8.0
 MEMORY_BAR_MB = 600.0
 
@@ -48,7 +49,9 @@ def measure(data: Path) -> Outcome:
     for name in ALGORITHMS:
         shipped = undisturbed("shipped", data / RECORDING, name)
         timed = undisturbed("interleaved", data / RECORDING, name)
-        outcome.metrics += [m.under(name) for m in (*whole(shipped), *parts(timed))]
+        complete = undisturbed("complete", data / RECORDING, name)
+        figures = (*whole(shipped), *parts(timed), *with_adjustment(complete))
+        outcome.metrics += [m.under(name) for m in figures]
         outcome.notes += [
             f"{name}: {shipped['recorded_s']:.1f} s recorded took {shipped['wall_s']:.1f} s; the "
             f"runs had their core for {share(shipped):.0%} and {share(timed):.0%} of the time "
@@ -56,7 +59,8 @@ def measure(data: Path) -> Outcome:
         ]
     outcome.notes += [
         f"the bar of {COST_BAR:g} {UNIT} applies to `cost_mean`: mean over all frames, start-up "
-        "included, without decoding of PNG files, as the figure known of OpenVINS (2.8) is",
+        "included, without decoding of PNG files, as the figure known of OpenVINS (2.8) is; nor is "
+        "the final bundle adjustment in it",
         "`part_*` are means over all frames and add up to `cost_mean_decoding`",
     ]
     return outcome
@@ -67,9 +71,18 @@ def whole(shipped: dict[str, Any]) -> list[Metric]:
     speed = shipped["recorded_s"] / shipped["wall_s"]
     by_cpu = shipped["recorded_s"] / shipped["cpu_s"]
     return [
-        Metric("real_time_factor", speed, "×", "higher", REAL_TIME_BAR, tolerance=None),
-        info("real_time_factor_cpu", by_cpu, "× by CPU time"),
+        info("real_time_factor", speed, "× real time"),
+        info("real_time_factor_cpu", by_cpu, "× real time"),
+        info("seconds", shipped["wall_s"], "s wall"),
         Metric("peak_memory", shipped["peak_mb"], "MB", "lower", MEMORY_BAR_MB),
+    ]
+
+
+def with_adjustment(complete: dict[str, Any]) -> list[Metric]:
+    """The same figures of the run that ends with the bundle adjustment."""
+    return [
+        info("seconds_with_adjustment", complete["wall_s"], "s wall"),
+        info("peak_memory_with_adjustment", complete["peak_mb"], "MB"),
     ]
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from benchmarks.metric import Metric, info
@@ -19,6 +19,9 @@ ALGORITHMS = ("msckf", "swf")
 
 RECURSIVE = ("msckf", "swf", "okvis", "ekf", "iekf")
 """The algorithms of the engine."""
+
+CORE = ("msckf", "swf", "okvis")
+"""Those whose cost is bounded, which is what the quick benchmarks judge."""
 
 PEERS = ("fixed_lag_isam2", "fixed_lag_batch", "isam2")
 """GTSAM's smoothers behind the same interface."""
@@ -44,11 +47,24 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     failure: str = ""
 
-    def add(self, variant: str, metrics: Iterable[Metric], judged: bool = True) -> None:
-        """Add figures of a variant, its name before their keys; those not judged are only shown."""
+    def add(
+        self,
+        variant: str,
+        metrics: Iterable[Metric],
+        judged: bool = True,
+        held_out: bool = False,
+    ) -> None:
+        """Add figures of a variant.
+
+        Args:
+            variant: goes before their keys.
+            metrics: the figures.
+            judged: whether they have bars and a baseline, or are only shown.
+            held_out: whether no parameter was chosen on what they were measured on.
+        """
         for metric in metrics:
             shown = metric if judged else info(metric.key, metric.value, metric.unit)
-            self.metrics.append(shown.under(variant))
+            self.metrics.append(replace(shown.under(variant), held_out=held_out))
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +75,13 @@ class Benchmark:
         summary: one line for `--list`.
         needs: folders that it reads, below the folder of recordings.
         run: measures; takes the folder of recordings.
+        quick: whether it is one of those that every change is judged by, of some ten seconds each.
     """
 
     summary: str
     needs: tuple[str, ...]
     run: Callable[[Path], Outcome]
+    quick: bool = False
 
 
 def data_folder() -> Path:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import baseline, cost_over_time, monte_carlo, report, run, speed, speed_worker
+from benchmarks import cost_over_time, monte_carlo, report, run, speed, speed_worker
 from benchmarks.metric import Bar, Direction, Metric, info
 from benchmarks.openvins_sim import Quality, best
 from benchmarks.registry import BENCHMARKS
 from benchmarks.running import Errors
 from benchmarks.suite import DATA_VARIABLE, Benchmark, Outcome
-from slam_graph.errors import DataError, EstimationError
+from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import Trajectory
 
 NAN = math.nan
@@ -72,7 +72,7 @@ def test_what_depends_on_the_machine_is_judged_by_its_bar_alone() -> None:
     metric = Metric("a.b", 1.1, "×", "higher", 1.0, tolerance=None)
     assert metric.meets_bar
     assert not metric.worse_than(9.0)
-    assert baseline.updated({"a.b": 9.0}, [metric], {"a"}) == {}
+    assert not metric.has_baseline
 
 
 @pytest.mark.parametrize(
@@ -82,52 +82,6 @@ def test_what_depends_on_the_machine_is_judged_by_its_bar_alone() -> None:
 def test_a_bar_must_fit_its_direction(direction: Direction, bar: Bar | None) -> None:
     with pytest.raises(ValueError, match=r"a\.b"):
         Metric("a.b", 1.0, "m", direction, bar)
-
-
-def test_the_gate_names_bars_missed_figures_worse_and_figures_gone() -> None:
-    metrics = [
-        Metric("a.good", 1.0, "m", "lower", 2.0),
-        Metric("a.high", 3.0, "m", "lower", 2.0),
-        Metric("a.worse", 1.0, "m", "lower"),
-        info("a.shown", 99.0, "m"),
-    ]
-    before = {"a.good": 1.0, "a.worse": 0.5, "a.gone": 1.0, "b.not_run": 1.0}
-    lines = baseline.complaints(metrics, before, {"a"})
-    assert [line.split()[0] for line in lines] == ["a.high", "a.worse", "a.gone"]
-    assert "2.0" in lines[0]
-    assert "0.5" in lines[1]
-    assert baseline.complaints(metrics[:1], before, {"c"}) == []
-
-
-def test_a_baseline_is_read_back_and_keeps_what_was_not_run(tmp_path: Path) -> None:
-    path = tmp_path / "baseline.json"
-    assert baseline.read_baseline(path) == {}
-    before = {"a.old": 1.0, "b.kept": 2.0}
-    metrics = [
-        Metric("a.new", 0.123456, "m", "lower"),
-        Metric("a.none", NAN, "m", "lower"),
-        info("a.shown", 3.0, "m"),
-    ]
-    baseline.write_baseline(baseline.updated(before, metrics, {"a"}), path)
-    values = baseline.read_baseline(path)
-    assert values.keys() == {"a.new", "a.none", "b.kept"}
-    assert values["a.new"] == 0.1235
-    assert math.isnan(values["a.none"])
-
-
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"schema_version": 99, "values": {}}'])
-def test_a_file_that_is_no_baseline_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "baseline.json"
-    path.write_text(text)
-    with pytest.raises(DataError, match="--update-baseline") as caught:
-        baseline.read_baseline(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_the_committed_baseline_knows_only_benchmarks_that_exist() -> None:
-    values = baseline.read_baseline()
-    assert values
-    assert {baseline.benchmark_of(key) for key in values} <= BENCHMARKS.keys()
 
 
 def _made_up(value: float = 1.0, fail: bool = False) -> Benchmark:
@@ -162,7 +116,9 @@ def test_a_run_prints_gates_and_writes(
     files = {name: tmp_path / name for name in ("b.json", "out.json", "out.md")}
     common = ["--only", "made_up", "--baseline", str(files["b.json"])]
     written = ["--json", str(files["out.json"]), "--markdown", str(files["out.md"])]
-    assert run.main([*common, *written, "--gate", "--update-baseline"]) == 0
+    assert run.main([*common, "--gate"]) == 1, "nothing to compare with"
+    assert run.main([*common, *written, "--update-baseline"]) == 0
+    assert run.main([*common, "--gate"]) == 0
     assert "note: read recordings" in capsys.readouterr().out
 
     table = json.loads(files["out.json"].read_text())
@@ -227,10 +183,17 @@ def test_the_list_needs_no_recordings(
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(BENCHMARKS)
 
 
-def test_an_unknown_name_is_a_usage_error() -> None:
+@pytest.mark.parametrize("words", [["--only", "nothing"], ["--only", "bal_small", "--quick"]])
+def test_an_unknown_or_contradictory_choice_is_a_usage_error(words: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        run.main(["--only", "nothing"])
+        run.main(words)
     assert caught.value.code == 2
+
+
+def test_quick_chooses_the_quick_ones() -> None:
+    names = run.chosen(run.parser().parse_args(["--quick"]))
+    assert names == [name for name in BENCHMARKS if BENCHMARKS[name].quick]
+    assert set(names) < set(run.chosen(run.parser().parse_args([])))
 
 
 def test_errors_are_taken_at_the_times_of_the_estimate() -> None:

@@ -209,8 +209,8 @@ def test_goes_on_and_finds_its_way_back(recording: list[Packet], name: str) -> N
     assert outcome.refused == (at_least if warning == "frame_out_of_order" else 0)
     assert outcome.counts.get(warning or "", 0) >= at_least
     errors = outcome.errors_m()
-    assert errors.max() < 0.2
-    assert errors[-20:].max() < 0.06
+    assert errors.max() < 0.055
+    assert errors[-20:].max() < 0.052
 
 
 @pytest.mark.parametrize("length_s", [0.5, 1.0, 9.0])
@@ -270,7 +270,7 @@ def test_a_start_waits_for_good_data_and_then_succeeds(
     truth = FALGORITHM.nav_state(first_s)
     assert state is not None
     ours, true = (s.world_T_body.rotation().unrotate(s.velocity) for s in (state, truth))
-    assert np.linalg.norm(ours - true) < 0.15
+    assert np.linalg.norm(ours - true) < 0.037
 
 
 @pytest.mark.parametrize("name", ["msckf", "fixed_lag_isam2"])

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whole recordings through the estimator, measured against the truth."""
+"""Whole recordings through the estimator, measured against the truth.
+
+Bounds of errors are 1.5 times what was measured, here and in all tests of whole runs.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -35,17 +38,17 @@ def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
     result = run(sequence, load_config(algorithm=algorithm))
     assert result.status == "ok"
     stamps = result.trajectory.stamps_ns
-    assert stamps[-1] - stamps[0] >= 25_000_000_000
-    assert rmse(sequence, result, "se3", "trans_part") <= 0.15
+    assert stamps[-1] - stamps[0] >= 28_000_000_000
+    assert rmse(sequence, result, "se3", "trans_part") <= 0.020
 
 
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("algorithm", "cameras", "position_m", "angle_deg"),
     [
-        ("msckf", 1, 0.06, 0.5),
-        ("msckf", 2, 0.05, 0.3),
-        ("swf", 2, 0.05, 0.3),
+        ("msckf", 1, 0.019, 0.21),
+        ("msckf", 2, 0.015, 0.19),
+        ("swf", 2, 0.015, 0.19),
     ],
 )
 def test_a_simulation_from_a_given_start(
@@ -56,7 +59,7 @@ def test_a_simulation_from_a_given_start(
     result = run(sequence, load_config(algorithm=algorithm, duration_s=30.0))
     assert result.status == "ok"
     assert result.start_was_given
-    assert result.coverage > 0.99
+    assert result.coverage > 0.999
     assert rmse(sequence, result, "none", "trans_part") <= position_m
     assert rmse(sequence, result, "none", "angle_deg") <= angle_deg
 
@@ -99,7 +102,7 @@ def test_every_algorithm_gives_sane_states(contract_run: RunResult) -> None:
         assert np.isfinite(values).all()
     np.testing.assert_allclose(np.linalg.norm(trajectory.quaternions, axis=1), 1.0, atol=1e-9)
     travelled = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
-    assert 0.5 < travelled < 5.0
+    assert 0.5 < travelled < 1.1
 
 
 def test_every_algorithm_gives_positive_definite_covariances(contract_run: RunResult) -> None:

@@ -61,7 +61,7 @@ def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path
     ]
     for row in printed["rows"]:
         assert row["status"] == {"ok": 1}
-        assert all(0.0 < row["ate_m"][mode] < 0.1 for mode in ALIGNMENTS)
+        assert all(0.0 < row["ate_m"][mode] < 0.0147 for mode in ALIGNMENTS)
         assert row["nees"]["position"] > 0.0
         assert row["ms_per_frame"] > 0.0
         assert row["steps"] == 1.0

@@ -92,7 +92,7 @@ def test_a_run_survives_dark_saturated_blurred_and_blank_images(folder: Path) ->
 
     kept = Kept()
     result = run(Edited(folder, spoil), load_config(duration_s=10.5), recorder=kept)
-    assert ate_m(result) < 0.05
+    assert ate_m(result) < 0.0105
     assert result.coverage > 0.8
     assert result.warnings["few_features"] > 0
     counts = np.array([len(frame.cameras[0]) for frame in kept.frames])
@@ -159,7 +159,7 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     assert 0.25 < np.mean(black > 0) < 0.4
     result = run(Edited(folder, wall), load_config(duration_s=8))
     assert (result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9 < 2.0
-    assert ate_m(result) < 2.0 * clean_m
+    assert ate_m(result) < 1.65 * clean_m
 
 
 def test_a_thread_for_the_front_end_changes_nothing(folder: Path) -> None:

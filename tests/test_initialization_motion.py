@@ -205,9 +205,9 @@ def test_a_simulated_flight_starts_in_motion(cameras: int, seed: int) -> None:
     assert state.covariance is not None
     assert state.stamp_ns < 2_000_000_000
     truth = flight.nav_state(state.stamp_ns * 1e-9)
-    assert np.linalg.norm(body_velocity(state) - body_velocity(truth)) < 0.06
+    assert np.linalg.norm(body_velocity(state) - body_velocity(truth)) < 0.039
     np.testing.assert_allclose(state.gyro_bias, flight.gyro_bias, atol=5e-3)
-    assert tilt_rad(state, truth) < 0.025
+    assert tilt_rad(state, truth) < 0.0205
     biases = np.concatenate([state.accel_bias, state.gyro_bias])
     error = biases - np.concatenate([flight.accel_bias, flight.gyro_bias])
     assert error @ np.linalg.solve(state.covariance[9:, 9:], error) < chi2.ppf(0.999, 6)
@@ -248,7 +248,7 @@ def test_real_images_start_in_motion_within_three_seconds(data_dir: Path, camera
             break
     assert state is not None, estimator.waiting_for
     velocity = true_body_velocity(truth, state.stamp_ns)
-    assert np.linalg.norm(body_velocity(state) - velocity) < 0.1
+    assert np.linalg.norm(body_velocity(state) - velocity) < 0.01
     near, _ = interpolate(truth, np.array([state.stamp_ns]))
     up = near.pose(0).rotation().matrix()[2]
     tilt = np.degrees(np.arccos(up @ state.world_T_body.rotation().matrix()[2]))

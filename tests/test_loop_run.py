@@ -54,7 +54,7 @@ def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
         accuracy["yaw"]["ate"]["translation_m"]["rmse"]
         for accuracy in (table["accuracy"], loops["accuracy"])
     ]
-    assert rmse[1] < rmse[0]
+    assert rmse[1] < 0.57 * rmse[0]
     causal = np.loadtxt(folder / "trajectory.tum")
     corrected = np.loadtxt(folder / "trajectory_loop.tum")
     np.testing.assert_array_equal(causal[:, 0], corrected[:, 0])

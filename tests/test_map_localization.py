@@ -123,7 +123,7 @@ def test_a_run_is_located_once_three_matchs_agree(world: World) -> None:
     located = localizer(world)
     errors = fly(world, located, 0, range(5))
     assert len(errors) == 3
-    assert max(errors) < 1e-3
+    assert max(errors) < 1e-6
     assert (located.queries, located.accepted, located.starts) == (5, 5, 1)
 
 
@@ -156,7 +156,7 @@ def test_a_false_match_is_left_out(world: World, monkeypatch: pytest.MonkeyPatch
         return replace(match, world_T_body=shift.compose(match.world_T_body))
 
     monkeypatch.setattr(MapPlaces, "locate", wrong)
-    assert max(fly(world, located, 0, range(3, 5))) < 0.01
+    assert max(fly(world, located, 0, range(3, 5))) < 1e-6
     assert located.starts == 1
     # if they go on and agree with each other, it is the filter that is wrong
     fly(world, located, 0, range(3, 5))
@@ -179,7 +179,7 @@ def test_who_has_been_carried_off_is_found_again(world: World) -> None:
         errors.append(float(np.linalg.norm(away)))
     assert located.starts == 2
     assert errors[0] > 1.0
-    assert max(errors[2:]) < 0.01
+    assert max(errors[2:]) < 1e-6
 
 
 def test_odometry_that_makes_no_sense_leaves_it_lost(world: World) -> None:

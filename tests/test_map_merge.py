@@ -38,13 +38,13 @@ def test_maps_of_one_place_become_one(world: World) -> None:
     truth = np.array([world.pose(n).translation() for n in [*range(8), *range(3, 11)]])
     np.testing.assert_allclose(content.poses.translations, truth, atol=2e-3)
     assert summary.accepted >= MIN_LINKS
-    assert summary.first_moved_m < 1e-3
-    assert summary.link_rmse_m < 2e-3
+    assert summary.first_moved_m < 1e-6
+    assert summary.link_rmse_m < 1e-6
     # every feature of the wall is there once, where it is
     assert len(content.points) <= len(world.points)
     assert summary.fused == len(first.points) + len(second.points) - len(content.points)
     away = np.linalg.norm(content.points[:, None] - world.points, axis=2).min(axis=1)
-    assert away.max() < 5e-3
+    assert away.max() < 1e-6
     np.testing.assert_array_equal(content.recording_of, [0] * 8 + [1] * 8)
 
 

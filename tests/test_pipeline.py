@@ -127,7 +127,7 @@ def test_a_run_may_start_from_the_truth(data_dir: Path) -> None:
     result.check()
     assert len(result.rig.cameras) == 1
     assert result.start_was_given
-    assert result.metrics["accuracy"]["none"]["ate"]["translation_m"]["rmse"] < 0.1
+    assert result.metrics["accuracy"]["none"]["ate"]["translation_m"]["rmse"] < 0.042
 
 
 def state(**changes: Any) -> NavState:

@@ -68,7 +68,7 @@ CHOICES: dict[str, list[Any]] = {
     "recent_frames": [1, 3],
     "max_state_features": [0, 5, None],
     "keep_lost_features": [False, True],
-    "max_features_per_step": [4, MANY],
+    "max_features_per_step": [4, CostPolicy().max_features_per_step],
 }
 STEPS: list[dict[str, Any]] = [
     {"max_steps": 1},
@@ -103,7 +103,7 @@ def throws_nothing_away(algorithm: AlgorithmConfig) -> bool:
     cost = algorithm.cost
     return (
         cost.max_past_poses == MANY
-        and cost.max_features_per_step == MANY
+        and cost.max_features_per_step >= POINTS
         and cost.features in ("once", "every_step")
         and cost.past_poses != "keyframes"
     )

@@ -147,7 +147,7 @@ def ate(sequence: SimulatedSequence) -> float:
 
 
 def test_the_estimator_follows_a_simulated_flight() -> None:
-    assert ate(simulated(duration_s=15.0)) < 0.05
+    assert ate(simulated(duration_s=15.0)) < 0.0115
 
 
 @pytest.mark.data
@@ -157,7 +157,7 @@ def test_the_estimator_follows_a_real_flight_with_its_real_imu(data_dir: Path) -
     recorded = open_dataset(path)
     truth = recorded.groundtruth()
     assert truth is not None
-    assert ate(sequence) < 0.10
+    assert ate(sequence) < 0.0215
     samples = sequence.imu()
     where = np.searchsorted(truth.stamps_ns, samples.stamps_ns[100])
     assert truth.stamps_ns[where] - samples.stamps_ns[100] < 5_000_000
@@ -172,7 +172,7 @@ def test_a_simulated_imu_flies_along_a_recorded_trajectory(data_dir: Path) -> No
     packets = list(sequence.packets())
     check_contract(sequence, packets)
     assert len(packets) == 101
-    assert ate(sequence) < 0.05
+    assert ate(sequence) < 0.0095
 
 
 def invoke(*arguments: object) -> Any:

@@ -87,4 +87,4 @@ def test_the_wheels_tracks(data_dir: Path, name: str) -> None:
     reference = sequence.groundtruth()
     assert reference is not None
     error = ape(reference, result.trajectory, "trans_part", "se3").statistics.rmse
-    assert error <= 0.10
+    assert error <= 0.020

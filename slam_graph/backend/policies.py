@@ -30,6 +30,9 @@ from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
 from slam_graph.plugins import Choice
 from slam_graph.settings.base import Settings
 
+STATE_FEATURE_FRAMES = 10
+"""Features seen in fewer frames are worth more when they are used once, with all observations."""
+
 
 class CostPolicy(Settings):
     """Module 1: which variables and residuals are in the cost."""
@@ -51,8 +54,9 @@ class CostPolicy(Settings):
     """Whether features of the state that are no longer tracked are kept for when they come back."""
     max_state_features: int | None = Field(40, ge=0)
     """How many features are held in the state while they are tracked; null for no bound."""
-    state_feature_frames: int = Field(10, ge=2)
-    """How many frames must have seen a feature before it may be held in the state."""
+    state_feature_frames: int | None = Field(None, ge=2)
+    """How many frames must have seen a feature before it may be held in the state; null for 10, or
+    for as many as the past poses allow if these are fewer."""
     state_feature_depth_error: float = Field(0.1, gt=0)
     """… and the standard deviation of its depth, relative to it, must be less than this."""
     max_features_per_step: int = Field(60, ge=1)
@@ -96,13 +100,19 @@ class CostPolicy(Settings):
                     f"recent_frames: {self.recent_frames} are more than the poses that stay: "
                     f"max_past_poses: {self.max_past_poses} and the current one"
                 )
-        if not holds_none and self.state_feature_frames > self._most_frames:
+        asked = self.state_feature_frames
+        if asked is not None and asked > self._most_frames:
             raise ValueError(
                 f"a feature waits over {self._most_frames} frames at most under max_past_poses: "
                 f"{self.max_past_poses}, so none would be seen in state_feature_frames: "
-                f"{self.state_feature_frames}; lower that, or set max_state_features: 0"
+                f"{asked}; lower that, or remove it"
             )
         return self
+
+    @property
+    def frames_before_state(self) -> int:
+        """In how many frames a feature must have been seen before it may be held in the state."""
+        return self.state_feature_frames or min(STATE_FEATURE_FRAMES, self._most_frames)
 
     @property
     def _most_frames(self) -> int:

@@ -152,8 +152,10 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
     if fault["type"] == "unused":
         return f"{where}: '{dotted}' {fault['msg']}"
     message = str(fault["msg"]).removeprefix("Value error, ")
-    got = repr(fault["input"])
     message = f"{where}: {dotted}: {message[:1].lower()}{message[1:]}"
+    if isinstance(fault["input"], dict | BaseModel):  # a whole table says nothing
+        return message
+    got = repr(fault["input"])
     return message if got in message else f"{message}, got {got}"
 
 

@@ -318,7 +318,7 @@ class CostConstruction:
         outside = ~is_in(ids, window.features) & ~is_in(ids, self._dynamic)
         ids, lengths = ids[outside], lengths[outside]
         live = is_in(ids, tracks.seen)
-        lasting = live & (lengths >= policy.state_feature_frames) & (room > 0)
+        lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
         lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
             (ids + window.frame) % RETRY_FRAMES == 0
         )

@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the tables of the documents hold: a function from figures to lines each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from benchmarks.baseline import Baseline, benchmark_of, value_of
+from benchmarks.suite import PEERS, RECURSIVE
+from slam_graph.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures of the baseline as text."""
+
+    baseline: Baseline
+
+    def __call__(self, key: str, digits: int) -> str:
+        """A figure with so many digits after the point.
+
+        Raises:
+            DataError: if the baseline does not have it.
+        """
+        value = value_of(self.baseline, key)
+        if value is None:
+            raise DataError(
+                f"{key} is not in the baseline; run `python -m benchmarks.run --only "
+                f"{benchmark_of(key)} --update-baseline`"
+            )
+        return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+    def all(self, keys: Sequence[str], digits: int, separator: str = " / ") -> str:
+        """Several figures in one cell."""
+        return separator.join(self(key, digits) for key in keys)
+
+
+def results(figures: Figures) -> Iterator[str]:
+    """The table of the README."""
+    yield "| recording | | msckf | swf | OpenVINS | Basalt | OKVIS2, causal |"
+    yield "|---|---|---:|---:|---:|---:|---:|"
+    position, orientation = ("position [m]", 4), ("orientation [deg]", 2)
+    real = (("ate", *position), ("orientation", *orientation))
+    simulated = (("position", *position), ("orientation", *orientation))
+    others = ("openvins", "basalt", "okvis2")
+    for name, benchmark, rows, shown in (
+        ("V1_01, tracks, mono, 30 s (the demo)", "wheel_v101", real, others[:0]),
+        ("MH_01, images, mono, 17 s", "mh01_mono", real, others[:1]),
+        ("MH_01, images, stereo, 17 s", "mh01_stereo", real, others),
+        (f"V1_01, {SIMULATED}, mono, 134 s", "openvins_sim_mono", simulated, others[:1]),
+        (f"V1_01, {SIMULATED}, stereo, 134 s", "openvins_sim_stereo", simulated, others[:1]),
+    ):
+        systems = ("msckf", "swf", *shown)
+        for row, (key, label, digits) in enumerate(rows):
+            cells = [figures(f"{benchmark}.{system}.{key}", digits) for system in systems]
+            yield line(name if row == 0 else "", label, *cells, width=7)
+        if rows is simulated:
+            pairs = [
+                [f"{benchmark}.{system}.nees_{part}" for part in ("position", "orientation")]
+                for system in systems
+            ]
+            cells = [figures.all(pair, 1) for pair in pairs]
+            yield line("", "NEES, position / orientation (ideal 3)", *cells, width=7)
+    yield from speed(figures)
+
+
+SIMULATED = "simulated tracks"
+
+
+def speed(figures: Figures) -> Iterator[str]:
+    """The last rows of the table of the README; all of the causal part, start-up included."""
+    cost, memory = (
+        [figures(f"speed_mh01_stereo.{system}.{key}", digits) for system in ("msckf", "swf")]
+        for key, digits in (("cost_mean", 1), ("peak_memory", 0))
+    )
+    yield line("MH_01, images, stereo, causal", "time a frame [flows]", *cost, width=7)
+    yield line("", "peak memory [MB]", *memory, width=7)
+
+
+def monte_carlo(figures: Figures) -> Iterator[str]:
+    """NEES with and without first-estimates Jacobians."""
+    yield "| | NEES pose | orientation | position | without: pose | orientation | position |"
+    yield "|---|---:|---:|---:|---:|---:|---:|"
+    for name in RECURSIVE:
+        keys = [
+            f"monte_carlo.{name}{variant}.nees_{part}"
+            for variant in ("", "_no_fej")
+            for part in ("pose", "orientation", "position")
+        ]
+        yield line(f"`{name}`", *(figures(key, 1) for key in keys))
+
+
+def real_imu(figures: Figures) -> Iterator[str]:
+    """Errors and NEES of every algorithm on flights with their real IMU."""
+    flights = ("V1_02_medium", "V2_01_easy", "V2_02_medium", "MH_04_difficult")
+    yield "| | V1_02 | V2_01 | V2_02, held out | MH_04, held out |"
+    yield "|---|---|---|---|---|"
+    for name in (*RECURSIVE, *PEERS):
+        cells = []
+        for flight in flights:
+            run = f"real_imu.{flight}.{name}"
+            nees = [f"{run}.nees_{part}" for part in ("position", "orientation")]
+            errors = f"{figures(f'{run}.ate', 3)} / {figures(f'{run}.orientation', 2)}"
+            cells.append(f"{errors} / {figures.all(nees, 0, ', ')}")
+        yield line(f"`{name}`", *cells)
+
+
+def held_out(figures: Figures) -> Iterator[str]:
+    """What no parameter was chosen on."""
+    yield "| | V2_02, 30 s | MH_04, 30 s | ten simulated flights of 15 s |"
+    yield "|---|---:|---:|---:|"
+    for name in ("msckf", "swf", "okvis"):
+        cells = [
+            f"{figures(f'held_out.{part}.{name}.{error}', 4)} / "
+            f"{figures(f'held_out.{part}.{name}.orientation', 2)}"
+            for part, error in (
+                ("V2_02_medium", "ate"),
+                ("MH_04_difficult", "ate"),
+                ("seeds", "position"),
+            )
+        ]
+        nees = [f"held_out.seeds.{name}.nees_{part}" for part in ("position", "orientation")]
+        yield line(f"`{name}`", *cells[:-1], f"{cells[-1]} / {figures.all(nees, 1, ', ')}")
+
+
+def line(*cells: str, width: int = 0) -> str:
+    """A line of a table, filled up with empty cells; an empty one is a single blank."""
+    filled = (*cells, *("" for _ in range(width - len(cells))))
+    return "|" + "|".join(f" {cell} " if cell else " " for cell in filled) + "|"
+
+
+TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
+    "results": results,
+    "monte_carlo": monte_carlo,
+    "real_imu": real_imu,
+    "held_out": held_out,
+}
+"""By the name in the marker of a document."""
