@@ -60,14 +60,14 @@ def rooms(seed: int, duration_s: float, cameras: int, looks: int) -> RunResult:
 def long_flight(cameras: int, folder: Path) -> Outcome:
     """Twenty minutes, of which every minute comes back to places."""
     outcome, result = Outcome(), rooms(LONG_SEED, LONG_S, cameras, 2000)
-    if result.loops is None or result.truth is None:
+    if result.loops is None or result.input.truth is None:
         return Outcome(failure=result.message or "no loops")
     causal, corrected = result.trajectory, result.loops.correct(result.best_trajectory)
     before, after = (
-        ape(result.truth, trajectory, "trans_part", "yaw").statistics.rmse
+        ape(result.input.truth, trajectory, "trans_part", "yaw").statistics.rmse
         for trajectory in (causal, corrected)
     )
-    false = false_loops(result.loops, result.truth) & result.loops.accepted
+    false = false_loops(result.loops, result.input.truth) & result.loops.accepted
     outcome.metrics += [
         Metric("ate_ratio", before / after, "", "higher", ATE_BAR),
         Metric("ate_m", after, "m", "lower"),
@@ -85,9 +85,9 @@ def many_flights(folder: Path) -> Outcome:
     outcome, verified, accepted, loops = Outcome(), 0, 0, 0
     for seed in range(SEEDS):
         result = rooms(seed, SHORT_S, 2, LOOKS)
-        if result.loops is None or result.truth is None:
+        if result.loops is None or result.input.truth is None:
             return Outcome(failure=f"seed {seed}: {result.message or 'no loops'}")
-        false = false_loops(result.loops, result.truth)
+        false = false_loops(result.loops, result.input.truth)
         verified, accepted = (
             verified + int(false.sum()),
             accepted + int(np.sum(false & result.loops.accepted)),

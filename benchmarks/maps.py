@@ -73,7 +73,7 @@ def located(seeds: range, cameras: int, images: bool, judged: bool, folder: Path
     shares, errors, first = [], [], []
     for seed in seeds:
         known = mapped(flight(seed, cameras, images), half_s)
-        if known.slam_map is None or known.truth is None:
+        if known.slam_map is None or known.input.truth is None:
             return Outcome(failure=f"seed {seed}: {known.message or 'no map'}")
         config = load_config(None, ["final_ba.enabled=false"], start_s=half_s)
         result = run(flight(seed, cameras, images), config, known_map=known.slam_map)
@@ -81,11 +81,13 @@ def located(seeds: range, cameras: int, images: bool, judged: bool, folder: Path
         if log is None or not log.located.any():
             shares.append(0.0)
             continue
-        similarity = map_alignment(known.truth, known.slam_map)
-        metres, degrees = errors_in_map(known.truth, log.trajectory(), similarity)
-        shares.append(float(np.sum((metres < WITHIN_M) & (degrees < WITHIN_DEG))) / result.frames)
+        similarity = map_alignment(known.input.truth, known.slam_map)
+        metres, degrees = errors_in_map(known.input.truth, log.trajectory(), similarity)
+        shares.append(
+            float(np.sum((metres < WITHIN_M) & (degrees < WITHIN_DEG))) / result.logs.frames
+        )
         errors.append(metres)
-        first.append(float(log.stamps_ns[log.located][0] - result.start_ns) * 1e-9)
+        first.append(float(log.stamps_ns[log.located][0] - result.input.start_ns) * 1e-9)
     bar = SHARE_BAR if judged else None
     outcome.metrics += [
         Metric("least_share", min(shares), "", "higher", bar, QUANTISED_TOLERANCE),
@@ -107,19 +109,19 @@ def real(folder: Path) -> Outcome:
     spacing = [f"loop_closure.keyframes.{key}=0.1" for key in ("distance_m", "angle_rad")]
     settings = ["map.enabled=true", *spacing]
     known = run(open_dataset(str(path)), load_config(None, settings, duration_s=MH01_HALF_S))
-    if known.slam_map is None or known.truth is None:
+    if known.slam_map is None or known.input.truth is None:
         return Outcome(failure=known.message or "no map")
     config = load_config(None, ["final_ba.enabled=false"], start_s=MH01_HALF_S)
     result = run(open_dataset(str(path)), config, known_map=known.slam_map)
     log = result.localization
     if log is None or not log.located.any():
         return Outcome(failure="never located")
-    similarity = map_alignment(known.truth, known.slam_map)
-    metres, degrees = errors_in_map(known.truth, log.trajectory(), similarity)
+    similarity = map_alignment(known.input.truth, known.slam_map)
+    metres, degrees = errors_in_map(known.input.truth, log.trajectory(), similarity)
     outcome.metrics += [
         Metric("rmse_m", float(np.sqrt(np.mean(metres**2))), "m", "lower", WITHIN_M),
         Metric("rmse_deg", float(np.sqrt(np.mean(degrees**2))), "deg", "lower", WITHIN_DEG),
-        info("located_share", float(log.located.sum()) / result.frames, ""),
+        info("located_share", float(log.located.sum()) / result.logs.frames, ""),
     ]
     return outcome
 
@@ -131,7 +133,7 @@ def merged(folder: Path) -> Outcome:
     for seed in range(SEEDS):
         first = mapped(flight(seed, 2, False), HALF_S)
         second = mapped(flight(seed, 2, False), HALF_S, HALF_S)
-        if first.slam_map is None or second.slam_map is None or first.truth is None:
+        if first.slam_map is None or second.slam_map is None or first.input.truth is None:
             return Outcome(failure=f"seed {seed}: no map")
         halves.append(first.slam_map)
         both = merge_maps(first.slam_map, second.slam_map, config.loop_closure, config.localization)
@@ -153,10 +155,10 @@ def merged(folder: Path) -> Outcome:
 
 def keyframe_errors(content: SlamMap, result: RunResult) -> np.ndarray:
     """(K,) errors of the keyframes of a map, all recordings aligned as one."""
-    assert result.truth is not None
-    similarity = map_alignment(result.truth, content)
+    assert result.input.truth is not None
+    similarity = map_alignment(result.input.truth, content)
     return np.concatenate(
-        [errors_in_map(result.truth, t, similarity)[0] for t in content.trajectories()]
+        [errors_in_map(result.input.truth, t, similarity)[0] for t in content.trajectories()]
     )
 
 

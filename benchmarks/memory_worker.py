@@ -43,7 +43,11 @@ def main(algorithm: str, duration_s: str) -> None:
         result = run(sequence, config)
         result.check()
         result.save(folder)
-    table = {"peak_mb": peak_memory_mb(), "frames": result.frames, "wall_s": result.wall_s}
+    table = {
+        "peak_mb": peak_memory_mb(),
+        "frames": result.logs.frames,
+        "wall_s": result.ending.wall_s,
+    }
     print(json.dumps(table))
 
 

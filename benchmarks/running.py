@@ -89,7 +89,7 @@ class Run:
         with threadpool_limits(limits=1, user_api="blas"):
             self.result = run(sequence, config, viewer=counter)
         self.frames_waited = counter.waited
-        truth = self.result.truth
+        truth = self.result.input.truth
         assert truth is not None, f"{recording} has no ground truth"
         self.truth = truth
 
@@ -102,14 +102,14 @@ class Run:
     def seconds_to_start(self) -> float:
         """From the first frame to the first state; NaN if there was none."""
         stamps = self.result.trajectory.stamps_ns
-        return float(stamps[0] - self.result.start_ns) * 1e-9 if len(stamps) else math.nan
+        return float(stamps[0] - self.result.input.start_ns) * 1e-9 if len(stamps) else math.nan
 
     @property
     def frames_lost(self) -> float:
         """Frames from the first state to the end without one; NaN if all."""
         states = len(self.result.history)
         whole = self.result.config.duration_s is None or not self.ok
-        frames = self.result.info.frames if whole else self.result.frames
+        frames = self.result.input.info.frames if whole else self.result.logs.frames
         return frames - self.frames_waited - states if states else math.nan
 
     def errors(self, alignment: AlignmentMode) -> Errors:

@@ -50,8 +50,8 @@ def shipped(recording: Path, config: RunConfig) -> Table:
     with tempfile.TemporaryDirectory() as folder:
         result.save(folder)
     return {
-        "recorded_s": result.recorded_s,
-        "wall_s": result.wall_s,
+        "recorded_s": result.input.recorded_s,
+        "wall_s": result.ending.wall_s,
         "cpu_s": cpu_s,
         "peak_mb": peak_memory_mb(),
     }
@@ -69,7 +69,9 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
     result = run(sequence, config, viewer=reference, progress=reference)
     cpu_s = time.process_time() - began_s
     result.check()
-    stages = {name: result.timing.column(name).tolist() for name in result.timing.stages()}
+    stages = {
+        name: result.logs.timing.column(name).tolist() for name in result.logs.timing.stages()
+    }
     stages["frame"] = reference.frames.wall
     stages["decoding"] = sequence.decoding.wall
     return {
@@ -77,7 +79,7 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
         "frame": reference.frames.cpu,
         "decoding": sequence.decoding.cpu,
         "stages": stages,
-        "wall_s": result.wall_s,
+        "wall_s": result.ending.wall_s,
         "cpu_s": cpu_s,
     }
 

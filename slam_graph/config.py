@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configuration of a run: typed, closed and complete, so that a result can name all its settings.
 
-Defaults are laid under a YAML file, and the file under `key=value` overrides.
+Later sources replace earlier ones: defaults, algorithm, YAML file, options, overrides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
@@ -21,13 +21,23 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.maps.map_config import LocalizationConfig, MapConfig
-from slam_graph.settings.base import Settings
-from slam_graph.settings.tree import ConfigTree, closest, override, read_tree, validate
+from slam_graph.settings.base import Settings, expert
+from slam_graph.settings.tree import ConfigTree, closest, override_trees, read_tree, validate
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
-DEFAULT_ALGORITHM = "msckf"
+__all__ = [
+    "LimitsConfig",
+    "RunConfig",
+    "algorithm_names",
+    "algorithm_tree",
+    "config_folder",
+    "dump_yaml",
+    "load_config",
+]
 
-CAMERA_WORDS = {"mono": 1, "stereo": 2, "all": None}
+_DEFAULT_ALGORITHM = "msckf"
+
+_CAMERA_WORDS = {"mono": 1, "stereo": 2, "all": None}
 
 
 def config_folder() -> Path:
@@ -57,16 +67,6 @@ def algorithm_tree(name: str) -> ConfigTree:
     return read_tree(config_folder() / "algorithms" / f"{name}.yaml")
 
 
-def is_algorithm_file(path: Path) -> bool:
-    """Whether a YAML file holds the table of one algorithm rather than the settings of a run.
-
-    Raises:
-        ConfigError: if it cannot be read.
-    """
-    keys = read_tree(path).values.keys()
-    return bool(keys & AlgorithmConfig.model_fields.keys()) and "algorithm" not in keys
-
-
 def _named_algorithm(value: Any) -> Any:
     """Read the table of an algorithm that is given by its name."""
     return validate(AlgorithmConfig, algorithm_tree(value)) if isinstance(value, str) else value
@@ -74,24 +74,25 @@ def _named_algorithm(value: Any) -> Any:
 
 def _counted_cameras(value: Any) -> Any:
     """Read `mono`, `stereo` and `all` as numbers of cameras."""
-    return CAMERA_WORDS.get(value, value) if isinstance(value, str) else value
+    return _CAMERA_WORDS.get(value, value) if isinstance(value, str) else value
 
 
 class LimitsConfig(Settings):
-    """Beyond what an estimate counts as diverged."""
+    """Beyond these limits a run counts as diverged and ends."""
 
-    max_speed: float = Field(default=100.0, gt=0)
-    """Largest sane speed, m/s."""
-    max_position_sigma_m: float = Field(default=100.0, gt=0)
-    """Largest standard deviation of the position on any axis."""
-    max_gyro_bias: float = Field(default=0.5, gt=0)
-    """Largest sane gyroscope bias, rad/s (0.35 is what a data sheet allows the cheapest ones)."""
-    max_accel_bias: float = Field(default=3.0, gt=0)
-    """Largest sane accelerometer bias, m/s² (1.5 is what a data sheet allows the cheapest ones)."""
-    max_rejected_share: float = Field(default=0.6, gt=0, le=1)
-    """Largest sane share of the features that the gate rejects …"""
-    disagreement_s: float = Field(default=3.0, gt=0)
-    """… over so many seconds in which images were tested."""
+    max_speed: float = expert(default=100.0, gt=0)
+    """Largest plausible speed, m/s."""
+    max_position_sigma_m: float = expert(default=100.0, gt=0)
+    """Largest standard deviation of the position along any axis."""
+    max_gyro_bias: float = expert(default=0.5, gt=0)
+    """Largest plausible gyroscope bias, rad/s (data sheets of cheap sensors allow 0.35)."""
+    max_accel_bias: float = expert(default=3.0, gt=0)
+    """Largest plausible accelerometer bias, m/s² (data sheets of cheap sensors allow 1.5)."""
+    max_rejected_share: float = expert(default=0.6, gt=0, le=1)
+    """Largest share of the tested features that the χ² gate may reject over `disagreement_s`."""
+    disagreement_s: float = expert(default=3.0, gt=0)
+    """Length of the interval over which that share is taken; only time with tested features
+    counts."""
 
 
 class RunConfig(Settings):
@@ -100,23 +101,26 @@ class RunConfig(Settings):
     algorithm: Annotated[
         AlgorithmConfig,
         BeforeValidator(_named_algorithm, json_schema_input_type=str | AlgorithmConfig),
-    ] = Field(default_factory=lambda: _named_algorithm(DEFAULT_ALGORITHM))
+    ] = Field(default_factory=lambda: _named_algorithm(_DEFAULT_ALGORITHM))
     """Name of an algorithm, path of its YAML file, or its table of policies."""
     cameras: Annotated[
         int | None, BeforeValidator(_counted_cameras, json_schema_input_type=int | str | None)
     ] = Field(default=None, ge=1)
-    """How many cameras to use: mono, stereo, a number; all that the recording has if not said."""
+    """How many cameras to use: mono, stereo, a number, or null for all of the recording. Fewer are
+    faster; without a second camera the scale comes from the IMU alone."""
     start_s: float = Field(default=0.0, ge=0)
-    """Where to start, in seconds after the first frame."""
+    """Where to start, in seconds after the first frame; skips what cannot be used, such as hands in
+    front of the camera."""
     duration_s: float | None = Field(default=None, gt=0)
-    """How many seconds to run; to the end if not said."""
+    """How many seconds to run; null runs to the end. Set it for a quick try."""
     seed: int = Field(default=0, ge=0)
-    """Seed of all random numbers."""
-    min_coverage: float = Field(default=0.5, ge=0, le=1)
-    """Smallest part of the time asked for that the estimate must cover for a run to succeed."""
+    """Seed of all random numbers. The same seed gives the same result; change it to see how much of
+    a result is chance."""
+    min_coverage: float = expert(default=0.5, ge=0, le=1)
+    """Smallest share of the time asked for that the estimate must cover for a run to succeed."""
     overlap: bool = True
-    """Whether the front end tracks the next frame in a thread while the back end works on this one;
-    the results are the same."""
+    """Whether the front end tracks the next frame in a thread while the back end works on this one.
+    The results are the same; switch it off to time the parts of a run apart."""
     frontend: FrontendConfig = FrontendConfig()
     """From images to features."""
     backend: BackendConfig = BackendConfig()
@@ -124,7 +128,7 @@ class RunConfig(Settings):
     final_ba: FinalBaConfig = FinalBaConfig()
     """The bundle adjustment of the whole recording at the end of a run."""
     loop_closure: LoopClosureConfig = LoopClosureConfig()
-    """What takes the drift out at the end, where places are seen again."""
+    """Recognising places at the end of a run and correcting the drift between visits."""
     map: MapConfig = MapConfig()
     """Whether the map is saved at the end."""
     localization: LocalizationConfig = LocalizationConfig()
@@ -145,47 +149,98 @@ class RunConfig(Settings):
             raise PydanticCustomError("unused", "{reason}", {"reason": reason})
         return backend
 
+    def with_overrides(
+        self, overrides: str | Iterable[str] | Mapping[str, Any] = (), **options: Any
+    ) -> Self:
+        """The same settings with some changed, checked again.
+
+            config.with_overrides({"backend.noise.pixel_sigma": 1.5}, seed=3)
+
+        Args:
+            overrides: as for `load_config`.
+            options: as for `load_config`.
+
+        Raises:
+            ConfigError: if a change does not fit the schema.
+        """
+        tree = ConfigTree(self.model_dump(exclude_unset=True))
+        return validate(type(self), _changed(tree, overrides, options))
+
 
 def load_config(
-    file: Path | str | None = None, overrides: Iterable[str] = (), **options: Any
+    file: Path | str | None = None,
+    overrides: str | Iterable[str] | Mapping[str, Any] = (),
+    **options: Any,
 ) -> RunConfig:
     """The settings of a run.
 
+        load_config("msckf", {"backend.noise.pixel_sigma": 1.5}, cameras="mono", seed=3)
+
     Args:
-        file: YAML file laid over the defaults.
-        overrides: `a.b=value` laid over file and options, in their order.
-        options: top-level settings by name, laid over the file; None leaves a setting as it is.
+        file: YAML file that replaces defaults; or the name of an algorithm (`msckf`) or a YAML file
+            of one, as for the option `algorithm`.
+        overrides: changes in their order, each by its dotted key: a mapping, or texts `a.b=value`
+            as for `--set`. They come last.
+        options: top-level settings by name, which replace those of the file; None changes nothing.
 
     Raises:
         ConfigError: one line that names the file and line, the option or the override at fault.
     """
-    tree = ConfigTree({"algorithm": DEFAULT_ALGORITHM})
+    tree = ConfigTree()
     if file is not None:
-        tree.merge(read_tree(Path(file)))
-    said = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in options.items()
-        if value is not None
-    }
-    tree.merge(ConfigTree(said, {(name,): f"option {name}" for name in said}))
-    changes = [override(text) for text in overrides]
-    for change in changes:  # which algorithm comes first: other overrides may reach into it
+        tree = _algorithm_or_settings(file)
+    return validate(RunConfig, _changed(tree, overrides, options))
+
+
+def _algorithm_or_settings(file: Path | str) -> ConfigTree:
+    """The settings of a file; or those that choose the algorithm that it names or holds."""
+    name = str(file)
+    if Path(name).suffix == "" and not Path(name).exists():
+        if name in algorithm_names():
+            return ConfigTree({"algorithm": name})
+        raise ConfigError(
+            f"'{name}' is neither a YAML file nor an algorithm; {closest(name, algorithm_names())}"
+        )
+    tree = read_tree(Path(file))
+    if "algorithm" not in tree.values and tree.values.keys() & AlgorithmConfig.model_fields.keys():
+        return ConfigTree({"algorithm": name})
+    return tree
+
+
+def _changed(
+    tree: ConfigTree,
+    overrides: str | Iterable[str] | Mapping[str, Any],
+    options: Mapping[str, Any],
+) -> ConfigTree:
+    """The tree with options and overrides merged into it, and the algorithm's table expanded."""
+    tree.values.setdefault("algorithm", _DEFAULT_ALGORITHM)
+    given = {name: _plain(value) for name, value in options.items() if value is not None}
+    tree.merge(ConfigTree(given, {(name,): f"option {name}" for name in given}))
+    changes = override_trees(overrides)
+    for change in changes:  # the algorithm's name first: other overrides may change its table
         if isinstance(change.values.get("algorithm"), str):
             tree.merge(change)
     _expand_algorithm(tree)
     for change in changes:
         if not isinstance(change.values.get("algorithm"), str):
             tree.merge(change)
-    return validate(RunConfig, tree)
+    return tree
+
+
+def _plain(value: Any) -> Any:
+    """An option as a YAML file would have it."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(exclude_unset=True)
+    return str(value) if isinstance(value, Path) else value
 
 
 def dump_yaml(config: BaseModel) -> str:
-    """The settings as YAML that `load_config` reads back, with what each means as a comment."""
+    """The settings as YAML that `load_config` reads back, each with its meaning as a comment."""
     return "\n".join(_yaml_lines(config, config.model_dump(mode="json"), "")) + "\n"
 
 
 def _expand_algorithm(tree: ConfigTree) -> None:
-    """Replace the name of an algorithm by its table, so that overrides can reach into it."""
+    """Replace the name of an algorithm by its table, so that overrides can change the table."""
     name = tree.values["algorithm"]
     if not isinstance(name, str):
         return

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counted warnings: what went wrong without ending the run, by cause.
 
-A `Diagnostics` is passed to whatever reads or estimates. It counts every event by its kind, and
-logs the first few of each kind through `logging`, so that a fault that repeats on every frame
-neither floods the log nor gets lost: the counts go into `metrics.json`.
+A `Diagnostics` is passed to whatever reads or estimates. It counts every event by its kind and logs
+the first few of each kind, so that a fault that repeats on every frame neither floods the log nor
+gets lost. The counts go into `metrics.json`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from __future__ import annotations
 import logging
 from collections import Counter
 
+__all__ = ["Diagnostics"]
+
 logger = logging.getLogger("slam_graph")
 
-LOGGED_PER_KIND = 5
-"""How many events of one kind are written to the log before only the count goes on."""
+_LOGGED_PER_KIND = 5
+"""So many events of one kind are written to the log; further ones are only counted."""
 
 
 class Diagnostics:
@@ -31,8 +33,8 @@ class Diagnostics:
     def warn(self, kind: str, message: str) -> None:
         """Count one event of `kind` and log `message` if it is among the first of its kind."""
         self.counts[kind] += 1
-        if self.counts[kind] <= LOGGED_PER_KIND:
+        if self.counts[kind] <= _LOGGED_PER_KIND:
             last = (
-                " (further ones are only counted)" if self.counts[kind] == LOGGED_PER_KIND else ""
+                " (further ones are only counted)" if self.counts[kind] == _LOGGED_PER_KIND else ""
             )
             logger.warning("%s: %s%s", kind, message, last)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that slam_graph raises: one tree, each branch with the exit code of the command line.
+"""The errors that slam_graph raises: one tree, each branch with an exit code of the command line.
 
-Every message is one line that names what is wrong, where (file and line where there is one), and
+Every message is one line that says what is wrong, where (with file and line, if there are any), and
 what to do about it.
 """
 
@@ -11,6 +11,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from typing import ClassVar
+
+__all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError", "closest"]
 
 
 class SlamGraphError(Exception):

@@ -5,6 +5,7 @@
 import importlib.util
 import re
 from pathlib import Path
+from typing import Any
 
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
@@ -16,7 +17,12 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)")
 SOURCE = re.compile(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|yaml|md|ipynb|png))`")
 
-KIND = re.compile(r"(?:\.warn\(|diagnostics\.counts\[|Fault\(|kind = )\s*\"([a-z_]+)\"")
+KIND = re.compile(
+    r"(?:\.warn\(|warn_on_failure\([\w.]+,|diagnostics\.counts\[|Fault\(|kind = )\s*\"([a-z_]+)\""
+)
+
+MOST_PLAIN_SETTINGS = 45
+"""Settings that a user can sensibly choose; all others are expert settings or constants."""
 
 
 def name(path: Path) -> str:
@@ -70,27 +76,42 @@ def test_every_group_of_entry_points_is_in_the_documents() -> None:
     assert not {group for group in groups if f"| `{group}` |" not in page}
 
 
-def test_the_list_of_settings_is_current() -> None:
+def generator() -> Any:
+    """The script that writes the pages of settings, as a module."""
     script = ROOT / "docs" / "generate_configuration.py"
     spec = importlib.util.spec_from_file_location("generate_configuration", script)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    written = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    assert written == module.page(), "run `make docs`"
+    return module
+
+
+def test_the_lists_of_settings_are_current() -> None:
+    module = generator()
+    for path, page in ((module.PAGE, module.page()), (module.EXPERT_PAGE, module.expert_page())):
+        assert path.read_text(encoding="utf-8") == page, f"{path.name}: run `make docs`"
+
+
+def test_the_settings_that_matter_exist_and_are_plain() -> None:
+    module = generator()
+    matter = [advice.setting for advice in module.TEN_THAT_MATTER]
+    plain = {*module.plain_settings().values(), "algorithm"}  # which is a table, or its name
+    assert len(matter) == len(set(matter)) == 10
+    assert not set(matter) - plain
+
+
+def test_plain_settings_are_few() -> None:
+    plain = generator().plain_settings()
+    assert len(plain) <= MOST_PLAIN_SETTINGS, f"{len(plain)} plain settings: {sorted(plain)}"
 
 
 def test_every_kind_of_warning_is_explained() -> None:
     kinds = set()
     for path in (ROOT / "slam_graph").rglob("*.py"):
         source = path.read_text(encoding="utf-8")
-        kinds |= set(
-            re.findall(
-                r"(?:\.warn\(|diagnostics\.counts\[|Fault\(|kind = )\s*\"([a-z_]+)\"", source
-            )
-        )
-    assert {"imu_gap", "image_unreadable", "feature_rejected_by_gate"} <= kinds
+        kinds |= set(KIND.findall(source))
+    assert {"imu_gap", "image_unreadable", "feature_rejected_by_gate", "map_failed"} <= kinds
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"^\| `([a-z_]+)` \|", page, re.MULTILINE))
     assert not kinds - explained

@@ -24,11 +24,12 @@ from slam_graph.evaluation.ape import ape
 from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
 from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
-from slam_graph.experiment.comparison_results import ALIGNMENTS, peak_memory_mb
+from slam_graph.experiment.comparison_results import ALIGNMENTS
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
 from slam_graph.pipeline.run import run as run_pipeline
+from slam_graph.results.metrics import peak_memory_mb
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")
@@ -84,7 +85,7 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
     # the error of the start is drawn from its covariance, which is not to be reduced
     config = load_config(None, ["backend.initialization.fix_gauge=false"], algorithm="swf")
     result = run_pipeline(open_dataset(tracks), config)
-    truth = result.truth_of_run()
+    truth = result.groundtruth
     assert truth is not None
     file = folder / "runs" / "sim_figure8_seed0" / "swf.npz"
     with np.load(file, allow_pickle=False) as series:
@@ -93,11 +94,11 @@ def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(
             np.testing.assert_allclose(series[f"translation_m_{mode}"], expected.values, atol=1e-12)
         assert np.all(np.diff(series["distance_m"]) >= 0.0)
         assert len(series["nees_position"]) == len(series["nees_time_s"]) > 0
-        assert len(series["steps"]) == len(result.steps) > 0
+        assert len(series["steps"]) == len(result.logs.steps) > 0
         assert np.all(series["columns"] >= 15)
         assert 0.5 < np.median(series["nis_ratio"]) < 1.5
         assert np.all(series["cost_before"] >= 0.0)
-        assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.frames
+        assert len(series["ms_backend"]) == len(series["frame_time_s"]) == result.logs.frames
     table = json.loads(file.with_suffix(".json").read_text())
     ours = table["metrics"]["accuracy"]["none"]["ate"]
     assert ours == result.metrics["accuracy"]["none"]["ate"]

@@ -211,7 +211,7 @@ def test_files_and_metrics_hold_it_and_the_causal_estimate_is_as_without(
     texts = [(tmp_path / name / "trajectory.tum").read_text() for name in ("on", "off")]
     assert texts[0] == texts[1]
     rows = (tmp_path / "on" / "trajectory_smoothed.tum").read_text().splitlines()
-    assert len(rows) == demo.frames == demo.metrics["final_ba"]["frames"]
+    assert len(rows) == demo.logs.frames == demo.metrics["final_ba"]["frames"]
     assert not (tmp_path / "off" / "trajectory_smoothed.tum").exists()
     assert off.metrics["final_ba"] is None
     assert demo.final_ba is not None

@@ -117,7 +117,7 @@ def test_random_matches_do_little_harm(
 
     monkeypatch.setattr(CornerTracking, "follow", spoilt)
     result = run(open_dataset(folder), load_config(duration_s=8))
-    assert result.features["rejected_ransac"] > 0.15 * result.features["tracked"]
+    assert result.logs.features["rejected_ransac"] > 0.15 * result.logs.features["tracked"]
     assert ate_m(result) < 2.0 * clean_m
 
 
@@ -158,7 +158,7 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     black = wall(np.zeros((480, 752), np.uint8), 0, 5.0)
     assert 0.25 < np.mean(black > 0) < 0.4
     result = run(Edited(folder, wall), load_config(duration_s=8))
-    assert (result.trajectory.stamps_ns[0] - result.start_ns) * 1e-9 < 2.0
+    assert (result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9 < 2.0
     assert ate_m(result) < 1.65 * clean_m
 
 
@@ -172,8 +172,8 @@ def test_a_thread_for_the_front_end_changes_nothing(folder: Path) -> None:
         kept = Kept()
         runs.append((run(open_dataset(folder), config, recorder=kept), kept.frames))
     (one, frames), (other, frames_again) = runs
-    assert one.features["rejected_gate"] > 0
-    assert one.features == other.features
+    assert one.logs.features["rejected_gate"] > 0
+    assert one.logs.features == other.logs.features
     for a, b in zip(frames, frames_again, strict=True):
         for seen, again in zip(a.cameras, b.cameras, strict=True):
             np.testing.assert_array_equal(seen.ids, again.ids)

@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.pipeline.run import run
+from slam_graph.results.run_result import RunResult
+from slam_graph.results.saved_run import SavedRun, load_result
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 
@@ -66,6 +68,48 @@ def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
     assert (without / "trajectory.tum").read_text() == (folder / "trajectory.tum").read_text()
 
 
+def test_a_result_of_all_stages_reads_back_as_it_was(flight: Path, tmp_path: Path) -> None:
+    overrides = {"loop_closure.enabled": True, "loop_closure.places.words": 300}
+    result = run(flight, overrides={**overrides, "map.enabled": True})
+    result.check()
+    located = run(flight, known_map=result.slam_map, duration_s=10.0, overrides={"min_coverage": 0})
+    for name, found in (("all", result), ("located", located)):
+        found.save(tmp_path / name)
+        assert_reads_back(found, load_result(str(tmp_path / name)))
+    assert result.loop_closed is not None
+    assert result.slam_map is not None
+    assert located.in_map is not None
+
+
+def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
+    """Every accessor of a saved run says what the result says."""
+    names = {name for name in dir(SavedRun) if not name.startswith("_")}
+    assert names <= set(dir(RunResult))
+    names |= {"metrics"}
+    trajectories = {"trajectory", "best_trajectory", "smoothed", "loop_closed", "in_map"}
+    for name in trajectories | {"groundtruth"}:
+        true, found = getattr(result, name), getattr(saved, name)
+        assert (true is None) == (found is None), name
+        if true is not None:
+            np.testing.assert_array_equal(found.stamps_ns, true.stamps_ns)
+            np.testing.assert_allclose(found.positions, true.positions, atol=1e-9)
+            np.testing.assert_allclose(found.quaternions, true.quaternions, atol=1e-9)
+    for name in ("velocities", "accel_biases", "gyro_biases"):
+        true, found = getattr(result.trajectory, name), getattr(saved.trajectory, name)
+        np.testing.assert_allclose(found, true, rtol=1e-8)
+    np.testing.assert_allclose(saved.sigmas, result.sigmas, rtol=1e-8)
+    np.testing.assert_array_equal(saved.points, result.points)
+    assert (saved.slam_map is None) == (result.slam_map is None)
+    if saved.slam_map is not None and result.slam_map is not None:
+        np.testing.assert_array_equal(saved.slam_map.points, result.slam_map.points)
+    assert len(saved.rig.cameras) == len(result.rig.cameras)
+    tested = trajectories | {"groundtruth", "sigmas", "points", "slam_map", "rig"}
+    for name in ("metrics", "config", "status", "message", "coverage"):
+        assert getattr(saved, name) == getattr(result, name), name
+        tested.add(name)
+    assert tested == names
+
+
 def test_tracks_without_descriptors_are_said_to_have_no_loops() -> None:
     tracks = TrackConfig(features=30)
     sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
@@ -83,7 +127,7 @@ def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatc
         def fail(*_: object, error: BaseException = error) -> None:
             raise error
 
-        monkeypatch.setattr("slam_graph.pipeline.loop_stage.close_loops", fail)
+        monkeypatch.setattr("slam_graph.pipeline.loops.close_loops", fail)
         result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
         assert result.status == "ok"
         assert len(result.trajectory) > 10

@@ -127,7 +127,7 @@ def ate_m(result: RunResult) -> float:
 
 
 def started_s(result: RunResult) -> float:
-    return float(result.trajectory.stamps_ns[0] - result.start_ns) * 1e-9
+    return float(result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9
 
 
 def test_an_object_through_a_third_of_the_view_does_little_harm(calibration: Path) -> None:

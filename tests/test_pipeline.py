@@ -15,8 +15,8 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.pipeline.known_start import true_state
 from slam_graph.pipeline.run import run
+from slam_graph.pipeline.start import true_state
 from slam_graph.pipeline.supervision import DivergenceError, check_sane
 from slam_graph.sensors.measurements import Packet
 
@@ -74,9 +74,9 @@ def test_the_same_seed_gives_the_same_trajectory_and_all_are_told() -> None:
     np.testing.assert_array_equal(first.trajectory.positions, second.trajectory.positions)
     assert first.status == "ok"
     first.check()
-    assert watcher.calls == ["open", *["write", "show"] * first.frames, "close"]
+    assert watcher.calls == ["open", *["write", "show"] * first.logs.frames, "close"]
     assert watcher.stamps == sorted(watcher.stamps)
-    assert len(watcher.stamps) == first.frames
+    assert len(watcher.stamps) == first.logs.frames
     stages = first.metrics["timing"]["stages"]
     assert {"read", "frontend", "backend", "total"} <= stages.keys()
     assert stages["total"]["mean_ms"] >= stages["backend"]["mean_ms"]
@@ -95,7 +95,7 @@ def test_a_fault_during_the_run_loses_nothing_and_is_raised_by_check(
 ) -> None:
     watcher = Watcher()
     result = run(Faulty(fault), load_config(overrides=[STATIC]), viewer=watcher)
-    assert (result.status, result.frames) == (status, FRAMES_BEFORE_FAULT)
+    assert (result.status, result.logs.frames) == (status, FRAMES_BEFORE_FAULT)
     assert len(result.history) > 0
     assert watcher.calls[-1] == "close"
     assert result.save(tmp_path)
@@ -109,9 +109,9 @@ def test_a_part_of_a_recording_is_run() -> None:
         open_dataset("demo"), load_config(start_s=1.0, duration_s=0.5, overrides=["min_coverage=0"])
     )
     info = open_dataset("demo").info()
-    assert result.frames == 11
-    assert result.last_frame_ns is not None
-    assert result.last_frame_ns <= info.start_ns + 1_500_000_000
+    assert result.logs.frames == 11
+    assert result.logs.last_frame_ns is not None
+    assert result.logs.last_frame_ns <= info.start_ns + 1_500_000_000
     assert result.status == "not_initialized"
     with pytest.raises(EstimationError, match="never initialised"):
         result.check()

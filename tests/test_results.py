@@ -16,11 +16,12 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.results.metrics import finite
+from slam_graph.results.metrics import SCHEMA_VERSION, finite
 from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
 from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
-from slam_graph.results.run_result import RunResult
+from slam_graph.results.run_result import RunInput, RunResult
+from slam_graph.results.saved_run import load_result
 from slam_graph.sensors.rig import Rig
 
 NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
@@ -136,15 +137,15 @@ def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
     """A result whose states are a trajectory that another system estimated."""
     start, end = int(estimate.stamps_ns[0]), int(estimate.stamps_ns[-1])
     info = SequenceInfo("clip", "euroc", "images", 2, len(estimate), start, end, 0, True)
-    result = RunResult(info, load_config(), Rig(()), start, end, truth=truth)
+    result = RunResult(RunInput(info, load_config(), Rig(()), start, end, truth))
     for index in range(len(estimate)):
         stamp, zero = int(estimate.stamps_ns[index]), np.zeros(3)
         covariance = np.eye(15) * 1e-4
         biases = {"accel_bias": zero, "gyro_bias": zero}
         state = NavState(stamp, estimate.pose(index), zero, **biases, covariance=covariance)
         result.history.append(state)
-        result.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
-    result.wall_s = 2.0
+        result.logs.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
+    result.ending.wall_s = 2.0
     return result
 
 
@@ -167,7 +168,7 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     assert float(rows[0]["sigma_position_body_x_m"]) == pytest.approx(0.01)
 
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert metrics["schema_version"] == 1
+    assert metrics["schema_version"] == SCHEMA_VERSION
     assert metrics["extent"]["coverage"] == 1.0
     assert metrics["accuracy"]["se3"]["ate"]["translation_m"]["rmse"] < 0.0061
     freer = [metrics["accuracy"][mode]["ate"] for mode in ("none", "yaw", "se3", "sim3")]
@@ -176,9 +177,33 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     assert metrics["accuracy"]["none"]["rpe"]["translation_m"]["rmse"] < 0.0117
     assert metrics["nees"]["alignment"] == "yaw"
     assert metrics["features_per_frame"] == {"tracked": 10.0}
-    assert metrics["timing"]["real_time_factor"] == pytest.approx(result.recorded_s / 2.0)
+    assert metrics["timing"]["real_time_factor"] == pytest.approx(result.input.recorded_s / 2.0)
     assert (tmp_path / "out" / "trajectory.png").read_bytes()[:4] == b"\x89PNG"
     assert load_config(tmp_path / "out" / "config.yaml") == result.config
+
+
+def test_a_folder_without_a_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no result of a run here"):
+        load_result(tmp_path)
+    with pytest.raises(DataError, match="no result of a run here"):
+        load_result(tmp_path / "nowhere")
+
+
+def test_the_latest_result_of_a_recording_is_read(tmp_path: Path) -> None:
+    info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
+    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
+    folder = create_run_folder(tmp_path, "clip")
+    result.save(folder)
+    link_latest(folder)
+    saved = load_result(tmp_path / "clip")
+    assert (saved.status, len(saved.trajectory)) == ("ok", 0)
+    assert saved.smoothed is None
+    (folder / "map.ply").write_bytes(b"ply\n")
+    with pytest.raises(DataError, match="not a point cloud"):
+        saved.points  # noqa: B018
+    (folder / "states.csv").write_text("stamp_ns,a\n1,2\n")
+    with pytest.raises(DataError, match="not the states of a run"):
+        load_result(folder).sigmas  # noqa: B018
 
 
 def test_a_result_without_states_is_written_too(
@@ -186,7 +211,7 @@ def test_a_result_without_states_is_written_too(
 ) -> None:
     caplog.set_level(logging.INFO)
     info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
-    result = RunResult(info, load_config(), Rig(()), 0, 10**9)
+    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
     result.save(tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["accuracy"] is None

@@ -59,6 +59,9 @@ def _problem_name(path: Path) -> str:
 def read_bal(path: Path | str) -> BalProblem:
     """Read a problem.
 
+    Args:
+        path: of a text file, or of one compressed by bzip2 whose name ends with `.bz2`.
+
     Raises:
         DataError: naming file and line, if the file cannot be read or unpacked, is cut short or too
             long, has no observations, numbers that are not finite, or an index out of range.

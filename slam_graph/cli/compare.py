@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.experiment.comparison_plan import Comparison
     from slam_graph.experiment.tasks import Task
 
-INTERRUPTED = 130
+__all__ = ["compare"]
 
 
 def compare(

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import Json
+from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
 
 if TYPE_CHECKING:
@@ -18,29 +19,31 @@ if TYPE_CHECKING:
     from slam_graph.geometry.trajectory import Trajectory
     from slam_graph.geometry.trajectory_alignment import AlignmentMode
 
-Align = Literal["none", "yaw", "se3", "sim3"]
+__all__ = ["ape", "rpe"]
 
-STATISTICS = ("max", "mean", "median", "min", "rmse", "sse", "std")
+_Align = Literal["none", "yaw", "se3", "sim3"]
 
-Reference = Annotated[
+_STATISTICS = ("max", "mean", "median", "min", "rmse", "sse", "std")
+
+_Reference = Annotated[
     Path, typer.Argument(help="True trajectory: TUM file, EuRoC CSV or EuRoC folder.")
 ]
-Estimate = Annotated[Path, typer.Argument(help="Trajectory to judge: TUM file or EuRoC CSV.")]
-Relation = Annotated[
+_Estimate = Annotated[Path, typer.Argument(help="Trajectory to evaluate: TUM file or EuRoC CSV.")]
+_Relation = Annotated[
     PoseRelation,
     typer.Option("-r", "--pose_relation", help="Part of the difference of two poses that counts."),
 ]
-AlignFlag = Annotated[
+_AlignFlag = Annotated[
     bool, typer.Option("-a", help="Align with Umeyama's method (the same as --align se3).")
 ]
-ScaleFlag = Annotated[
+_ScaleFlag = Annotated[
     bool,
     typer.Option("-s", "--correct_scale", help="Correct the scale; with -a that is --align sim3."),
 ]
-AlignOption = Annotated[
-    Align | None, typer.Option("--align", help="Align before errors are taken.")
+_AlignOption = Annotated[
+    _Align | None, typer.Option("--align", help="Align before errors are taken.")
 ]
-MaxDifference = Annotated[
+_MaxDifference = Annotated[
     float | None,
     typer.Option(
         "--t_max_diff",
@@ -49,17 +52,16 @@ MaxDifference = Annotated[
         "away; without it the truth is interpolated.",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def ape(
-    reference: Reference,
-    estimate: Estimate,
-    relation: Relation = "trans_part",
-    align_se3: AlignFlag = False,
-    correct_scale: ScaleFlag = False,
-    align: AlignOption = None,
-    t_max_diff: MaxDifference = None,
+    reference: _Reference,
+    estimate: _Estimate,
+    relation: _Relation = "trans_part",
+    align_se3: _AlignFlag = False,
+    correct_scale: _ScaleFlag = False,
+    align: _AlignOption = None,
+    t_max_diff: _MaxDifference = None,
     as_json: Json = False,
 ) -> None:
     """Absolute pose error of ESTIMATE against REFERENCE."""
@@ -72,9 +74,9 @@ def ape(
 
 
 def rpe(
-    reference: Reference,
-    estimate: Estimate,
-    relation: Relation = "trans_part",
+    reference: _Reference,
+    estimate: _Estimate,
+    relation: _Relation = "trans_part",
     delta: Annotated[float, typer.Option("-d", "--delta", min=0.0, help="Length of a step.")] = 1.0,
     delta_unit: Annotated[
         DeltaUnit,
@@ -92,10 +94,10 @@ def rpe(
     pairs_from_reference: Annotated[
         bool, typer.Option("--pairs_from_reference", help="Measure steps along the reference.")
     ] = False,
-    align_se3: AlignFlag = False,
-    correct_scale: ScaleFlag = False,
-    align: AlignOption = None,
-    t_max_diff: MaxDifference = None,
+    align_se3: _AlignFlag = False,
+    correct_scale: _ScaleFlag = False,
+    align: _AlignOption = None,
+    t_max_diff: _MaxDifference = None,
     as_json: Json = False,
 ) -> None:
     """Relative pose error (drift) of ESTIMATE against REFERENCE."""
@@ -123,7 +125,7 @@ def rpe(
     _report("RPE", result, relation, mode, steps, as_json)
 
 
-def _alignment(align_se3: bool, correct_scale: bool, align: Align | None) -> AlignmentMode:
+def _alignment(align_se3: bool, correct_scale: bool, align: _Align | None) -> AlignmentMode:
     """The alignment that the flags ask for."""
     if align is not None:
         if align_se3 or correct_scale:
@@ -176,4 +178,4 @@ def _report(
         f"{metric} {relation}{f' [{unit}]' if unit else ''}{step}, alignment: {mode}, "
         f"{result.poses} shared poses, {len(result.values)} errors"
     )
-    echo_table(((name, f"{statistics[name]:.6f}") for name in STATISTICS), indent="  ")
+    echo_table(((name, f"{statistics[name]:.6f}") for name in _STATISTICS), indent="  ")

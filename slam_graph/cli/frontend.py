@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph frontend`: the front end alone, its tracks drawn and judged; and several compared."""
+"""`slam-graph frontend`: run the front end alone and draw its tracks; compare several."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import (
+from slam_graph.cli.options import (
     Calibration,
     Cameras,
+    ConfigFile,
     Data,
     Duration,
     Format,
     Groundtruth,
     Json,
+    Overrides,
     Sources,
     Start,
     open_recording,
 )
-from slam_graph.cli.output import echo_json, echo_table, number
+from slam_graph.cli.printing import echo_json, echo_table, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,11 +35,13 @@ if TYPE_CHECKING:
     from slam_graph.experiment.frontend_comparison import FrontendReport
     from slam_graph.pipeline.tracking import TrackedPacket
 
-EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
+__all__ = ["app"]
+
+_EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
 
-class RunByDefault(TyperGroup):
-    """A group whose first command is meant where none is named: `frontend DATA`."""
+class _RunByDefault(TyperGroup):
+    """A group whose first command is the default: `frontend DATA`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the name of the first command before arguments that do not begin with one."""
@@ -48,7 +51,7 @@ class RunByDefault(TyperGroup):
 
 
 app = typer.Typer(
-    cls=RunByDefault,
+    cls=_RunByDefault,
     help="Run the front end alone and look at its tracks: `frontend DATA` is `frontend run DATA`.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -64,7 +67,7 @@ def run(
     start: Start = None,
     duration: Duration = None,
     picture: Annotated[
-        Path, typer.Option("--picture", help="PNG of the frame in the middle with its tracks.")
+        Path, typer.Option("--picture", help="PNG of the middle frame with its tracks.")
     ] = Path("tracks.png"),
     video: Annotated[
         Path | None, typer.Option("--video", help="MP4 of all frames with their tracks.")
@@ -101,10 +104,10 @@ def compare(
     frontends: Annotated[
         str,
         typer.Option("--frontends", help="METHOD or METHOD/DETECTOR, with commas between."),
-    ] = EVERYTHING,
+    ] = _EVERYTHING,
     algorithm: Annotated[
         str | None,
-        typer.Option("--algorithm", help="Also estimate the trajectory from each one's tracks."),
+        typer.Option("--algorithm", help="Also estimate the trajectory from the tracks of each."),
     ] = None,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -121,10 +124,10 @@ def compare(
     from slam_graph.config import load_config
     from slam_graph.experiment.frontend_comparison import parse_frontends, track, track_and_estimate
 
-    said = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
+    options = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
     runs = {  # all at once, so that a wrong name is found before the first run
-        name: load_config(config, [*(set_ or ()), *changes], **said)
+        name: load_config(config, [*(set_ or ()), *changes], **options)
         for name, changes in parse_frontends(n for n in frontends.split(",") if n).items()
     }
     for name, settings in runs.items():
@@ -137,7 +140,7 @@ def compare(
     if as_json:
         echo_json([_plain(report) for report in reports])
     else:
-        echo_table([COLUMNS, *map(_row, reports)])
+        echo_table([_COLUMNS, *map(_row, reports)])
 
 
 def _watch(
@@ -148,7 +151,7 @@ def _watch(
     record: Path | None,
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
-    """What is done with every frame: drawn, and recorded if asked for."""
+    """A function that draws each frame, and records it if asked for."""
     from slam_graph.datasets.formats.track_recorder import TrackRecorder
     from slam_graph.sensors.measurements import CameraFrame
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
@@ -183,7 +186,7 @@ def _watch(
     return watch
 
 
-COLUMNS = (
+_COLUMNS = (
     "front end",
     "features",
     "length median",
@@ -236,7 +239,7 @@ def _lines(report: FrontendReport) -> list[tuple[str, str]]:
 
 
 def _plain(report: FrontendReport) -> dict[str, Any]:
-    """A report for JSON, which knows no NaN."""
+    """A report for JSON, which has no NaN."""
     table = report.table()
     if table["inliers"] != table["inliers"]:
         table["inliers"] = None

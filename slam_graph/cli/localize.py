@@ -9,21 +9,29 @@ from typing import Annotated, Any
 
 import typer
 
-from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
-from slam_graph.cli.data import (
+from slam_graph.cli.logs import collected_log
+from slam_graph.cli.options import (
+    Algorithm,
     Calibration,
     Cameras,
+    ConfigFile,
     Data,
     Duration,
     Format,
     Groundtruth,
     Json,
+    Output,
+    Overrides,
+    Progress,
+    Rerun,
+    Seed,
     Sources,
     Start,
     open_recording,
 )
-from slam_graph.cli.logs import collected_log
-from slam_graph.cli.run import Output, Progress, Rerun, Seed, execute, report
+from slam_graph.cli.run import execute, report
+
+__all__ = ["localize"]
 
 
 def localize(
@@ -46,7 +54,7 @@ def localize(
         bool | None,
         typer.Option(
             "--final-ba/--no-final-ba",
-            help="Solve the recording as a whole at the end, too (off, unless --config says so).",
+            help="Also bundle adjust the whole recording at the end (off unless --config sets it).",
             show_default=False,
         ),
     ] = None,
@@ -58,22 +66,22 @@ def localize(
 ) -> None:
     """Estimate the trajectory of a recording in the world of a map.
 
-    It is a run as by `slam-graph run`, which also writes the causal pose of every frame in the map
-    to trajectory_map.tum, as soon as the place is recognised. The exit code is 3 if it never is.
+    Runs like `slam-graph run`, and also writes the causal pose of every frame in the map to
+    trajectory_map.tum, once the place is recognised. The exit code is 3 if it never is.
     """
     from slam_graph.config import load_config
     from slam_graph.errors import EstimationError
     from slam_graph.results.map_output import find_map, load_map
 
-    said: dict[str, Any] = {
+    options: dict[str, Any] = {
         "algorithm": algorithm,
         "cameras": cameras,
         "start_s": start,
         "duration_s": duration,
     }
     if final_ba is not None or config is None:
-        said["final_ba"] = {"enabled": bool(final_ba)}
-    settings = load_config(config, set_ or (), **said, seed=seed)
+        options["final_ba"] = {"enabled": bool(final_ba)}
+    settings = load_config(config, set_ or (), **options, seed=seed)
     path = find_map(map_)
     known = load_map(path)
     with collected_log() as log:
@@ -86,10 +94,10 @@ def localize(
         return
     if result.localization.counts["queries"] == 0:
         raise EstimationError(
-            f"{result.info.name}: has neither images nor tracks with descriptors, so that no place "
-            "can be recognised; the trajectory in a world of its own is written"
+            f"{result.input.info.name}: has neither images nor descriptors of tracks, so no place "
+            "can be recognised; the trajectory in its own world is written"
         )
     raise EstimationError(
-        f"{result.info.name}: no frame was recognised in {path}; is it of the same place, seen "
-        "by a camera held alike? The trajectory in a world of its own is written"
+        f"{result.input.info.name}: no frame was recognised in {path}; is it the same place, seen "
+        "from similar directions? The trajectory in its own world is written"
     )

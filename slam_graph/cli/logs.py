@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a command logs: collected for its `run.log`, with warnings on stderr."""
+"""The log of a command: collected for its `run.log`, with warnings on stderr."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+__all__ = ["collected_log", "remove_if_empty"]
 
 
 class _ListHandler(logging.Handler):
@@ -43,7 +45,7 @@ def collected_log() -> Iterator[list[str]]:
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Take away the folder of a run that wrote nothing, and that of its data set if it is empty."""
+    """Remove the folder of a run that wrote nothing, and that of its data set if it is empty."""
     for empty in (folder, folder.parent):
         if empty.is_dir() and not any(empty.iterdir()):
             empty.rmdir()

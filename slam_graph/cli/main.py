@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `slam-graph`: launches a command and turns errors into exit codes.
 
-Exit codes: 0 success; 1 expected failure, said in one line; 2 usage or configuration error; 3 ran
-but never initialised, diverged or covered less than asked; 130 interrupted. Whatever takes long to
-import is imported inside the commands.
+Exit codes: 0 success; 1 expected failure, with one line on stderr; 2 usage or configuration error;
+3 ran, but never initialised, diverged or covered less than asked; 130 interrupted. Modules that are
+slow to import are imported inside the commands.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import typer
 
 from slam_graph.cli import (
     compare,
-    config,
-    data,
+    config_commands,
+    data_commands,
     evaluate,
     frontend,
     localize,
@@ -27,11 +27,14 @@ from slam_graph.cli import (
     run,
     simulate,
 )
+from slam_graph.cli.options import INTERRUPTED
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
 
-# The matrices of a window are a few hundred wide: threads of BLAS cost more there than they bring,
-# ten times as much where other work shares the cores. It reads this when NumPy is first imported.
+__all__ = ["app", "main"]
+
+# The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
+# where other work shares the cores. OpenBLAS reads this when NumPy is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
@@ -50,8 +53,8 @@ app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)
 app.add_typer(frontend.app, name="frontend")
-app.add_typer(data.app, name="data")
-app.add_typer(config.app, name="config")
+app.add_typer(data_commands.app, name="data")
+app.add_typer(config_commands.app, name="config")
 
 
 def _print_version(wanted: bool) -> None:
@@ -73,14 +76,14 @@ def _global_options(
 
 
 def main() -> None:
-    """Launch; an error raised on purpose becomes one line and its exit code."""
+    """Launch a command; a `SlamGraphError` becomes one line on stderr and its exit code."""
     try:
         app(prog_name="slam-graph")
     except SlamGraphError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph map`: what a map holds, its export, and two maps made one."""
+"""`slam-graph map`: show, export and merge maps."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import (
+    ConfigFile,
+    Json,
+    Overrides,
+)
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.maps.map_model import MapRecording, SlamMap
 
-app = typer.Typer(
-    help="Look at maps, export and merge them.", no_args_is_help=True, rich_markup_mode=None
-)
+__all__ = ["app"]
 
-MapPath = Annotated[
+app = typer.Typer(help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode=None)
+
+_MapPath = Annotated[
     Path, typer.Argument(metavar="MAP", help="Map file, or the folder of a run with one.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 
 
 @app.command()
-def info(path: MapPath, as_json: Json = False) -> None:
+def info(path: _MapPath, as_json: Json = False) -> None:
     """Show what a map holds."""
     from slam_graph.results.map_output import find_map, load_map
 
@@ -51,7 +54,7 @@ def info(path: MapPath, as_json: Json = False) -> None:
 
 @app.command()
 def export(
-    path: MapPath,
+    path: _MapPath,
     ply: Annotated[
         Path | None, typer.Option("--ply", help="Points, and keyframes in red, as a point cloud.")
     ] = None,
@@ -59,7 +62,7 @@ def export(
         Path | None,
         typer.Option("--tum", help="Poses of the keyframes; one file for each recording."),
     ] = None,
-    force: Force = False,
+    force: _Force = False,
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
@@ -67,7 +70,7 @@ def export(
     from slam_graph.results.result_files import refuse_to_replace
 
     if ply is None and tum is None:
-        raise ConfigError("nothing to write: say --ply FILE, --tum FILE, or both")
+        raise ConfigError("nothing to write: give --ply FILE, --tum FILE, or both")
     content = load_map(path)
     if ply is not None and tum is not None:
         refuse_to_replace(tum, force)
@@ -81,15 +84,15 @@ def export(
 
 @app.command()
 def merge(
-    first: Annotated[Path, typer.Argument(metavar="MAP", help="Its world is that of the result.")],
+    first: Annotated[Path, typer.Argument(metavar="MAP", help="The result keeps its world.")],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="Map of the same place.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
     config: ConfigFile = None,
     set_: Overrides = None,
-    force: Force = False,
+    force: _Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make one map of two of the same place; nothing is written if they share none."""
+    """Merge two maps of the same place; nothing is written if they do not overlap."""
     from dataclasses import asdict
 
     from slam_graph.config import load_config

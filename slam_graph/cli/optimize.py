@@ -11,18 +11,23 @@ from zipfile import is_zipfile
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.optimization import read_policy
 from slam_graph.cli.optimize_bal import optimize_bal
+from slam_graph.cli.optimize_common import read_policy
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
+from slam_graph.cli.options import (
+    ConfigFile,
+    Json,
+    Overrides,
+)
 from slam_graph.errors import ConfigError, DataError
 
-Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
-Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
-Format = Literal["auto", "pose_graph", "bal"]
-Intrinsics = Literal["per_camera", "shared", "fixed"]
-Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
+__all__ = ["optimize"]
+
+_Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
+_Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
+_Format = Literal["auto", "pose_graph", "bal"]
+_Intrinsics = Literal["per_camera", "shared", "fixed"]
+_Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
 
 def optimize(
@@ -34,40 +39,40 @@ def optimize(
         ),
     ],
     kind: Annotated[
-        Format, typer.Option("--format", help="What FILE is; auto: as its content says.")
+        _Format, typer.Option("--format", help="Kind of FILE; auto detects it from the content.")
     ] = "auto",
-    method: Annotated[Method | None, typer.Option("--method", help="How steps are taken.")] = None,
+    method: Annotated[_Method | None, typer.Option("--method", help="Optimisation method.")] = None,
     initialization: Annotated[
-        Initial | None, typer.Option("--init", help="Where the first estimates come from.")
+        _Initial | None, typer.Option("--init", help="Source of the initial estimates.")
     ] = None,
     robust: Annotated[
-        Robust | None,
-        typer.Option("--robust", help="How false loop closures or outliers are held back."),
+        _Robust | None,
+        typer.Option("--robust", help="Robust loss against false loop closures or outliers."),
     ] = None,
     intrinsics: Annotated[
-        Intrinsics | None,
+        _Intrinsics | None,
         typer.Option("--intrinsics", help="Which intrinsics bundle adjustment estimates."),
     ] = None,
     information: Annotated[
         Literal["angle", "quaternion"] | None,
         typer.Option(
             "--information",
-            help="What the information of 3D rotations is for: GTSAM's (angle, the default) or "
-            "g2o's.",
+            help="Which rotation error the information of 3D edges is for: GTSAM's (angle, the "
+            "default) or g2o's (quaternion).",
         ),
     ] = None,
     certify: Annotated[
-        bool, typer.Option("--certify", help="Say whether the result is the global optimum.")
+        bool, typer.Option("--certify", help="Certify whether the result is the global optimum.")
     ] = False,
     covariances: Annotated[
         bool, typer.Option("--covariances", help="Write the covariance of every pose.")
     ] = False,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="PATH", help="Write the optimised problem here too."),
+        typer.Option("--save", metavar="PATH", help="Also write the optimised problem here."),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Let --save replace a file that is there.")
+        bool, typer.Option("--force", help="Let --save replace an existing file.")
     ] = False,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -84,9 +89,9 @@ def optimize(
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
-        raise DataError(f"{save}: is there already; say --force to replace it")
+        raise DataError(f"{save}: exists already; use --force to replace it")
     if save is not None and (save.is_dir() or not save.parent.is_dir()):
-        raise DataError(f"{save}: cannot be written; name a file in a folder that is there")
+        raise DataError(f"{save}: cannot be written; name a file in an existing folder")
     loss = {("cost", "robust"): robust}
     of_graphs = {("gauss_newton", "method"): method, ("cost", "initialization"): initialization}
     of_bundles = {("cost", "intrinsics"): intrinsics}
@@ -106,8 +111,8 @@ def optimize(
     optimize_bal(file, bundle_policy, save, output, as_json)
 
 
-def _seen_format(file: Path) -> Format:
-    """What a file is, as its content says.
+def _seen_format(file: Path) -> _Format:
+    """The kind of a file, from its content.
 
     Raises:
         DataError: if it is a map.
@@ -124,10 +129,10 @@ def _seen_format(file: Path) -> Format:
 
 
 def _refuse(options: Mapping[str, Any], what: str, file: Path) -> None:
-    """Make sure that options for another kind of problem are not given.
+    """Refuse options for another kind of problem.
 
     Raises:
-        ConfigError: if one is.
+        ConfigError: if one is given.
     """
     for option, value in options.items():
         if value is not None:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from slam_graph.cli.logs import collected_log
-from slam_graph.cli.optimization import timed, write_result
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.optimize_common import timed, write_result
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.bundle_adjustment.bal_policy import BalPolicy
     from slam_graph.results.bundle_result import BalResult
+
+__all__ = ["optimize_bal"]
 
 
 def optimize_bal(

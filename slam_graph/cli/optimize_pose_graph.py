@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from slam_graph.cli.logs import collected_log
-from slam_graph.cli.optimization import timed, write_result
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.optimize_common import timed, write_result
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
     from slam_graph.pose_graph.graph import PoseGraph, RotationInformation
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
     from slam_graph.results.pose_graph_result import PoseGraphResult
+
+__all__ = ["Wanted", "optimize_pose_graph_file"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a run is, on stderr: a bar in a terminal, now and then a line in a log."""
+"""Progress of a run on stderr: a bar in a terminal, a line every few seconds in a log."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import time
 from types import TracebackType
 from typing import Self
 
-BAR_WIDTH = 28
-TERMINAL_PERIOD_S = 0.1
-LOG_PERIOD_S = 10.0
+__all__ = ["ProgressBar"]
+
+_BAR_WIDTH = 28
+_TERMINAL_PERIOD_S = 0.1
+_LOG_PERIOD_S = 10.0
 
 
 class ProgressBar:
@@ -26,7 +28,7 @@ class ProgressBar:
         self._start_ns = start_ns
         self._length_ns = max(end_ns - start_ns, 1)
         self._terminal = sys.stderr.isatty()
-        self._period_s = TERMINAL_PERIOD_S if self._terminal else LOG_PERIOD_S
+        self._period_s = _TERMINAL_PERIOD_S if self._terminal else _LOG_PERIOD_S
         self._began = self._shown = time.monotonic()
         self._frames = 0
         self._line = ""
@@ -45,7 +47,7 @@ class ProgressBar:
             sys.stderr.flush()
 
     def advance(self, stamp_ns: int, initialized: bool) -> None:
-        """Count a frame, and show it if it is time to."""
+        """Count a frame, and refresh the line if it is due."""
         self._frames += 1
         now = time.monotonic()
         self._line = self._text(stamp_ns - self._start_ns, now - self._began, initialized)
@@ -56,7 +58,7 @@ class ProgressBar:
         sys.stderr.flush()
 
     def adjusting(self, done: int, keyframes: int, steps: int) -> None:
-        """Show how far the bundle adjustment over the whole recording is."""
+        """Show the progress of the final bundle adjustment."""
         now = time.monotonic()
         if now - self._shown < self._period_s:
             return
@@ -81,5 +83,5 @@ class ProgressBar:
 
 def _bar(part: float) -> str:
     """A bar of which a part is filled."""
-    filled = round(part * BAR_WIDTH)
-    return f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] "
+    filled = round(part * _BAR_WIDTH)
+    return f"[{'#' * filled}{'.' * (_BAR_WIDTH - filled)}] "

@@ -6,25 +6,33 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.config import Algorithm, ConfigFile, Overrides
-from slam_graph.cli.data import (
+from slam_graph.cli.logs import collected_log, remove_if_empty
+from slam_graph.cli.options import (
+    INTERRUPTED,
+    Algorithm,
     Calibration,
     Cameras,
+    ConfigFile,
     Data,
     Duration,
     Format,
     Groundtruth,
     Json,
+    Output,
+    Overrides,
+    Progress,
+    Rerun,
+    RerunMode,
+    Seed,
     Sources,
     Start,
     open_recording,
 )
-from slam_graph.cli.logs import collected_log, remove_if_empty
-from slam_graph.cli.output import echo_json
+from slam_graph.cli.printing import echo_json
 from slam_graph.cli.progress import ProgressBar
 from slam_graph.cli.summary import echo_summary
 
@@ -36,19 +44,7 @@ if TYPE_CHECKING:
     from slam_graph.maps.map_model import SlamMap
     from slam_graph.results.run_result import RunResult
 
-RerunMode = Literal["off", "save", "spawn", "connect"]
-Seed = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")]
-Output = Annotated[
-    Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
-]
-Rerun = Annotated[
-    RerunMode, typer.Option("--rerun", help="Show the run in Rerun, or save it for Rerun.")
-]
-Progress = Annotated[
-    bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
-]
-
-INTERRUPTED = 130
+__all__ = ["execute", "report", "run"]
 
 
 def run(
@@ -67,7 +63,7 @@ def run(
         bool | None,
         typer.Option(
             "--final-ba/--no-final-ba",
-            help="Solve the recording as a whole at the end (on by default).",
+            help="Bundle adjust the whole recording at the end (on by default).",
             show_default=False,
         ),
     ] = None,
@@ -75,7 +71,7 @@ def run(
         bool | None,
         typer.Option(
             "--loop-closure/--no-loop-closure",
-            help="Take the drift out at the end where places are seen again (off by default).",
+            help="Recognise places at the end and correct the drift (off by default).",
             show_default=False,
         ),
     ] = None,
@@ -99,19 +95,19 @@ def run(
     """
     from slam_graph.config import load_config
 
-    said: dict[str, Any] = {
+    options: dict[str, Any] = {
         "algorithm": algorithm,
         "cameras": cameras,
         "start_s": start,
         "duration_s": duration,
     }
     if final_ba is not None:
-        said["final_ba"] = {"enabled": final_ba}
+        options["final_ba"] = {"enabled": final_ba}
     if loop_closure is not None:
-        said["loop_closure"] = {"enabled": loop_closure}
+        options["loop_closure"] = {"enabled": loop_closure}
     if save_map is not None:
-        said["map"] = {"enabled": save_map}
-    settings = load_config(config, set_ or (), **said, seed=seed)
+        options["map"] = {"enabled": save_map}
+    settings = load_config(config, set_ or (), **options, seed=seed)
     with collected_log() as log:
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
@@ -121,7 +117,7 @@ def run(
 
 
 def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) -> None:
-    """Print what a run reached, and end with the exit code that fits how it ended."""
+    """Print the result, and exit with the code for the run's status."""
     if as_json:
         names = [str(path) for path in files]
         echo_json({**result.metrics, "folder": str(folder), "files": names})
@@ -142,7 +138,7 @@ def execute(
     log: list[str],
     known_map: SlamMap | None = None,
 ) -> tuple[RunResult, Path, list[Path]]:
-    """Run, and write whatever came of it."""
+    """Run, and write the result, whole or cut short."""
     from slam_graph.pipeline.run import run as run_pipeline
     from slam_graph.results.result_files import create_run_folder, link_latest, write_text
 
@@ -177,7 +173,7 @@ def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:
 def _progress(
     sequence: Sequence, settings: RunConfig, wanted: bool
 ) -> AbstractContextManager[ProgressBar | None]:
-    """A progress bar over the part that is asked for, or none."""
+    """A progress bar over the part that is asked for, or None."""
     if not wanted:
         return nullcontext()
     info = sequence.info()

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from slam_graph.cli.config import ConfigFile, Overrides
-from slam_graph.cli.data import Json
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import ConfigFile, Json, Overrides
+from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
     from slam_graph.simulation.simulated_sequence import SimulatedSequence
+
+__all__ = ["simulate"]
 
 Kind = Literal["tracks", "images"]
 

@@ -10,16 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from slam_graph.cli.output import echo_table, number
+from slam_graph.cli.printing import echo_table, number
 
 if TYPE_CHECKING:
     from slam_graph.results.run_result import RunResult
 
-Table = dict[str, Any]
+__all__ = ["echo_summary"]
+
+_Table = dict[str, Any]
 
 
 def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
-    """Print what a run reached, and where its files are."""
+    """Print the results of a run, and where its files are."""
     metrics = result.metrics
     echo_table(_overview(metrics))
     if metrics["accuracy"]:
@@ -48,8 +50,8 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     typer.echo("  " + " ".join(path.name for path in files))
 
 
-def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
-    """What was run, how much of it, and how fast."""
+def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
+    """Dataset, algorithm, extent, speed and sizes."""
     dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
     cameras = f"{metrics['cameras']} camera{'s' if metrics['cameras'] > 1 else ''}"
     yield "dataset", f"{dataset['name']} ({dataset['format']}, {dataset['content']}, {cameras})"
@@ -85,8 +87,8 @@ def _overview(metrics: Table) -> Iterator[tuple[str, str]]:
         yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
 
 
-def _final_ba(table: Table) -> str:
-    """How large the problem of the whole recording was, and what became of its cost."""
+def _final_ba(table: _Table) -> str:
+    """Size of the final bundle adjustment, and its cost before and after."""
     return (
         f"{table['frames']} frames, {table['keyframes']} keyframes, {table['features']} features, "
         f"{table['iterations']} steps in {table['seconds']:.1f} s, "
@@ -94,7 +96,7 @@ def _final_ba(table: Table) -> str:
     )
 
 
-def _located(table: Table) -> str:
+def _located(table: _Table) -> str:
     """How much of the run was located in a map."""
     if table["first_s"] is None:
         return f"never, in {table['queries']} comparisons with the map"
@@ -106,7 +108,7 @@ def _located(table: Table) -> str:
     )
 
 
-def _accuracy(accuracy: Table, title: str = "alignment") -> Iterator[tuple[str, ...]]:
+def _accuracy(accuracy: _Table, title: str = "alignment") -> Iterator[tuple[str, ...]]:
     """Absolute and relative errors under each alignment."""
     yield title, "ATE rmse [m]", "[deg]", "RPE rmse, 1 m [m]", "[deg]", "scale"
     for mode, table in accuracy.items():
@@ -124,7 +126,7 @@ def _accuracy(accuracy: Table, title: str = "alignment") -> Iterator[tuple[str, 
         )
 
 
-def _consistency(nees: Table) -> Iterator[tuple[str, ...]]:
+def _consistency(nees: _Table) -> Iterator[tuple[str, ...]]:
     """Mean NEES beside its ideal."""
     yield "NEES", "mean", "ideal", "inside 95% bounds"
     for name in ("orientation", "position", "pose"):
@@ -132,15 +134,15 @@ def _consistency(nees: Table) -> Iterator[tuple[str, ...]]:
         yield name, number(row["mean"], 2), str(row["ideal_mean"]), f"{row['inside_bounds']:.0%}"
 
 
-def _innovations(nis: Table) -> Iterator[tuple[str, ...]]:
-    """NIS over its degrees of freedom, beside what a right covariance leaves behind the gate."""
+def _innovations(nis: _Table) -> Iterator[tuple[str, ...]]:
+    """NIS over its degrees of freedom, beside the mean expected after the gate."""
     yield "NIS / dof", "mean", "expected", "inside 95% bounds", "rejected"
     shares = (f"{nis['inside_bounds']:.0%}", f"{nis['rejected']:.1%}")
     yield "images", number(nis["mean"], 2), number(nis["expected_mean"], 2), *shares
 
 
-def _calibration(parameters: Table) -> Iterator[tuple[str, ...]]:
-    """Estimated parameters of the rig beside what they were at first."""
+def _calibration(parameters: _Table) -> Iterator[tuple[str, ...]]:
+    """Estimated parameters of the rig beside their initial values."""
     yield "calibration", "start", "estimate", "1 sigma"
     for name, row in parameters.items():
         values = (f"{row[column]:.6g}" for column in ("start", "value"))

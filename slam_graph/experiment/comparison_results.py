@@ -39,7 +39,6 @@ __all__ = [
     "STAGE",
     "Series",
     "Table",
-    "peak_memory_mb",
     "read_result",
     "read_series",
     "write_result",
@@ -71,12 +70,11 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
     path.unlink(missing_ok=True)
     with appearing(path.with_suffix(".npz")) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **_series_of(result))  # type: ignore[arg-type]  # its last keyword
-    metrics = {**result.metrics, "peak_memory_mb": peak_memory_mb()}
     table = {
         "schema_version": SCHEMA_VERSION,
         **about,
-        "metrics": metrics,
-        "mean_steps": float(result.steps.steps.mean()) if len(result.steps) else None,
+        "metrics": result.metrics,
+        "mean_steps": float(result.logs.steps.steps.mean()) if len(result.logs.steps) else None,
         "config": result.config.model_dump(mode="json"),
     }
     write_text(path, [json.dumps(table, indent=1, allow_nan=False), "\n"])
@@ -101,32 +99,19 @@ def read_series(path: Path) -> Series:
 def _series_of(result: RunResult) -> Series:
     """All series of a run; errors and NEES only if there is ground truth."""
     series: Series = {
-        f"ms_{stage}": result.timing.column(stage) for stage in result.timing.stages()
+        f"ms_{stage}": result.logs.timing.column(stage) for stage in result.logs.timing.stages()
     }
-    series["frame_time_s"] = (result.timing.stamps_ns - result.start_ns) * 1e-9
-    series["step_time_s"] = (result.steps.stamps_ns - result.start_ns) * 1e-9
-    series["steps"] = result.steps.steps
-    series["cost_before"], series["cost_after"] = result.steps.costs.T
-    series["columns"] = result.steps.columns
+    series["frame_time_s"] = (result.logs.timing.stamps_ns - result.input.start_ns) * 1e-9
+    series["step_time_s"] = (result.logs.steps.stamps_ns - result.input.start_ns) * 1e-9
+    series["steps"] = result.logs.steps.steps
+    series["cost_before"], series["cost_after"] = result.logs.steps.costs.T
+    series["columns"] = result.logs.steps.columns
     series |= _innovation_series(result)
-    truth = result.truth_of_run()
+    truth = result.groundtruth
     if truth is not None and len(result.history) > 0:
         series |= _error_series(truth, result)
         series |= _nees_series(truth, result)
     return series
-
-
-def peak_memory_mb() -> float | None:
-    """Peak resident memory of this process.
-
-    Not from `getrusage`: there a process inherits the peak of its parent.
-    """
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    peaks = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
-    return float(peaks[0]) / 1024.0 if peaks else None
 
 
 def _error_series(truth: Trajectory, result: RunResult) -> Series:
@@ -136,7 +121,7 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         return {}
     steps = np.linalg.norm(np.diff(true.positions, axis=0), axis=1)
     series: Series = {
-        "time_s": (estimate.stamps_ns - result.start_ns) * 1e-9,
+        "time_s": (estimate.stamps_ns - result.input.start_ns) * 1e-9,
         "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
     }
     for mode in ALIGNMENTS:
@@ -157,7 +142,7 @@ def _nees_series(truth: Trajectory, result: RunResult) -> Series:
         return {}
     values = nees(estimate, result.history.pose_covariances(), truth, similarity)
     return {
-        "nees_time_s": (values.stamps_ns - result.start_ns) * 1e-9,
+        "nees_time_s": (values.stamps_ns - result.input.start_ns) * 1e-9,
         "nees_orientation": values.orientation,
         "nees_position": values.position,
         "nees_pose": values.pose,
@@ -165,12 +150,12 @@ def _nees_series(truth: Trajectory, result: RunResult) -> Series:
 
 
 def _innovation_series(result: RunResult) -> Series:
-    columns = result.innovations.columns()
+    columns = result.logs.innovations.columns()
     expected = columns["expected"]
     ratio = np.full(len(expected), np.nan)
     np.divide(columns["passed_distance"], expected, out=ratio, where=expected > 0)
     return {
-        "nis_time_s": (result.innovations.stamps_ns - result.start_ns) * 1e-9,
+        "nis_time_s": (result.logs.innovations.stamps_ns - result.input.start_ns) * 1e-9,
         "nis_ratio": ratio,
         **{f"nis_{name}": values for name, values in columns.items()},
     }

@@ -107,7 +107,7 @@ def track_and_estimate(sequence: Sequence, config: RunConfig, name: str) -> Fron
     result = run(sequence, config, recorder=quality)
     accuracy = result.metrics.get("accuracy") or {}
     ate_m = accuracy.get("se3", {}).get("ate", {}).get("translation_m", {}).get("rmse")
-    return _report(name, quality, result.features, result.timing, ate_m, result.status)
+    return _report(name, quality, result.logs.features, result.logs.timing, ate_m, result.status)
 
 
 def _report(

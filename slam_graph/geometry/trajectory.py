@@ -59,6 +59,10 @@ class NavState:
     gyro_bias: FloatArray = field(kw_only=True)
     covariance: FloatArray | None = field(default=None, kw_only=True)
 
+    def __repr__(self) -> str:
+        position = ", ".join(f"{value:.3f}" for value in self.world_T_body.translation())
+        return f"NavState({seconds_text(self.stamp_ns)} s, position ({position}) m)"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
@@ -87,6 +91,30 @@ class Trajectory:
         """`world_T_body` of one row."""
         x, y, z, w = self.quaternions[index]
         return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), self.positions[index])
+
+    def as_dict(self) -> dict[str, FloatArray | IntArray]:
+        """All columns (N,) by name with unit, as for `pandas.DataFrame(trajectory.as_dict())`."""
+        columns: dict[str, FloatArray | IntArray] = {"stamp_ns": self.stamps_ns}
+        for name, values in (
+            ("position_{}_m", self.positions),
+            ("quaternion_{}", self.quaternions),
+            ("velocity_{}_m_s", self.velocities),
+            ("accel_bias_{}_m_s2", self.accel_biases),
+            ("gyro_bias_{}_rad_s", self.gyro_biases),
+        ):
+            if values is not None:
+                columns |= {
+                    name.format(axis): values[:, k]
+                    for k, axis in enumerate("xyzw"[: values.shape[1]])
+                }
+        return columns
+
+    def __repr__(self) -> str:
+        if len(self) == 0:
+            return "Trajectory(0 poses)"
+        length_s = (self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9
+        path_m = np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()
+        return f"Trajectory({len(self)} poses, {length_s:.2f} s, {path_m:.2f} m)"
 
 
 _STATE_WIDTH = 16

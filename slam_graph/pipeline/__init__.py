@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A run from end to end: its stages, and the loop over the recording."""
+"""A run from end to end: `run` is the table of contents, each other file one stage of it."""

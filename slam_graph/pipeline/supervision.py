@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Watching over a run: is the estimate sane, and how did the run end?"""
+"""Supervision: is the estimate sane, how did the run end, and when may Ctrl-C interrupt it?"""
 
 from __future__ import annotations
 
@@ -18,35 +18,20 @@ import numpy as np
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.estimator import Estimator
 from slam_graph.config import LimitsConfig
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.results.run_result import RunResult
-from slam_graph.sensors.measurements import FeatureFrame
 
-LONGEST_GAP_S = 0.5
-"""How much of the time between two frames of which features were tested counts at most."""
+__all__ = ["Agreement", "DivergenceError", "check_sane", "interrupts_between_frames", "outcome"]
+
+_LONGEST_GAP_S = 0.5
+"""A gap between two frames whose features were tested counts as at most this much time."""
 
 logger = logging.getLogger(__name__)
 
 
 class DivergenceError(EstimationError):
-    """The estimate left all that is possible."""
-
-
-def estimate(estimator: Estimator, features: FeatureFrame) -> NavState | None:
-    """The state at a frame.
-
-    Raises:
-        DivergenceError: if the linear algebra fails, which a sane state does not bring about.
-    """
-    try:
-        return estimator.add_frame(features)
-    except (RuntimeError, np.linalg.LinAlgError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise DivergenceError(
-            f"diverged at frame {features.stamp_ns}: the equations cannot be solved ({reason})"
-        ) from error
+    """The estimate is beyond what is physically possible, or contradicts the images."""
 
 
 def check_sane(state: NavState, limits: LimitsConfig) -> None:
@@ -85,14 +70,14 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
 
 
 class Agreement:
-    """Whether the images still agree with the state, by what the gate makes of them.
+    """Whether the images still agree with the state, by the share that the χ² gate rejects.
 
-    If state and covariance are right the χ² gate rejects a few percent of the features. Where it
-    rejects most of them for seconds, the state is wrong and surer of itself than it should be, and
-    nothing will bring it back: the features that would are those that are rejected.
+    If state and covariance are right, the gate rejects a few percent of the features. Where it
+    rejects most of them for seconds, the state is wrong and its covariance too small. It cannot
+    recover then: the features that would correct it are those that are rejected.
 
-    Time counts as long as images are tested only, and for one gap between two tests little: after a
-    pause, as of blank images, an estimate has its time to recover.
+    Only time in which features are tested counts, and a gap between two tests counts little: after
+    a pause, such as blank images, an estimate has time to recover.
     """
 
     def __init__(self, limits: LimitsConfig) -> None:
@@ -102,7 +87,7 @@ class Agreement:
         self._last_ns: int | None = None
 
     def check(self, stamp_ns: int, innovations: Innovations) -> None:
-        """Take what was tested in the next frame.
+        """Add the tests of the next frame.
 
         Raises:
             DivergenceError: if too much was rejected for too long.
@@ -110,7 +95,7 @@ class Agreement:
         if innovations.tested == 0:
             return
         if self._last_ns is not None:
-            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, LONGEST_GAP_S)
+            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, _LONGEST_GAP_S)
         self._last_ns = stamp_ns
         self._tests.append((self._tested_s, innovations.tested, innovations.rejected))
         begin_s = self._tested_s - self._limits.disagreement_s
@@ -129,54 +114,55 @@ class Agreement:
 
 
 @contextmanager
-def outcome(result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> Iterator[None]:
-    """Run a block and note in the result how it ended; nothing is raised, `check` does it later."""
+def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
+    """Run the block and note in the result how it ended; `RunResult.check` raises it later."""
     began = time.perf_counter()
+    ending = result.ending
     try:
         yield
         _judge(result, estimator)
     except KeyboardInterrupt as interrupt:
-        result.status, result.message = "interrupted", "interrupted before the end"
-        result.error = interrupt
+        ending.status, ending.message = "interrupted", "interrupted before the end"
+        ending.error = interrupt
     except DivergenceError as error:
-        result.status, result.message, result.error = "diverged", str(error), error
+        ending.status, ending.message, ending.error = "diverged", str(error), error
     except SlamGraphError as error:
-        result.status, result.message, result.error = "failed", str(error), error
+        ending.status, ending.message, ending.error = "failed", str(error), error
     except Exception as error:
         logger.exception("internal error")
-        result.status, result.error = "failed", error
-        result.message = f"internal error: {type(error).__name__}: {error}"
-    result.wall_s = time.perf_counter() - began
-    result.warnings = +diagnostics.counts
-    level = logging.INFO if result.status == "ok" else logging.ERROR
-    logger.log(level, "%s", result.message or f"{result.frames} frames in {result.wall_s:.1f} s")
+        ending.status, ending.error = "failed", error
+        ending.message = f"internal error: {type(error).__name__}: {error}"
+    ending.wall_s = time.perf_counter() - began
+    level = logging.INFO if ending.status == "ok" else logging.ERROR
+    done = f"{result.logs.frames} frames in {ending.wall_s:.1f} s"
+    logger.log(level, "%s", ending.message or done)
 
 
 def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
-    asked = result.config.min_coverage
+    asked, ending = result.config.min_coverage, result.ending
     if not estimator.initialized:
-        result.status = "not_initialized"
-        result.message = (
-            f"never initialised in {result.frames} frames: waiting for {estimator.waiting_for}"
+        ending.status = "not_initialized"
+        ending.message = (
+            f"never initialised in {result.logs.frames} frames: waiting for {estimator.waiting_for}"
         )
     elif result.coverage < asked:
-        result.status = "low_coverage"
-        result.message = (
-            f"the estimate covers {result.coverage:.1%} of the {result.recorded_s:.1f} s asked "
-            f"for, less than min_coverage = {asked:.1%}"
+        ending.status = "low_coverage"
+        ending.message = (
+            f"the estimate covers {result.coverage:.1%} of the {result.input.recorded_s:.1f} s "
+            f"asked for, less than min_coverage = {asked:.1%}"
         )
 
 
 @contextmanager
 def interrupts_between_frames() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C take effect when a frame is done, not in the middle of its book-keeping.
+    """Let Ctrl-C take effect between two frames, so that no frame is left half noted.
 
     A second Ctrl-C takes effect at once. Outside the main thread, which alone gets signals, this
     changes nothing.
 
     Yields:
-        To be called after each frame; raises KeyboardInterrupt if there was one.
+        A function to call after each frame; it raises KeyboardInterrupt after a Ctrl-C.
     """
     pending = False
 

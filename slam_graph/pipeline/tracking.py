@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The front end at work: reading and tracking, in a thread beside the back end or in turn with it.
+"""Tracking: reading and the front end, in a thread beside the back end or in turn with it.
 
-While the back end works on frame k, the front end tracks frame k + 1. So what the back end found in
+While the back end works on frame k, the front end tracks frame k + 1. So the back end's feedback on
 frame k reaches the front end before frame k + 2, in either mode: results are the same.
 """
 
@@ -13,9 +13,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.frontend.frontend_protocol import Feedback, Frontend
 from slam_graph.results.run_logs import Stopwatch, milliseconds
-from slam_graph.sensors.measurements import FeatureFrame, Packet
+from slam_graph.results.run_result import RunInput
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, Packet
+
+__all__ = ["TrackedPacket", "Tracking", "packets_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,7 @@ class TrackedPacket:
         packet: as it was read.
         features: found in its frame.
         frame_stats: counts and milliseconds of the front end.
-        clock: has timed reading and front end, and goes on with the back end.
+        clock: has timed reading and front end; the back end's time is added to it.
     """
 
     packet: Packet
@@ -40,7 +44,7 @@ class Tracking:
 
     Args:
         packets: to track; read in the thread of the front end.
-        frontend: does it.
+        frontend: tracks them.
         overlap: whether to track the next packet in a thread while the caller works on this one.
     """
 
@@ -50,14 +54,14 @@ class Tracking:
         self._overlap = overlap
         self._feedback: Feedback | None = None
 
-    def tell(self, feedback: Feedback) -> None:
-        """What the back end found in the packet that was handed out last."""
+    def give_feedback(self, feedback: Feedback) -> None:
+        """Pass on what the back end knows after the packet that was yielded last."""
         self._feedback = feedback
 
     def run(self) -> Generator[TrackedPacket, None, None]:
-        """The packets, to be closed when no more are wanted.
+        """The tracked packets; close the generator when no more are wanted.
 
-        A fault in one is raised when its turn comes, not while it is read ahead.
+        A fault in a packet is raised when its turn comes, not while it is read ahead.
         """
         if self._overlap:
             yield from self._ahead()
@@ -89,3 +93,21 @@ class Tracking:
         stats = dict(self._frontend.frame_stats)
         clock.lap("frontend", milliseconds(stats))
         return TrackedPacket(packet, features, stats, clock)
+
+
+def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
+    """The packets of the part that is asked for, with the cameras that are asked for."""
+    packets = sequence.packets(
+        asked.start_ns if asked.config.start_s > 0 else None,
+        asked.end_ns if asked.config.duration_s is not None else None,
+    )
+    count = len(asked.rig.cameras)
+    for packet in packets:
+        yield Packet(packet.imu, _first_cameras(packet.frame, count))
+
+
+def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:
+    """The same frame without the cameras that are not used."""
+    if isinstance(frame, CameraFrame):
+        return CameraFrame(frame.stamp_ns, frame.images[:count])
+    return FeatureFrame(frame.stamp_ns, frame.cameras[:count])

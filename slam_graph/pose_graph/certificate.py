@@ -100,6 +100,10 @@ class Certificate:
 def certify(graph: PoseGraph, estimate: Poses) -> Certificate:
     """Move an estimate to the next minimum of SE-Sync's objective, and bound F from below.
 
+    Args:
+        graph: the edges.
+        estimate: world_T_body of all poses, from which the minimum is searched.
+
     Raises:
         EstimationError: if the smallest eigenvalue cannot be found.
     """

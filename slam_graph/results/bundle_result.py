@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 import bz2
-import json
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,17 +19,14 @@ from slam_graph.bundle_adjustment.bal_file import bal_lines
 from slam_graph.bundle_adjustment.bal_policy import BalPolicy, BalSolution
 from slam_graph.bundle_adjustment.bal_problem import BalEstimates
 from slam_graph.config import dump_yaml
-from slam_graph.results.metrics import finite, versions
+from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.point_map import write_ply
-from slam_graph.results.result_files import appearing, write_text
+from slam_graph.results.result_files import ResultFolder, appearing, write_text
 
-SCHEMA_VERSION = 1
-"""Counts up whenever a key changes its name or meaning."""
-
-Table = dict[str, Any]
+__all__ = ["BalResult"]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class BalResult:
     """What a bundle adjustment found out.
 
@@ -47,14 +42,21 @@ class BalResult:
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
+    def __repr__(self) -> str:
+        part, minimum = self.solution.part.problem, self.solution.minimum
+        return (
+            f"{type(self).__name__}({self.name}: {part.cameras} cameras, {part.points} points, "
+            f"cost {minimum.cost:.6g}, {'' if minimum.converged else 'not '}converged)"
+        )
+
     @property
     def name(self) -> str:
-        """Of the problem."""
+        """The name of the problem."""
         return self.solution.problem.name
 
     @cached_property
     def after(self) -> BalEstimates:
-        """Estimates of what was in the cost."""
+        """The estimates of the cameras and points that were in the cost."""
         return self.solution.estimates.select(self.solution.part.cameras, self.solution.part.points)
 
     @cached_property
@@ -104,30 +106,30 @@ class BalResult:
         )
         return table
 
-    def save(self, folder: Path) -> list[Path]:
+    def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
+        Args:
+            folder: made if it is missing.
+
         Returns:
-            The files.
+            The files, in the order in which they were written.
         """
-        texts: dict[str, Iterable[str]] = {
-            "optimized.txt": self.lines(),
-            "config.yaml": [dump_yaml(self.policy)],
-            "metrics.json": [json.dumps(self.metrics, indent=2, allow_nan=False), "\n"],
-        }
-        for name, lines in texts.items():
-            write_text(folder / name, lines)
-        write_ply(folder / "scene.ply", self.after.points, self.after.centres())
-        self._draw(folder / "bundle_adjustment.png")
-        more = (*texts, "scene.ply", "bundle_adjustment.png")
-        return [folder / name for name in more]
+        files = ResultFolder(folder)
+        files.text("optimized.txt", self.lines())
+        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.json("metrics.json", self.metrics)
+        write_ply(files.path("scene.ply"), self.after.points, self.after.centres())
+        self._draw(files.path("bundle_adjustment.png"))
+        return files.files
 
     def lines(self) -> Iterable[str]:
         """The whole problem with its estimates, in BAL's format."""
         return bal_lines(self.solution.problem, self.solution.estimates)
 
-    def save_problem(self, path: Path) -> None:
+    def save_problem(self, path: Path | str) -> None:
         """Write the whole problem with its estimates, compressed if the name ends with `.bz2`."""
+        path = Path(path)
         if path.suffix != ".bz2":
             write_text(path, self.lines())
             return
@@ -135,7 +137,7 @@ class BalResult:
             partial.write_bytes(bz2.compress("".join(self.lines()).encode("ascii")))
 
     def _draw(self, path: Path) -> None:
-        from slam_graph.visualization.bal_plot import plot_bundle
+        from slam_graph.visualization.result_plots import plot_bundle
 
         part = self.solution.part.problem
         title = f"{self.name}: {part.cameras} cameras, {part.points} points"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a run was in a map, frame by frame, and what ground truth says about it."""
+"""The poses of a run in a map, frame by frame, and their errors against ground truth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.ape import ape
 from slam_graph.evaluation.evaluation_report import accuracy_report
@@ -21,9 +20,11 @@ from slam_graph.geometry.trajectory_alignment import Similarity, align_yaw, umey
 from slam_graph.maps.map_model import SlamMap
 from slam_graph.maps.pose_filter import MapPoseFilter
 
-POSE_WIDTH = 7
-LEAST_SHARED = 3
-"""So many keyframes of a map must have a truth for the map to be aligned by them."""
+__all__ = ["LocalizationLog", "errors_in_map", "map_alignment"]
+
+_POSE_WIDTH = 7
+_LEAST_SHARED = 3
+"""A map is aligned with the truth by at least this many keyframes."""
 
 
 class LocalizationLog:
@@ -34,8 +35,8 @@ class LocalizationLog:
 
     Attributes:
         known: the map.
-        seconds: that localization took in all.
-        counts: of comparisons with the map.
+        seconds: total time of localization.
+        counts: of comparisons with the map, by name.
     """
 
     def __init__(self, known: SlamMap) -> None:
@@ -48,20 +49,29 @@ class LocalizationLog:
         self._poses = array("d")
 
     def append(self, stamp_ns: int, estimate: MapPoseFilter | None, located: bool) -> None:
-        """Add a frame, with the estimate if there is one, and whether it is good enough."""
+        """Add a frame.
+
+        Args:
+            stamp_ns: its time.
+            estimate: of the pose in the map, if there is one.
+            located: whether the estimate is certain enough to count as located.
+        """
         self._stamps_ns.append(stamp_ns)
         self._located.append(located)
         if estimate is None:
             self._sigmas.append(np.nan)
-            self._poses.extend([np.nan] * POSE_WIDTH)
+            self._poses.extend([np.nan] * _POSE_WIDTH)
             return
         self._sigmas.append(estimate.position_sigma)
         quaternion: Any = estimate.pose.rotation().toQuaternion()  # unknown to the stubs
         self._poses.extend([*estimate.pose.translation(), *quaternion.coeffs()])
 
     def count(self, **counts: int) -> None:
-        """Note how often things happened."""
+        """Set counts, by name."""
         self.counts |= counts
+
+    def __repr__(self) -> str:
+        return f"LocalizationLog({int(self.located.sum())} of {len(self.located)} frames located)"
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -69,13 +79,13 @@ class LocalizationLog:
         return np.array(self._stamps_ns, dtype=np.int64)
 
     @property
-    def located(self) -> NDArray[np.bool_]:
-        """(N,) whether the pose in the map was known then."""
+    def located(self) -> BoolArray:
+        """(N,) whether the pose in the map was known at that frame."""
         return np.array(self._located, dtype=np.bool_)
 
     def trajectory(self) -> Trajectory:
         """Poses in the world of the map, of the frames where they are known."""
-        rows = np.array(self._poses, dtype=np.float64).reshape(-1, POSE_WIDTH)[self.located]
+        rows = np.array(self._poses, dtype=np.float64).reshape(-1, _POSE_WIDTH)[self.located]
         return Trajectory(self.stamps_ns[self.located], rows[:, :3], rows[:, 3:])
 
     def csv_lines(self) -> Iterator[str]:
@@ -88,12 +98,12 @@ class LocalizationLog:
             yield f"{stamp_ns},{located},{text}\n"
 
     def table(self, start_ns: int, frames: int, truth: Trajectory | None) -> dict[str, Any]:
-        """What became of it, for `metrics.json`.
+        """The table for `metrics.json`.
 
         Args:
-            start_ns: when the run began.
-            frames: that were read.
-            truth: the true trajectory, as far as it is known.
+            start_ns: time of the first frame that was asked for.
+            frames: number of frames that were read.
+            truth: the true trajectory, if there is one.
         """
         stamps_ns = self.stamps_ns[self.located]
         return {
@@ -122,9 +132,9 @@ class LocalizationLog:
 
 
 def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
-    """The map from the world of a map to that of the truth, by keyframes whose truth is known.
+    """The transformation from the world of a map to that of the truth, by the map's keyframes.
 
-    Yaw and position are aligned, and the whole pose if z of the map is not up.
+    Yaw and position are aligned, and the whole pose where the map's z axis is not vertical.
 
     Raises:
         DataError: if the truth does not cover the map's keyframes.
@@ -135,8 +145,8 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
             pairs.append(synchronize(truth, keyframes))
         except DataError:
             continue
-    if sum(len(true) for true, _ in pairs) < LEAST_SHARED:
-        raise DataError(f"the truth covers fewer than {LEAST_SHARED} keyframes of the map")
+    if sum(len(true) for true, _ in pairs) < _LEAST_SHARED:
+        raise DataError(f"the truth covers fewer than {_LEAST_SHARED} keyframes of the map")
     true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
     return align_yaw(true, own) if known.gravity_aligned else umeyama(true, own)
 

@@ -13,12 +13,14 @@ from slam_graph.maps.map_model import SlamMap
 from slam_graph.results.point_map import write_ply
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
 
+__all__ = ["MAP_NAME", "export_ply", "export_tum", "find_map", "load_map", "save_map"]
+
 MAP_NAME = "map.slam"
 """Name of the map in the folder of a run."""
 
 
 def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
-    """Write a map file: it is there whole, or the one that was there before still is.
+    """Write a map file. If writing fails, a file that was there before stays as it was.
 
     Args:
         content: the map.
@@ -47,11 +49,12 @@ def load_map(path: Path | str) -> SlamMap:
     Raises:
         DataError: if there is none, or it cannot be used.
     """
-    return read_map(find_map(Path(path)))
+    return read_map(find_map(path))
 
 
-def find_map(path: Path) -> Path:
+def find_map(path: Path | str) -> Path:
     """The map file that a path means (see `load_map`)."""
+    path = Path(path)
     if not path.is_dir():
         if not path.exists():
             raise DataError(
@@ -66,12 +69,13 @@ def find_map(path: Path) -> Path:
     )
 
 
-def export_ply(content: SlamMap, path: Path, force: bool = False) -> None:
+def export_ply(content: SlamMap, path: Path | str, force: bool = False) -> None:
     """Write the points of a map, and its keyframes in red, as a PLY point cloud.
 
     Raises:
         DataError: if the file exists or cannot be written.
     """
+    path = Path(path)
     refuse_to_replace(path, force)
     try:
         write_ply(path, content.points, content.poses.translations)
@@ -79,7 +83,7 @@ def export_ply(content: SlamMap, path: Path, force: bool = False) -> None:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def export_tum(content: SlamMap, path: Path, force: bool = False) -> list[Path]:
+def export_tum(content: SlamMap, path: Path | str, force: bool = False) -> list[Path]:
     """Write the keyframes of a map as TUM trajectories, one for each recording.
 
     Returns:
@@ -88,6 +92,7 @@ def export_tum(content: SlamMap, path: Path, force: bool = False) -> list[Path]:
     Raises:
         DataError: if a file exists or cannot be written.
     """
+    path = Path(path)
     count = len(content.recordings)
     paths = [path.with_stem(f"{path.stem}_{n}") if count > 1 else path for n in range(count)]
     for file in paths:

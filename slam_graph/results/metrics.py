@@ -1,76 +1,51 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The content of `metrics.json`: what was measured in a run, under a versioned schema."""
+"""The content of `metrics.json`: what was measured, in tables that JSON can hold.
+
+The functions take what they measure, not a result, so that any kind of result can use them.
+"""
 
 from __future__ import annotations
 
+import importlib
 import math
 import platform
-import resource
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.evaluation_report import (
-    accuracy_report,
-    consistency_report,
-    innovation_report,
-)
+from slam_graph.evaluation.evaluation_report import accuracy_report, consistency_report
+from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.loop_closure.close_loops import LoopClosures
+from slam_graph.results.run_logs import RunLogs
+from slam_graph.smoothing.final_adjustment import FinalBa
 from slam_graph.version import __version__
 
-if TYPE_CHECKING:
-    from slam_graph.results.run_result import RunResult
+__all__ = [
+    "SCHEMA_VERSION",
+    "Table",
+    "accuracy_table",
+    "consistency_table",
+    "coverage",
+    "extent_table",
+    "final_ba_table",
+    "finite",
+    "loop_closure_table",
+    "peak_memory_mb",
+    "timing_table",
+    "versions",
+]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Counts up whenever a key changes its name or meaning."""
 
-RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
+_RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
 
 Table = dict[str, Any]
-
-
-def metrics_table(result: RunResult) -> Table:
-    """All metrics of a run; JSON can hold every value of it."""
-    table: Table = finite(
-        {
-            "schema_version": SCHEMA_VERSION,
-            "status": result.status,
-            "message": result.message,
-            "dataset": asdict(result.info),
-            "algorithm": result.config.algorithm.name,
-            "cameras": len(result.rig.cameras),
-            "seed": result.config.seed,
-            "extent": _extent(result),
-            "accuracy": _accuracy(result),
-            "final_ba": _final_ba(result),
-            "loop_closure": _loop_closure(result),
-            "slam_map": None if result.slam_map is None else result.slam_map.summary(),
-            "localization": _localization(result),
-            "nees": _nees(result),
-            "nis": innovation_report(result.innovations.columns()),
-            "calibration": result.calibration.table(),
-            "timing": _timing(result),
-            "features_per_frame": _per_frame(result),
-            "map_points": len(result.points),
-            "warnings": dict(sorted(result.warnings.items())),
-            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-            "versions": versions(),
-        }
-    )
-    return table
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    table = {"slam_graph": __version__, "python": platform.python_version()}
-    for package in RECORDED_PACKAGES:
-        try:
-            table[package] = version(package)
-        except PackageNotFoundError:
-            table[package] = "unknown"
-    return table
 
 
 def finite(value: Any) -> Any:
@@ -82,46 +57,114 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _extent(result: RunResult) -> Table:
-    """How much was asked for, read and estimated."""
-    stamps = result.trajectory.stamps_ns
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    table = {"slam_graph": __version__, "python": platform.python_version()}
+    for package in _RECORDED_PACKAGES:
+        try:
+            table[package] = version(package)
+        except PackageNotFoundError:
+            table[package] = "unknown"
+    return table
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident size of this process so far, in MB; None where the system does not tell.
+
+    On Linux it is read from /proc: `getrusage` would give the peak of the parent process where
+    that was larger. Windows has neither.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return float(line.split()[1]) / 1024.0
+    try:
+        resource = importlib.import_module("resource")
+    except ImportError:
+        return None
+    peak: int = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+
+
+def accuracy_table(truth: Trajectory | None, trajectory: Trajectory) -> Table | None:
+    """Errors against ground truth, or None where there is nothing to compare."""
+    if truth is None or len(trajectory) == 0:
+        return None
+    return accuracy_report(truth, trajectory)
+
+
+def consistency_table(truth: Trajectory | None, history: StateHistory, given: bool) -> Table | None:
+    """NEES against ground truth, or None where there is nothing to compare.
+
+    Args:
+        truth: the true trajectory.
+        history: the estimate with its covariances.
+        given: whether the start was given in the world of the truth.
+    """
+    if truth is None or len(history) == 0:
+        return None
+    try:
+        return consistency_report(truth, history, aligned=given)
+    except DataError as error:
+        return {"unavailable": str(error)}
+
+
+def extent_table(start_ns: int, end_ns: int, frames: int, trajectory: Trajectory) -> Table:
+    """How much was asked for, read and estimated.
+
+    Args:
+        start_ns: first time that was asked for.
+        end_ns: last time that was asked for.
+        frames: that were read.
+        trajectory: that was estimated.
+    """
+    stamps = trajectory.stamps_ns
     started = len(stamps) > 0
     return {
-        "start_ns": result.start_ns,
-        "end_ns": result.end_ns,
-        "recorded_s": result.recorded_s,
-        "frames": result.frames,
+        "start_ns": start_ns,
+        "end_ns": end_ns,
+        "recorded_s": (end_ns - start_ns) * 1e-9,
+        "frames": frames,
         "estimated_frames": len(stamps),
         "estimated_s": float(stamps[-1] - stamps[0]) * 1e-9 if started else 0.0,
-        "coverage": result.coverage,
-        "initialization_s": float(stamps[0] - result.start_ns) * 1e-9 if started else None,
-        "start_was_given": result.start_was_given,
+        "coverage": coverage(start_ns, end_ns, trajectory),
+        "initialization_s": float(stamps[0] - start_ns) * 1e-9 if started else None,
     }
 
 
-def _accuracy(result: RunResult) -> Table | None:
-    """Errors against ground truth, or None where there is nothing to compare."""
-    truth = result.truth_of_run()
-    if truth is None or len(result.history) == 0:
+def coverage(start_ns: int, end_ns: int, trajectory: Trajectory) -> float:
+    """Estimated time over the time asked for, from 0 to 1."""
+    stamps = trajectory.stamps_ns
+    if len(stamps) == 0:
+        return 0.0
+    if end_ns <= start_ns:
+        return 1.0
+    return min(float(stamps[-1] - stamps[0]) / (end_ns - start_ns), 1.0)
+
+
+def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table | None:
+    """Size, cost and accuracy of the final bundle adjustment, if there was one."""
+    if final_ba is None:
         return None
-    return accuracy_report(truth, result.trajectory)
+    accuracy = None if truth is None else accuracy_report(truth, final_ba.trajectory)
+    return {**asdict(final_ba.summary), "accuracy": accuracy}
 
 
-def _final_ba(result: RunResult) -> Table | None:
-    """What the bundle adjustment over the whole recording took and reached, if there was one."""
-    if result.final_ba is None:
+def loop_closure_table(
+    loops: LoopClosures | None, corrected: Trajectory | None, truth: Trajectory | None
+) -> Table | None:
+    """What loop closure found and reached, if loops were to be closed.
+
+    Args:
+        loops: what was found.
+        corrected: the trajectory after loop closure.
+        truth: the true trajectory.
+    """
+    if loops is None or corrected is None:
         return None
-    trajectory, truth = result.final_ba.trajectory, result.truth_of_run()
-    accuracy = None if truth is None else accuracy_report(truth, trajectory)
-    return {**asdict(result.final_ba.summary), "accuracy": accuracy}
-
-
-def _loop_closure(result: RunResult) -> Table | None:
-    """What loop closure found and reached, if loops were to be closed."""
-    loops, truth = result.loops, result.truth_of_run()
-    if loops is None:
-        return None
-    corrected = loops.correct(result.best_trajectory)
     return {
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
@@ -130,41 +173,16 @@ def _loop_closure(result: RunResult) -> Table | None:
     }
 
 
-def _localization(result: RunResult) -> Table | None:
-    """Where the run was in a known map, if it was to be located in one."""
-    if result.localization is None:
-        return None
-    return result.localization.table(result.start_ns, result.frames, result.truth)
-
-
-def _nees(result: RunResult) -> Table | None:
-    """Consistency with ground truth, or None where there is nothing to compare."""
-    truth = result.truth_of_run()
-    if truth is None or len(result.history) == 0:
-        return None
-    try:
-        return consistency_report(truth, result.history, aligned=result.start_was_given)
-    except DataError as error:
-        return {"unavailable": str(error)}
-
-
-def _timing(result: RunResult) -> Table:
+def timing_table(logs: RunLogs, start_ns: int, wall_s: float) -> Table:
     """Speed as a whole and by stage.
 
     `real_time_factor` is the recorded time that was worked through in a second: above 1 is faster
     than real time.
     """
-    last_ns = result.start_ns if result.last_frame_ns is None else result.last_frame_ns
-    wall_s = result.wall_s
+    last_ns = start_ns if logs.last_frame_ns is None else logs.last_frame_ns
     return {
         "wall_s": wall_s,
-        "frames_per_s": result.frames / wall_s if wall_s > 0 else None,
-        "real_time_factor": (last_ns - result.start_ns) * 1e-9 / wall_s if wall_s > 0 else None,
-        "stages": {stage: asdict(times) for stage, times in result.timing.summary().items()},
+        "frames_per_s": logs.frames / wall_s if wall_s > 0 else None,
+        "real_time_factor": (last_ns - start_ns) * 1e-9 / wall_s if wall_s > 0 else None,
+        "stages": {stage: asdict(times) for stage, times in logs.timing.summary().items()},
     }
-
-
-def _per_frame(result: RunResult) -> Table:
-    """Mean counts a frame of the front end."""
-    frames = max(result.frames, 1)
-    return {name: total / frames for name, total in sorted(result.features.items())}

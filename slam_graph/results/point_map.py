@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The points of the world that a run has estimated, and their PLY file."""
+"""The points of the world that a run has estimated, and PLY files of points."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.errors import DataError
 from slam_graph.results.result_files import appearing
 
-POINT_COLOUR = (200, 200, 200)
-CAMERA_COLOUR = (220, 30, 30)
+__all__ = ["PointMap", "read_ply", "write_ply"]
+
+_POINT_COLOUR = (200, 200, 200)
+_CAMERA_COLOUR = (220, 30, 30)
+
+_POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
 
 RECENT = 10_000
-"""How many features are held where they can be replaced at once, before they are packed."""
+"""Features are moved from the dictionary into the arrays when there are more than this."""
 
 
 class PointMap:
@@ -31,18 +36,23 @@ class PointMap:
         return len(self._ids)
 
     def update(self, ids: IntArray, points: FloatArray) -> None:
-        """Take over the positions (N, 3) in the world of features (N,)."""
+        """Replace the positions of features.
+
+        Args:
+            ids: (N,) of the features.
+            points: (N, 3) in the world, m.
+        """
         self._recent.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
         if len(self._recent) > RECENT:
             self._pack()
 
     def points(self) -> FloatArray:
-        """(N, 3) in the world, in metres."""
+        """(N, 3) in the world, m."""
         self._pack()
         return self._points
 
     def _pack(self) -> None:
-        """Move what is recent into the arrays, in the place of what was known of it before."""
+        """Move the recent features into the arrays; older positions of the same ids are dropped."""
         ids = np.array(list(self._recent), dtype=np.int64)
         points = np.array(list(self._recent.values()), dtype=np.float64).reshape(-1, 3)
         kept = ~np.isin(self._ids, ids)
@@ -61,7 +71,7 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
     """
     finite = points[np.isfinite(points).all(axis=1)]
     fields: list[tuple[str, str, int]] = [("place", "<f8", 3)]
-    lines = [f"property double {axis}" for axis in "xyz"]
+    lines = list(_POSITION_PROPERTIES)
     if centres is not None:
         fields.append(("colour", "u1", 3))
         lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
@@ -69,8 +79,8 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
     vertices = np.empty(len(places), fields)
     vertices["place"] = places
     if centres is not None:
-        vertices["colour"][: len(finite)] = POINT_COLOUR
-        vertices["colour"][len(finite) :] = CAMERA_COLOUR
+        vertices["colour"][: len(finite)] = _POINT_COLOUR
+        vertices["colour"][len(finite) :] = _CAMERA_COLOUR
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -80,3 +90,22 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
     ]
     with appearing(path) as partial:
         partial.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
+
+
+def read_ply(path: Path | str) -> FloatArray:
+    """Read the points (N, 3) of a point cloud that `write_ply` wrote without cameras.
+
+    Raises:
+        DataError: if the file is missing or has another form.
+    """
+    path = Path(path)
+    try:
+        header, separator, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    lines = header.decode("ascii", errors="replace").splitlines()
+    properties = tuple(line for line in lines if line.startswith("property"))
+    binary = "format binary_little_endian 1.0" in lines
+    if not separator or not binary or properties != _POSITION_PROPERTIES or len(body) % 24:
+        raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
+    return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)

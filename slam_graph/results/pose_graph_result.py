@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,16 +22,13 @@ from slam_graph.pose_graph.graph_files import g2o_lines
 from slam_graph.pose_graph.graph_initialization import along_tree
 from slam_graph.pose_graph.gtsam_graph import edge_chi2, edge_factors, values_of
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy, PoseGraphSolution
-from slam_graph.results.metrics import finite, versions
-from slam_graph.results.result_files import appearing, write_text
+from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
+from slam_graph.results.result_files import ResultFolder, appearing
 
-SCHEMA_VERSION = 1
-"""Counts up whenever a key changes its name or meaning."""
-
-Table = dict[str, Any]
+__all__ = ["PoseGraphResult"]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class PoseGraphResult:
     """What an optimisation found out.
 
@@ -53,9 +48,16 @@ class PoseGraphResult:
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
+    def __repr__(self) -> str:
+        graph, minimum = self.solution.graph, self.solution.minimum
+        return (
+            f"PoseGraphResult({graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges, "
+            f"cost {minimum.cost:.6g}, {'' if minimum.converged else 'not '}converged)"
+        )
+
     @cached_property
     def before(self) -> Poses:
-        """The poses as they were: those of the file, or odometry."""
+        """The poses before the optimisation: those of the file, or odometry."""
         graph = self.solution.graph
         return along_tree(graph) if graph.estimates is None else graph.estimates
 
@@ -101,28 +103,28 @@ class PoseGraphResult:
         table = {name: getattr(found, name) for name in found.__slots__ if name != "poses"}
         return {**table, "gap": found.gap}
 
-    def save(self, folder: Path) -> list[Path]:
+    def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
+        Args:
+            folder: made if it is missing.
+
         Returns:
-            The files.
+            The files, in the order in which they were written.
         """
         solution, graph = self.solution, self.solution.graph
-        texts = {
-            "optimized.g2o": g2o_lines(graph, solution.poses),
-            "trajectory.tum": tum_lines(graph.trajectory(solution.poses)),
-            "edges.csv": self._edge_lines(),
-            "config.yaml": [dump_yaml(self.policy)],
-            "metrics.json": [json.dumps(self.metrics, indent=2, allow_nan=False), "\n"],
-        }
+        files = ResultFolder(folder)
+        files.text("optimized.g2o", g2o_lines(graph, solution.poses))
+        files.text("trajectory.tum", tum_lines(graph.trajectory(solution.poses)))
+        files.text("edges.csv", self._edge_lines())
+        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.json("metrics.json", self.metrics)
         if self.covariances is not None:
-            texts["covariances.csv"] = self._covariance_lines(self.covariances)
+            files.text("covariances.csv", self._covariance_lines(self.covariances))
         if self.certificate is not None:
-            texts["certified.g2o"] = g2o_lines(graph, self.certificate.poses)
-        for name, lines in texts.items():
-            write_text(folder / name, lines)
-        self._draw(folder / "pose_graph.png")
-        return [folder / name for name in (*texts, "pose_graph.png")]
+            files.text("certified.g2o", g2o_lines(graph, self.certificate.poses))
+        self._draw(files.path("pose_graph.png"))
+        return files.files
 
     def _edge_lines(self) -> Iterator[str]:
         """Edges as CSV: ids, χ² in GTSAM's convention, weight."""
@@ -154,7 +156,7 @@ class PoseGraphResult:
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
     def _draw(self, path: Path) -> None:
-        from slam_graph.visualization.pose_graph_plot import plot_pose_graph
+        from slam_graph.visualization.result_plots import plot_pose_graph
 
         graph, weights = self.solution.graph, self.solution.weights
         title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"

@@ -1,19 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole or not at all, and the folder of a run with its `latest` link."""
+"""Files that appear whole or not at all, and the folder of a result with its `latest` link."""
 
 from __future__ import annotations
 
-import logging
+import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from slam_graph.errors import DataError
 
+__all__ = [
+    "LATEST",
+    "ResultFolder",
+    "appearing",
+    "create_run_folder",
+    "link_latest",
+    "refuse_to_replace",
+    "write_text",
+]
+
 LATEST = "latest"
+"""Name of the link to the newest results."""
 
 
 @contextmanager
@@ -33,10 +45,10 @@ def appearing(path: Path) -> Iterator[Path]:
 
 
 def refuse_to_replace(path: Path, force: bool) -> None:
-    """Make sure that nothing is overwritten unless that is asked for.
+    """Make sure that no file is overwritten unless that is asked for.
 
     Raises:
-        DataError: if the path exists, and `force` is not said or it is a folder.
+        DataError: if the path exists without `force`, or is a folder.
     """
     if path.is_dir():
         raise DataError(f"{path}: is a folder; name a file")
@@ -50,8 +62,37 @@ def write_text(path: Path, lines: Iterable[str]) -> None:
         file.writelines(lines)
 
 
+class ResultFolder:
+    """Writes the files of a result into one folder, each whole or not at all.
+
+    Args:
+        folder: made if it is missing.
+
+    Attributes:
+        files: written so far, in order.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self._folder = Path(folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self.files: list[Path] = []
+
+    def path(self, name: str) -> Path:
+        """The path of the next file, for a writer that makes it appear whole."""
+        self.files.append(self._folder / name)
+        return self.files[-1]
+
+    def text(self, name: str, lines: Iterable[str]) -> None:
+        """Write lines (with their line ends)."""
+        write_text(self.path(name), lines)
+
+    def json(self, name: str, table: Mapping[str, Any]) -> None:
+        """Write a table as JSON."""
+        self.text(name, [json.dumps(table, indent=2, allow_nan=False), "\n"])
+
+
 def create_run_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
-    """A new folder `root/dataset/<UTC time>`, with a number behind the time if it exists already.
+    """Make a new folder `root/dataset/<UTC time>`; a number is added where that exists already.
 
     Raises:
         DataError: if it cannot be made.
@@ -88,23 +129,3 @@ def link_latest(folder: Path) -> Path:
     partial.symlink_to(folder.name)
     os.replace(partial, link)
     return link
-
-
-@contextmanager
-def logged_to(path: Path) -> Iterator[None]:
-    """Write what the package logs to a file, which appears when the block ends, well or not."""
-    partial = path.with_name(f".{path.name}.partial")
-    handler = logging.FileHandler(partial, mode="w", encoding="utf-8")
-    formatter = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
-    handler.setFormatter(formatter)
-    logger = logging.getLogger("slam_graph")
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(min(logging.INFO, logger.getEffectiveLevel()))
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-        logger.removeHandler(handler)
-        handler.close()
-        os.replace(partial, path)

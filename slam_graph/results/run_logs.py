@@ -1,32 +1,27 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How long each stage of each frame took.
-
-The size of each frame's problem, how many steps it took, and what they did to the cost.
-
-How far the images of each frame were from what was predicted of them.
-
-How an estimated calibration came about: its parameters at every frame.
-"""
+"""Logs of every frame of a run: times, steps, innovations, estimated calibration, counts."""
 
 from __future__ import annotations
 
 import time
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 
+__all__ = ["RunLogs", "Stopwatch", "TimingLog", "milliseconds"]
+
 
 class StepLog:
-    """A growing table with a row for each frame in which steps were taken."""
+    """A growing table with a row for each frame in which Gauss-Newton steps were taken."""
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
@@ -51,31 +46,31 @@ class StepLog:
         self._costs.extend((costs[0], costs[-1]))
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
         return np.array(self._stamps_ns, dtype=np.int64)
 
     @property
-    def steps(self) -> NDArray[np.int64]:
+    def steps(self) -> IntArray:
         """(N,) numbers of steps that were taken."""
         return np.array(self._steps, dtype=np.int64)
 
     @property
-    def columns(self) -> NDArray[np.int64]:
+    def columns(self) -> IntArray:
         """(N,) dimensions of the state while the steps were taken."""
         return np.array(self._columns, dtype=np.int64)
 
     @property
-    def costs(self) -> NDArray[np.float64]:
+    def costs(self) -> FloatArray:
         """(N, 2) cost before the first step and after the last."""
         return np.array(self._costs, dtype=np.float64).reshape(-1, 2)
 
 
-COLUMNS = tuple(field.name for field in fields(Innovations))
+_INNOVATION_COLUMNS = tuple(field.name for field in fields(Innovations))
 
 
 class InnovationLog:
-    """A growing table with a row for each frame of which something was predicted."""
+    """A growing table with a row for each frame whose features were tested by the gate."""
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
@@ -85,20 +80,20 @@ class InnovationLog:
         return len(self._stamps_ns)
 
     def append(self, stamp_ns: int, innovations: Innovations) -> None:
-        """Add a frame, unless nothing was tested in it."""
+        """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
             self._stamps_ns.append(stamp_ns)
             self._rows.extend(map(float, astuple(innovations)))
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
         return np.array(self._stamps_ns, dtype=np.int64)
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(COLUMNS))
-        return dict(zip(COLUMNS, rows.T, strict=True))
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(_INNOVATION_COLUMNS))
+        return dict(zip(_INNOVATION_COLUMNS, rows.T, strict=True))
 
 
 class CalibrationLog:
@@ -184,16 +179,16 @@ class TimingLog:
             column.append(milliseconds.get(stage, np.nan))
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
         return np.array(self._stamps_ns, dtype=np.int64)
 
-    def column(self, stage: str) -> NDArray[np.float64]:
+    def column(self, stage: str) -> FloatArray:
         """(N,) milliseconds of a stage."""
         return np.array(self._columns[stage])
 
     def stages(self) -> list[str]:
-        """Names of all stages, in the order of the alphabet: `a.b` is a part of `a`."""
+        """Names of all stages, sorted; `a.b` is a part of `a`."""
         return sorted(self._columns)
 
     def summary(self) -> dict[str, StageTime]:
@@ -232,15 +227,15 @@ class Stopwatch:
         self._since = time.perf_counter()
 
     def restart(self) -> None:
-        """Leave out the time since the last stage ended."""
+        """Do not count the time since the last stage ended."""
         self._since = time.perf_counter()
 
     def lap(self, stage: str, parts: Mapping[str, float] | None = None) -> None:
-        """End a stage that began when the stage before it ended.
+        """End a stage, which began when the stage before it ended.
 
         Args:
             stage: its name.
-            parts: milliseconds of parts of it that were timed elsewhere.
+            parts: milliseconds of its parts, by name; they were timed elsewhere.
         """
         now = time.perf_counter()
         elapsed_ms = 1e3 * (now - self._since)
@@ -248,6 +243,46 @@ class Stopwatch:
         self.milliseconds["total"] += elapsed_ms
         self.milliseconds |= {f"{stage}.{part}": value for part, value in (parts or {}).items()}
         self._since = now
+
+
+@dataclass(eq=False, repr=False)
+class RunLogs:
+    """All logs of a run.
+
+    Attributes:
+        timing: milliseconds of every stage of every frame.
+        steps: Gauss-Newton steps of every frame, and the cost before and after.
+        innovations: normalised innovations of every frame.
+        calibration: estimated calibration at every frame, if any of it is estimated.
+        frames: number of frames that were read.
+        features: sums over all frames of what the front end counts, by name.
+        last_frame_ns: time of the last frame that was read.
+    """
+
+    timing: TimingLog = field(default_factory=TimingLog)
+    steps: StepLog = field(default_factory=StepLog)
+    innovations: InnovationLog = field(default_factory=InnovationLog)
+    calibration: CalibrationLog = field(default_factory=CalibrationLog)
+    frames: int = 0
+    features: Counter[str] = field(default_factory=Counter)
+    last_frame_ns: int | None = None
+
+    def count_frame(
+        self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]
+    ) -> None:
+        """Note that a frame is done.
+
+        Args:
+            stamp_ns: its time.
+            milliseconds: of each stage.
+            frame_stats: what the front end counts.
+        """
+        self.frames += 1
+        self.last_frame_ns = stamp_ns
+        self.timing.append(stamp_ns, milliseconds)
+        for name, count in frame_stats.items():
+            if not name.endswith("_ms"):
+                self.features[name] += int(count)
 
 
 def milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:

@@ -1,66 +1,57 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""All that a run found out, whole or cut short."""
+"""All that a run found out, whole or cut short, and its files."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from slam_graph.config import RunConfig
+from slam_graph.arrays import FloatArray
+from slam_graph.config import RunConfig, dump_yaml
 from slam_graph.datasets.sequence import SequenceInfo
-from slam_graph.errors import EstimationError
+from slam_graph.errors import DataError, EstimationError
+from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.evaluation_report import innovation_report
 from slam_graph.evaluation.truth_pairing import select
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.geometry.trajectory import StateHistory, Trajectory, tum_lines
+from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.loop_closure.close_loops import LoopClosures
 from slam_graph.maps.map_model import SlamMap
+from slam_graph.results import metrics as tables
+from slam_graph.results import run_files as names
 from slam_graph.results.localization_result import LocalizationLog
-from slam_graph.results.point_map import PointMap
-from slam_graph.results.run_logs import CalibrationLog, InnovationLog, StepLog, TimingLog
+from slam_graph.results.map_output import MAP_NAME, save_map
+from slam_graph.results.point_map import PointMap, write_ply
+from slam_graph.results.result_files import ResultFolder, appearing
+from slam_graph.results.run_logs import RunLogs
+from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
 from slam_graph.smoothing.final_adjustment import FinalBa
 
+__all__ = ["Ending", "RunInput", "RunResult", "Status"]
+
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 
-TRUTH_MARGIN_NS = 1_000_000_000
-"""How much of the ground truth before and after the part that was run is kept."""
+_TRUTH_MARGIN_NS = 1_000_000_000
+"""Ground truth is kept from this long before the part that was run to this long after it."""
 
 
-@dataclass(eq=False)
-class RunResult:
-    """What a run found out.
+@dataclass(frozen=True, eq=False, repr=False)
+class RunInput:
+    """What was run: a part of a recording, under which settings.
 
     Attributes:
         info: the recording.
         config: all settings.
         rig: the sensors that were used.
         start_ns, end_ns: times of the first and the last frame that were asked for.
-        truth: ground truth of this time, or None.
-        status: how the run ended.
-        message: why it did not end well; empty if it did.
-        error: what ended the run, if something was raised.
-        history: the causal estimate of every frame.
-        final_ba: the trajectory that comes of the recording as a whole, if one was found.
-        loops: what became of places that were seen again, if loops were to be closed.
-        slam_map: the map, if it was asked for.
-        localization: where the run was in a known map, if it was to be located in one.
-        points: the map.
-        timing: milliseconds of every stage of every frame.
-        steps: Gauss-Newton steps of every frame, and the cost before and after.
-        innovations: how far the images of every frame were from what was predicted.
-        calibration: estimated parameters of the rig at every frame, where any are estimated.
-        frames: number of frames that were read.
-        features: sums over all frames of what the front end counts, by name.
-        wall_s: time that the run took.
-        last_frame_ns: time of the last frame that was read.
-        start_was_given: whether the first state came with the data, in the world of the truth.
-        warnings: counted faults and rejections.
+        truth: ground truth of the whole recording, or None.
     """
 
     info: SequenceInfo
@@ -69,25 +60,88 @@ class RunResult:
     start_ns: int
     end_ns: int
     truth: Trajectory | None = None
+
+    @property
+    def recorded_s(self) -> float:
+        """Length of the part that was asked for, s."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(eq=False)
+class Ending:
+    """How a run ended.
+
+    Attributes:
+        status: in one word.
+        message: why it did not end well; empty if it did.
+        error: what ended the run, if something was raised.
+        wall_s: time that the run took, without smoothing, loop closure and map, s.
+    """
+
     status: Status = "ok"
     message: str = ""
     error: BaseException | None = None
+    wall_s: float = 0.0
+
+
+@dataclass(eq=False, repr=False)
+class RunResult:
+    """What a run found out.
+
+    The accessors that `SavedRun` has too (`trajectory`, `metrics`, …) say the same of a result
+    that was saved and loaded again.
+
+    Attributes:
+        input: what was run.
+        ending: how it ended.
+        history: the causal estimate of every frame, with covariances.
+        start_was_given: whether the first state came with the data, in the world of the truth.
+        point_map: last estimates of the features that were in the state.
+        logs: what was noted at every frame.
+        final_ba: the smoothed trajectory and its summary, if there is one.
+        loops: loop closures, if loops were to be closed.
+        slam_map: the map, if one was to be built.
+        localization: poses in a known map, if there was one.
+        warnings: counted faults and rejections.
+    """
+
+    input: RunInput
+    ending: Ending = field(default_factory=Ending)
     history: StateHistory = field(default_factory=StateHistory)
+    start_was_given: bool = False
+    point_map: PointMap = field(default_factory=PointMap)
+    logs: RunLogs = field(default_factory=RunLogs)
     final_ba: FinalBa | None = None
     loops: LoopClosures | None = None
     slam_map: SlamMap | None = None
     localization: LocalizationLog | None = None
-    points: PointMap = field(default_factory=PointMap)
-    timing: TimingLog = field(default_factory=TimingLog)
-    steps: StepLog = field(default_factory=StepLog)
-    innovations: InnovationLog = field(default_factory=InnovationLog)
-    calibration: CalibrationLog = field(default_factory=CalibrationLog)
-    frames: int = 0
-    features: Counter[str] = field(default_factory=Counter)
-    wall_s: float = 0.0
-    last_frame_ns: int | None = None
-    start_was_given: bool = False
     warnings: Counter[str] = field(default_factory=Counter)
+
+    def __repr__(self) -> str:
+        return (
+            f"RunResult({self.input.info.name}, {self.config.algorithm.name}: {self.status}, "
+            f"{len(self.history)} states of {self.logs.frames} frames)"
+        )
+
+    @property
+    def config(self) -> RunConfig:
+        """All settings of the run."""
+        return self.input.config
+
+    @property
+    def rig(self) -> Rig:
+        """The sensors that were used, with the calibration from before the run."""
+        return self.input.rig
+
+    @property
+    def status(self) -> Status:
+        """How the run ended, in one word."""
+        return self.ending.status
+
+    @property
+    def message(self) -> str:
+        """Why the run did not end well; empty if it did."""
+        return self.ending.message
 
     @property
     def trajectory(self) -> Trajectory:
@@ -95,63 +149,90 @@ class RunResult:
         return self.history.trajectory()
 
     @property
-    def best_trajectory(self) -> Trajectory:
-        """The smoothed trajectory if there is one, else the causal one."""
-        return self.trajectory if self.final_ba is None else self.final_ba.trajectory
+    def sigmas(self) -> FloatArray:
+        """(N, 15) standard deviations of the states, in the order of `NavState.covariance`."""
+        return self.history.sigmas()
 
     @property
-    def recorded_s(self) -> float:
-        """Length of the part that was asked for."""
-        return (self.end_ns - self.start_ns) * 1e-9
+    def smoothed(self) -> Trajectory | None:
+        """The trajectory of the final bundle adjustment, if there is one."""
+        return None if self.final_ba is None else self.final_ba.trajectory
+
+    @property
+    def best_trajectory(self) -> Trajectory:
+        """The smoothed trajectory if there is one, else the causal one."""
+        return self.trajectory if self.smoothed is None else self.smoothed
+
+    @property
+    def loop_closed(self) -> Trajectory | None:
+        """The best trajectory after loop closure, if loops were to be closed."""
+        return None if self.loops is None else self.loops.correct(self.best_trajectory)
+
+    @property
+    def in_map(self) -> Trajectory | None:
+        """Poses in the world of a known map, of the frames where they are known."""
+        return None if self.localization is None else self.localization.trajectory()
+
+    @property
+    def points(self) -> FloatArray:
+        """(P, 3) last estimates of the features that were in the state, in the world, m."""
+        return self.point_map.points()
+
+    @cached_property
+    def groundtruth(self) -> Trajectory | None:
+        """The ground truth around the part that was run, if there is one."""
+        truth = self.input.truth
+        if truth is None:
+            return None
+        first, last = self.input.start_ns - _TRUTH_MARGIN_NS, self.input.end_ns + _TRUTH_MARGIN_NS
+        near = (truth.stamps_ns >= first) & (truth.stamps_ns <= last)
+        return select(truth, np.flatnonzero(near)) if near.any() else None
 
     @property
     def coverage(self) -> float:
         """Estimated time over the time asked for, from 0 to 1."""
-        if len(self.history) == 0:
-            return 0.0
-        stamps = self.trajectory.stamps_ns
-        if self.end_ns <= self.start_ns:
-            return 1.0
-        return min(float(stamps[-1] - stamps[0]) / (self.end_ns - self.start_ns), 1.0)
+        return tables.coverage(self.input.start_ns, self.input.end_ns, self.trajectory)
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`; computed when it is first asked for."""
-        from slam_graph.results.metrics import metrics_table
-
-        return metrics_table(self)
-
-    def count_frame(
-        self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]
-    ) -> None:
-        """Note a frame that was worked through: its time, how long it took, what was found."""
-        self.frames += 1
-        self.last_frame_ns = stamp_ns
-        self.timing.append(stamp_ns, milliseconds)
-        for name, count in frame_stats.items():
-            if not name.endswith("_ms"):
-                self.features[name] += int(count)
-
-    def truth_of_run(self) -> Trajectory | None:
-        """The ground truth around the part that was asked for."""
-        if self.truth is None:
-            return None
-        stamps = self.truth.stamps_ns
-        near = (stamps >= self.start_ns - TRUTH_MARGIN_NS) & (
-            stamps <= self.end_ns + TRUTH_MARGIN_NS
+        asked, logs, truth = self.input, self.logs, self.groundtruth
+        extent = tables.extent_table(asked.start_ns, asked.end_ns, logs.frames, self.trajectory)
+        frames = max(logs.frames, 1)
+        located = self.localization
+        table: dict[str, Any] = tables.finite(
+            {
+                "schema_version": tables.SCHEMA_VERSION,
+                "status": self.status,
+                "message": self.message,
+                "dataset": asdict(asked.info),
+                "algorithm": self.config.algorithm.name,
+                "cameras": len(asked.rig.cameras),
+                "seed": self.config.seed,
+                "extent": {**extent, "start_was_given": self.start_was_given},
+                "accuracy": tables.accuracy_table(truth, self.trajectory),
+                "final_ba": tables.final_ba_table(self.final_ba, truth),
+                "loop_closure": tables.loop_closure_table(self.loops, self.loop_closed, truth),
+                "slam_map": None if self.slam_map is None else self.slam_map.summary(),
+                "localization": (
+                    None
+                    if located is None
+                    else located.table(asked.start_ns, logs.frames, asked.truth)
+                ),
+                "nees": tables.consistency_table(truth, self.history, self.start_was_given),
+                "nis": innovation_report(logs.innovations.columns()),
+                "calibration": logs.calibration.table(),
+                "timing": tables.timing_table(logs, asked.start_ns, self.ending.wall_s),
+                "features_per_frame": {
+                    name: total / frames for name, total in sorted(logs.features.items())
+                },
+                "map_points": len(self.point_map),
+                "warnings": dict(sorted(self.warnings.items())),
+                "peak_memory_mb": tables.peak_memory_mb(),
+                "versions": tables.versions(),
+            }
         )
-        kept = select(self.truth, np.flatnonzero(near))
-        return kept if len(kept) else None
-
-    def save(self, folder: Path | str) -> list[Path]:
-        """Write all files of the run into a folder.
-
-        Returns:
-            The files, in the order in which they were written.
-        """
-        from slam_graph.results.run_writer import write_run
-
-        return write_run(self, Path(folder))
+        return table
 
     def check(self) -> None:
         """Raise what kept the run from ending well, if anything did.
@@ -161,7 +242,64 @@ class RunResult:
             KeyboardInterrupt: if it was interrupted.
             BaseException: whatever else ended it.
         """
-        if self.error is not None:
-            raise self.error
+        if self.ending.error is not None:
+            raise self.ending.error
         if self.status != "ok":
             raise EstimationError(self.message)
+
+    def save(self, folder: Path | str) -> list[Path]:
+        """Write all files of the run, the trajectory first; each appears whole or not at all.
+
+        Args:
+            folder: made if it is missing.
+
+        Returns:
+            The files, in the order in which they were written.
+        """
+        files = ResultFolder(folder)
+        files.text(names.TRAJECTORY, tum_lines(self.trajectory))
+        files.text(names.STATES, names.state_lines(self.history))
+        if self.smoothed is not None:
+            files.text(names.SMOOTHED, tum_lines(self.smoothed))
+        if self.loops is not None and self.loop_closed is not None:
+            files.text(names.LOOP_CLOSED, tum_lines(self.loop_closed))
+            files.text("loops.csv", self.loops.csv_lines())
+            write_ply(files.path("map_loop.ply"), self.loops.points())
+        if self.localization is not None:
+            files.text(names.IN_MAP, tum_lines(self.localization.trajectory()))
+            files.text("localization.csv", self.localization.csv_lines())
+        if self.groundtruth is not None:
+            files.text(names.GROUNDTRUTH, tum_lines(self.groundtruth))
+        write_ply(files.path(names.POINTS), self.points)
+        files.text("timing.csv", self.logs.timing.csv_lines())
+        files.text(names.CONFIG, [dump_yaml(self.config)])
+        write_kalibr(self.rig, files.path(names.RIG))
+        files.json(names.METRICS, self.metrics)
+        calibrated = self.logs.calibration.latest
+        if calibrated is not None:
+            write_kalibr(calibrated.rig, files.path("calibration_estimated.yaml"))
+            files.text("calibration.csv", self.logs.calibration.csv_lines())
+        self._draw(files)
+        if self.slam_map is not None:  # last: it is the file that a full disk is too small for
+            save_map(self.slam_map, files.path(MAP_NAME), force=True)
+        return files.files
+
+    def _draw(self, files: ResultFolder) -> None:
+        """Draw the trajectory beside the truth, where the two can be compared."""
+        from slam_graph.visualization.result_plots import plot_errors
+
+        truth, estimate = self.groundtruth, self.trajectory
+        if truth is None:
+            return
+        alignment: AlignmentMode = "none" if self.start_was_given else "se3"
+        try:
+            position = ape(truth, estimate, "trans_part", alignment)
+            rotation = ape(truth, estimate, "angle_deg", alignment)
+        except DataError:
+            return
+        title = f"{self.input.info.name}, {self.config.algorithm.name}, alignment: {alignment}"
+        aligned = position.similarity.apply(estimate)
+        with appearing(files.path("trajectory.png")) as partial:
+            plot_errors(
+                partial, title, truth, aligned, position.values, rotation.values, position.stamps_ns
+            )

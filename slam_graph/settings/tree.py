@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration trees: YAML files and `key=value` overrides that remember where each value stands.
+"""Configuration trees: nested settings from YAML files and overrides, with where each was set.
 
-A fault found later, when the tree is checked against the schema, can then name file and line.
+So a fault that is found later, when the tree is checked against the schema, names file and line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,13 +19,23 @@ from slam_graph.errors import ConfigError
 from slam_graph.errors import closest as closest
 from slam_graph.settings.base import Settings
 
+__all__ = [
+    "ConfigTree",
+    "KeyPath",
+    "closest",
+    "override",
+    "override_trees",
+    "read_tree",
+    "validate",
+]
+
 KeyPath = tuple[str | int, ...]
-ModelT = TypeVar("ModelT", bound=BaseModel)
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
 @dataclass
 class ConfigTree:
-    """Nested settings, and where each was said.
+    """Nested settings, and where each was set.
 
     Attributes:
         values: nested dictionaries as YAML gives them.
@@ -41,7 +51,7 @@ class ConfigTree:
         self.where.update(other.where)
 
     def locate(self, path: KeyPath) -> str:
-        """Where the value at `path`, or the nearest table around it, was said."""
+        """Where the value at `path`, or the nearest table around it, was set."""
         for length in range(len(path), 0, -1):
             if path[:length] in self.where:
                 return self.where[path[:length]]
@@ -73,7 +83,7 @@ def read_tree(path: Path) -> ConfigTree:
 
 
 def override(text: str) -> ConfigTree:
-    """The tree of one `a.b=value`; the value is read as YAML, so it has its type.
+    """The tree of one `a.b=value`; the value is read as YAML, which gives it its type.
 
     Raises:
         ConfigError: if there is no `=`, a key is empty, or the value is not YAML.
@@ -87,13 +97,32 @@ def override(text: str) -> ConfigTree:
         value = yaml.safe_load(value_text)
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: the value is not YAML; put it in quotes") from error
-    for key in reversed(keys):
-        value = {key: value}
-    paths: dict[KeyPath, str] = {tuple(keys[:n]): where for n in range(1, len(keys) + 1)}
-    return ConfigTree(value, paths)
+    return _branch(keys, value, where)
 
 
-def validate(model: type[ModelT], tree: ConfigTree) -> ModelT:
+def override_trees(overrides: str | Iterable[str] | Mapping[str, Any]) -> list[ConfigTree]:
+    """A tree for each override, in their order.
+
+    Args:
+        overrides: texts `a.b=value`, or a mapping from `a.b` to the value.
+
+    Raises:
+        ConfigError: if one is malformed.
+    """
+    if isinstance(overrides, str):
+        return [override(overrides)]
+    if not isinstance(overrides, Mapping):
+        return [override(text) for text in overrides]
+    trees = []
+    for name, value in overrides.items():
+        keys = name.split(".")
+        if not all(keys):
+            raise ConfigError(f"override '{name}': expected a key, e.g. backend.noise.pixel_sigma")
+        trees.append(_branch(keys, value, f"override {name}"))
+    return trees
+
+
+def validate(model: type[_ModelT], tree: ConfigTree) -> _ModelT:
     """The typed settings of a tree.
 
     Raises:
@@ -142,6 +171,14 @@ def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:
     return model if issubclass(model, Settings) else None
 
 
+def _branch(keys: list[str], value: Any, where: str) -> ConfigTree:
+    """The tree in which nothing but the value at the path `keys` is set."""
+    for key in reversed(keys):
+        value = {key: value}
+    paths: dict[KeyPath, str] = {tuple(keys[:n]): where for n in range(1, len(keys) + 1)}
+    return ConfigTree(value, paths)
+
+
 def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
     """Lay `top` over `base` in place."""
     for key, value in top.items():
@@ -154,7 +191,7 @@ def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
 
 
 def _record_lines(node: yaml.Node, file: Path, path: KeyPath, where: dict[KeyPath, str]) -> None:
-    """Note the line of every key and item below a node, refusing keys that are there twice."""
+    """Note the line of every key and item below a node; a key that is there twice is refused."""
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key_node, value_node in node.value:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of many curves: how algorithms compare over time and distance."""
+"""Pictures of many curves, for the comparison of algorithms over time or distance."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 
-PANEL_INCHES = (5.6, 3.3)
-DPI = 100
-COLUMNS = 2
+__all__ = ["Curve", "Panel", "plot_panels"]
 
-LOGARITHMIC_RANGE = 30.0
+_PANEL_INCHES = (5.6, 3.3)
+_DPI = 100
+_COLUMNS = 2
+
+_LOGARITHMIC_RANGE = 30.0
 """Curves whose medians differ by more than this factor are drawn on a logarithmic scale."""
 
 
@@ -35,10 +37,10 @@ class Panel:
     """One diagram.
 
     Attributes:
-        xlabel, ylabel: of its axes.
-        curves: its lines; the same label has the same colour in all panels of a picture.
-        band: two values between which curves should lie, if any.
-        band_label: what the band is.
+        xlabel, ylabel: labels of its axes.
+        curves: its lines; one label has one colour in all panels of a picture.
+        band: lower and upper bound of a shaded band, if there is one.
+        band_label: label of the band.
     """
 
     xlabel: str
@@ -54,15 +56,15 @@ def plot_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
     Args:
         path: of the PNG.
         title: of the picture.
-        panels: at least one.
+        panels: one or more.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = min(COLUMNS, len(panels))
+    columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
-    size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * rows)
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
@@ -77,7 +79,7 @@ def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
         axes.axhspan(*panel.band, color="0.85", label=panel.band_label)
     for curve in panel.curves:
         axes.plot(curve.x, curve.y, color=colours[curve.label], linewidth=1.2, label=curve.label)
-    if _spread(panel.curves) > LOGARITHMIC_RANGE:
+    if _spread(panel.curves) > _LOGARITHMIC_RANGE:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0.0)
@@ -87,7 +89,7 @@ def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
 
 
 def _spread(curves: Sequence[Curve]) -> float:
-    """Largest over smallest median."""
+    """Ratio of the largest to the smallest median."""
     known = [curve.y[np.isfinite(curve.y)] for curve in curves]
     medians = [float(np.median(values)) for values in known if len(values)]
     if not medians or min(medians) <= 0.0:

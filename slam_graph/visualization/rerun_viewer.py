@@ -18,14 +18,16 @@ from slam_graph.geometry.trajectory_alignment import align_first_pose
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
 
+__all__ = ["RerunViewer", "ViewerMode"]
+
 ViewerMode = Literal["save", "spawn", "connect"]
 
-TIMELINE = "time"
-STRIP_LENGTH = 50
-"""Poses a strip of the path: a finished strip is not sent again."""
+_TIMELINE = "time"
+_STRIP_LENGTH = 50
+"""Poses in one strip of the path; finished strips are not sent again."""
 
-JPEG_QUALITY = 75
-FRUSTUM_M = 0.2
+_JPEG_QUALITY = 75
+_FRUSTUM_M = 0.2
 ESTIMATE_COLOR, TRUTH_COLOR = (0, 122, 255), (150, 150, 150)
 FEATURE_COLOR, MAP_COLOR = (0, 220, 0), (255, 160, 0)
 
@@ -60,7 +62,7 @@ class RerunViewer:
         self._truth: Trajectory | None = None
 
     def open(self, rig: Rig, truth: Trajectory | None) -> None:
-        """Send what does not change: axes and cameras."""
+        """Send what does not change: the axes and the cameras."""
         rr = self._rr
         self._truth = truth
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -71,7 +73,7 @@ class RerunViewer:
             lens = rr.Pinhole(
                 image_from_camera=camera.K,
                 resolution=(camera.width, camera.height),
-                image_plane_distance=FRUSTUM_M,
+                image_plane_distance=_FRUSTUM_M,
             )
             self._log(entity, placed, static=True)
             self._log(entity, lens, static=True)
@@ -84,7 +86,7 @@ class RerunViewer:
         points: FloatArray,
     ) -> None:
         """Send one frame."""
-        self._stream.set_time(TIMELINE, timestamp=np.datetime64(features.stamp_ns, "ns"))
+        self._stream.set_time(_TIMELINE, timestamp=np.datetime64(features.stamp_ns, "ns"))
         self._show_cameras(frame, features)
         if state is None:
             return
@@ -94,7 +96,7 @@ class RerunViewer:
             self._show_truth(state)
 
     def close(self) -> None:
-        """Send the rest; a saved file gets its name."""
+        """Send what is left; a saved file appears under its name."""
         self._stream.flush()
         self._stream.disconnect()
         if self._path is not None:
@@ -112,19 +114,19 @@ class RerunViewer:
             raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error
 
     def _show_cameras(self, frame: CameraFrame | FeatureFrame, features: FeatureFrame) -> None:
-        """Images with the features in them."""
+        """The images, with their features."""
         rr = self._rr
         images = frame.images if isinstance(frame, CameraFrame) else ()
         for index, image in enumerate(images):
             if image is not None:
-                picture = rr.Image(image, color_model="L").compress(jpeg_quality=JPEG_QUALITY)
+                picture = rr.Image(image, color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
                 self._log(f"world/body/cam{index}/image", picture)
         for index, seen in enumerate(features.cameras):
             marks = rr.Points2D(seen.pixels, colors=FEATURE_COLOR, radii=2.0)
             self._log(f"world/body/cam{index}/image/features", marks)
 
     def _show_state(self, state: NavState) -> None:
-        """The pose, the path that leads to it, and the series."""
+        """The pose, the path so far, and the time series."""
         rr = self._rr
         pose = state.world_T_body
         position = pose.translation()
@@ -133,7 +135,7 @@ class RerunViewer:
         self._strip.append(np.array(position))
         path = rr.LineStrips3D([self._strip], colors=ESTIMATE_COLOR)
         self._log(f"world/path/{self._strips:05d}", path)
-        if len(self._strip) >= STRIP_LENGTH:
+        if len(self._strip) >= _STRIP_LENGTH:
             self._strip, self._strips = self._strip[-1:], self._strips + 1
         series = {
             "velocity": state.velocity,
@@ -147,7 +149,7 @@ class RerunViewer:
             self._log(f"series/{name}", rr.Scalars(values))
 
     def _show_truth(self, state: NavState) -> None:
-        """The true path, once, turned so that it starts where the estimate does."""
+        """The true path, sent once, aligned with the estimate at the first pose."""
         assert self._truth is not None
         start, _ = interpolate(self._truth, np.array([state.stamp_ns]))
         if len(start) == 0:

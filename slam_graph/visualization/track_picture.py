@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Feature tracks drawn on the images: where each feature is and the way that it came."""
+"""Feature tracks drawn on the images: the features and their recent paths."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 
+__all__ = ["Picture", "TrackPainter", "TrackVideo", "save_picture"]
+
 Picture = NDArray[np.uint8]
 
-TAIL_FRAMES = 15
-"""How much of its way is drawn behind a feature, and the age at which its colour is full."""
+_TAIL_FRAMES = 15
+"""Length of the path that is drawn behind a feature; also the age at which its colour is full."""
 
-FRAMES_PER_S = 20.0
+_FRAMES_PER_S = 20.0
 
 
 class TrackPainter:
@@ -51,7 +53,7 @@ class TrackPainter:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
             tails = self._tails[number]
             for j, (u, v) in zip(camera.ids.tolist(), camera.pixels.tolist(), strict=True):
-                tail = tails.setdefault(j, deque(maxlen=TAIL_FRAMES))
+                tail = tails.setdefault(j, deque(maxlen=_TAIL_FRAMES))
                 tail.append((round(8 * u), round(8 * v)))
                 self._mark(picture, tail, self._ages[j], everywhere[j] > 1)
             self._tails[number] = {j: tail for j, tail in tails.items() if j in seen[number]}
@@ -62,8 +64,8 @@ class TrackPainter:
     def _mark(
         self, picture: NDArray[np.uint8], tail: deque[tuple[int, int]], age: int, shared: bool
     ) -> None:
-        """Draw one feature; places are in eighths of a pixel."""
-        share = min(age / TAIL_FRAMES, 1.0)
+        """Draw one feature; coordinates are in eighths of a pixel (`shift=3` of OpenCV)."""
+        share = min(age / _TAIL_FRAMES, 1.0)
         colour = (255 * (1 - share), 160 * (1 - abs(2 * share - 1)) + 40, 255 * share)
         way = np.array(tail, np.int32).reshape(-1, 1, 2)
         cv2.polylines(picture, [way], False, colour, 1, cv2.LINE_AA, 3)
@@ -82,8 +84,8 @@ class TrackVideo:
         DataError: at the first picture, if it cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
         self._writer: cv2.VideoWriter | None = None
 
     def __enter__(self) -> Self:
@@ -104,18 +106,19 @@ class TrackVideo:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (picture.shape[1], picture.shape[0])
-            self._writer = cv2.VideoWriter(str(self._path), code, FRAMES_PER_S, size)
+            self._writer = cv2.VideoWriter(str(self._path), code, _FRAMES_PER_S, size)
             if not self._writer.isOpened():
                 raise DataError(f"{self._path}: cannot be written as a video; use .mp4")
         self._writer.write(picture)
 
 
-def save_picture(path: Path, picture: Picture) -> None:
+def save_picture(path: Path | str, picture: Picture) -> None:
     """Write a picture as PNG.
 
     Raises:
         DataError: if it cannot be written.
     """
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     good, data = cv2.imencode(".png", picture)
     if not good:
@@ -127,5 +130,5 @@ def save_picture(path: Path, picture: Picture) -> None:
 
 
 def _padded(picture: Picture, height: int) -> Picture:
-    """A picture with black below, so that all are equally high."""
+    """A picture padded with black below, to a common height."""
     return np.pad(picture, ((0, height - picture.shape[0]), (0, 0), (0, 0)))

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows to whoever watches, and the viewer that shows nothing."""
+"""The protocol of a viewer that watches a run, and the viewer that shows nothing."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from slam_graph.arrays import FloatArray
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.sensors.rig import Rig
+
+__all__ = ["NullViewer", "Viewer"]
 
 
 class Viewer(Protocol):
@@ -26,15 +26,15 @@ class Viewer(Protocol):
         frame: CameraFrame | FeatureFrame,
         features: FeatureFrame,
         state: NavState | None,
-        points: NDArray[np.float64],
+        points: FloatArray,
     ) -> None:
         """Called after each frame.
 
         Args:
-            frame: what the sequence delivered.
-            features: what the front end found in it.
-            state: the estimate, or None before initialisation.
-            points: (N, 3) features that are now estimated, in the world.
+            frame: images, or recorded features.
+            features: what the front end found in the frame.
+            state: the causal estimate, or None before initialisation.
+            points: (N, 3) positions of the features that are estimated now, in the world, m.
         """
         ...
 
@@ -54,7 +54,7 @@ class NullViewer:
         frame: CameraFrame | FeatureFrame,
         features: FeatureFrame,
         state: NavState | None,
-        points: NDArray[np.float64],
+        points: FloatArray,
     ) -> None:
         """Show nothing."""
 

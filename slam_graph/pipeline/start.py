@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A first state that need not be found: one that comes with the data, or the truth itself."""
+"""A known start: a first state that comes with the data, or is taken from the ground truth."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.backend.estimator import Estimator
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.results.run_result import RunResult
+from slam_graph.results.run_result import RunInput
 
-LEAD_NS = 1_000_000_000
-"""How long before the first frame a given state may be: the IMU reaches back that far."""
+__all__ = ["KnownStart", "true_state"]
 
-DIFFERENCE_NS = 25_000_000
-"""Half the time over which the velocity is taken from positions where the truth has none."""
+_LEAD_NS = 1_000_000_000
+"""A given state may be this much older than the first frame: the IMU reaches back that far."""
 
-TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
-"""Of the true rotation (rad), position (m), velocity (m/s), accelerometer bias (m/s²) and gyroscope
-bias (rad/s)."""
+_DIFFERENCE_NS = 25_000_000
+"""Half the step of the central difference that gives the velocity where the truth has none."""
 
-UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
-"""Of the accelerometer and gyroscope bias where the truth does not tell them."""
+_TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
+"""Standard deviations of the true rotation (rad), position (m), velocity (m/s), accelerometer bias
+(m/s²) and gyroscope bias (rad/s)."""
+
+_UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
+"""Standard deviations of the accelerometer and gyroscope bias where the truth has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,39 +43,36 @@ class KnownStart:
     truth: Trajectory | None = None
 
     @staticmethod
-    def of(sequence: Sequence, result: RunResult, mode: str) -> KnownStart:
-        """The known start under an initialisation mode (see `InitializationConfig.mode`).
+    def of(sequence: Sequence, asked: RunInput) -> KnownStart:
+        """The known start that the initialisation mode asks for (`backend.initialization.mode`).
 
         Raises:
-            DataError: if the mode needs a state or a ground truth that the sequence has not.
+            DataError: if the mode needs a state or a ground truth that the sequence does not have.
         """
-        name = result.info.name
+        name, mode = asked.info.name, asked.config.backend.initialization.mode
         if mode == "groundtruth":
-            if result.truth is None:
+            if asked.truth is None:
                 raise DataError(f"{name}: no ground truth to start from; use another mode")
-            return KnownStart(truth=result.truth)
+            return KnownStart(truth=asked.truth)
         if mode not in ("auto", "given"):
             return KnownStart()
         state = sequence.initial_state()
-        if state is not None and not (result.start_ns - LEAD_NS <= state.stamp_ns <= result.end_ns):
+        if state is not None and not (asked.start_ns - _LEAD_NS <= state.stamp_ns <= asked.end_ns):
             state = None
         if state is None and mode == "given":
             raise DataError(
-                f"{name}: no start state comes with the data at {result.config.start_s:g} s; "
+                f"{name}: no start state comes with the data at {asked.config.start_s:g} s; "
                 "use --set backend.initialization.mode=auto"
             )
         return KnownStart(state=state)
 
-    def apply(self, estimator: Estimator, frame_ns: int, result: RunResult) -> None:
-        """Start the estimator if the state is known by the time of a frame."""
-        if estimator.initialized:
-            return
-        state = self.state
+    def at(self, stamp_ns: int) -> NavState | None:
+        """The state to start from at a frame, or None if it is not known by then."""
         if self.truth is not None:
-            state = true_state(self.truth, frame_ns)
-        if state is not None and state.stamp_ns <= frame_ns:
-            estimator.start(state)
-            result.start_was_given = True
+            return true_state(self.truth, stamp_ns)
+        if self.state is not None and self.state.stamp_ns <= stamp_ns:
+            return self.state
+        return None
 
 
 def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
@@ -82,7 +80,7 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
 
     Velocity is taken from positions where the truth has none, and biases are zero.
     """
-    stamps = np.array([stamp_ns - DIFFERENCE_NS, stamp_ns, stamp_ns + DIFFERENCE_NS])
+    stamps = np.array([stamp_ns - _DIFFERENCE_NS, stamp_ns, stamp_ns + _DIFFERENCE_NS])
     near, valid = interpolate(truth, stamps)
     if not valid[1]:
         return None
@@ -94,9 +92,9 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
         velocity = (near.positions[-1] - near.positions[0]) / seconds
     else:
         return None
-    sigmas = TRUTH_SIGMAS
+    sigmas = _TRUTH_SIGMAS
     if near.accel_biases is None or near.gyro_biases is None:
-        sigmas = TRUTH_SIGMAS[:3] + UNKNOWN_BIAS_SIGMAS
+        sigmas = _TRUTH_SIGMAS[:3] + _UNKNOWN_BIAS_SIGMAS
     return NavState(
         stamp_ns,
         near.pose(middle),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""`slam-graph data`: what a recording holds, what is wrong with it, and its EuRoC form."""
+"""`slam-graph data`: show, check and convert recordings."""
 
 from __future__ import annotations
 
@@ -11,51 +11,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.output import echo_json, echo_table
+from slam_graph.cli.options import (
+    Calibration,
+    Data,
+    Format,
+    Groundtruth,
+    Json,
+    Progress,
+    Sources,
+    open_recording,
+)
+from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.datasets.sequence import RecordedSequence, Sequence
+    from slam_graph.datasets.sequence import Sequence
+
+__all__ = ["app"]
 
 app = typer.Typer(
-    help="Look at recordings, check and convert them.", no_args_is_help=True, rich_markup_mode=None
+    help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode=None
 )
-
-Data = Annotated[
-    str,
-    typer.Argument(
-        metavar="DATA", help="Recording: a folder or file; `demo` for the one that comes along."
-    ),
-]
-Format = Annotated[
-    str | None, typer.Option("--format", help="Format of the data; guessed if not said.")
-]
-Calibration = Annotated[
-    Path | None, typer.Option("--calibration", help="Kalibr YAML to use instead of the data's.")
-]
-Groundtruth = Annotated[
-    Path | None, typer.Option("--groundtruth", help="True trajectory to use instead of the data's.")
-]
-Sources = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        "--source",
-        metavar="SENSOR=WHERE",
-        help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
-        "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
-        "rate=30 instead of stamps.",
-    ),
-]
-Cameras = Annotated[
-    str | None, typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use.")
-]
-Start = Annotated[
-    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
-]
-Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds to run; to the end if not said.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()
@@ -67,7 +42,7 @@ def info(
     sources: Sources = None,
     as_json: Json = False,
 ) -> None:
-    """Show what a recording holds, without reading it whole."""
+    """Show what a recording holds, without reading all of it."""
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
     table = _describe(sequence)
     if as_json:
@@ -86,10 +61,10 @@ def check(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
-    images: Annotated[bool, typer.Option("--images", help="Read every image too.")] = False,
+    images: Annotated[bool, typer.Option("--images", help="Also read every image.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Read a recording and report what is wrong with it; the exit code is 1 if it is unusable."""
+    """Read a recording and report faults in it; the exit code is 1 if it is unusable."""
     from slam_graph.datasets.data_checks import check_sequence
 
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
@@ -115,9 +90,7 @@ def convert(
     force: Annotated[
         bool, typer.Option("--force", help="Replace OUTPUT if it is an EuRoC folder.")
     ] = False,
-    progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
-    ] = True,
+    progress: Progress = True,
 ) -> None:
     """Write a recording of images as an EuRoC folder, whole or not at all."""
     from slam_graph.cli.progress import ProgressBar
@@ -127,41 +100,11 @@ def convert(
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
-        told = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
-        convert_to_euroc(sequence, output, force, told)
+        report = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
+        convert_to_euroc(sequence, output, force, report)
     for kind, count in sequence.diagnostics.counts.items():
         typer.echo(f"warning: {kind} {count}", err=True)
     typer.echo(str(output))
-
-
-def sources_from(texts: list[str] | None) -> dict[str, str]:
-    """Where each sensor is, from texts ``sensor=where``."""
-    pairs = [text.partition("=") for text in texts or []]
-    for text, (sensor, _, where) in zip(texts or [], pairs, strict=True):
-        if not sensor or not where:
-            raise typer.BadParameter(f"'{text}' is not of the form SENSOR=WHERE")
-    return {sensor: where for sensor, _, where in pairs}
-
-
-def open_recording(
-    data: str,
-    format_: str | None,
-    calibration: Path | None,
-    groundtruth: Path | None,
-    sources: list[str] | None,
-    cameras: int | None = None,
-) -> RecordedSequence:
-    """The recording that the options of a command mean, with its first `cameras` cameras or all."""
-    from slam_graph.datasets.dataset_registry import open_dataset
-
-    return open_dataset(
-        data,
-        format=format_,
-        cameras=cameras,
-        calibration=calibration,
-        groundtruth=groundtruth,
-        sources=sources_from(sources),
-    )
 
 
 def _describe(sequence: Sequence) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from typing import Any
 
 import typer
 
+__all__ = ["echo_json", "echo_table", "number"]
+
 
 def echo_json(value: Any) -> None:
     """Print JSON on stdout."""

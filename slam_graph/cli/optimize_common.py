@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `slam-graph optimize` does with any kind of problem: settings, times, files."""
+"""What `slam-graph optimize` does for every kind of problem: settings, timing, files."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from pydantic import BaseModel
 
 from slam_graph.cli.logs import remove_if_empty
 
-Policy = TypeVar("Policy", bound=BaseModel)
+__all__ = ["read_policy", "timed", "write_result"]
+
+_Policy = TypeVar("_Policy", bound=BaseModel)
 
 
-class Result(Protocol):
-    """What was found out about a problem."""
+class _Result(Protocol):
+    """The result of an optimisation."""
 
     def save(self, folder: Path) -> list[Path]:
         """Write all files into a folder."""
@@ -26,18 +28,18 @@ class Result(Protocol):
 
 
 def read_policy(
-    kind: type[Policy],
+    kind: type[_Policy],
     file: Path | None,
     overrides: list[str],
     options: Mapping[tuple[str, str], Any],
-) -> Policy:
-    """The settings: file under options under overrides.
+) -> _Policy:
+    """The settings: the file, then options, then overrides.
 
     Args:
         kind: of policy.
         file: YAML, if there is one.
         overrides: `key=value` each.
-        options: values by table and name; None where nothing is said.
+        options: values by table and name; None changes nothing.
     """
     from slam_graph.settings.tree import ConfigTree, KeyPath, override, read_tree, validate
 
@@ -53,9 +55,9 @@ def read_policy(
 
 
 def write_result(
-    result: Result, name: str, output: Path, log: list[str]
+    result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
-    """Write all files into a new folder, under the name of the problem."""
+    """Write all files into a new folder, named after the problem."""
     from slam_graph.results.result_files import create_run_folder, link_latest, write_text
 
     folder = create_run_folder(output, name)

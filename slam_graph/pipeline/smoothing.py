@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Smoothing as a stage: frames are kept on disk, and bundle adjusted as a whole at the end."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import SlamGraphError
+from slam_graph.pipeline.observers import Progress
+from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
+from slam_graph.results.run_result import RunResult
+from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
+from slam_graph.smoothing.frame_log import FrameLog
+
+__all__ = ["Smoothing"]
+
+_SMOOTHED = (*COMPLETED, "diverged")
+"""Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
+
+_FAILED = "no smoothed trajectory"
+
+logger = logging.getLogger(__name__)
+
+
+class Smoothing(Stage):
+    """Keeps the frames of a run in a temporary folder and solves the recording as a whole.
+
+    Whatever goes wrong is counted as a warning; the causal result stays as it is.
+
+    Args:
+        result: of the run; it is given the smoothed trajectory.
+        progress: told after each step of the adjustment.
+        diagnostics: counts what goes wrong.
+    """
+
+    def __init__(self, result: RunResult, progress: Progress, diagnostics: Diagnostics) -> None:
+        self._result = result
+        self._progress = progress
+        self._diagnostics = diagnostics
+        self._recording = ExitStack()
+        self._log: FrameLog | None = None
+
+    def begin(self, resources: ExitStack) -> None:
+        """Make the temporary folder."""
+        rig, config = self._result.input.rig, self._result.config.final_ba
+        try:
+            folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
+            resources.enter_context(self._recording)  # released before the folder is removed
+            recording = FrameLog.recording(rig, config, Path(folder))
+            self._log = self._recording.enter_context(recording)
+        except OSError as error:
+            self._give_up(error)
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Keep a frame with the IMU samples since the one before."""
+        if self._log is None:
+            return
+        try:
+            self._log.add(frame.packet.imu, frame.features, frame.imu_noise)
+        except (OSError, SlamGraphError) as error:
+            self._give_up(error)
+
+    def finish(self) -> None:
+        """Solve the recording as a whole, if there is an estimate to start from."""
+        result = self._result
+        if self._log is None or not len(result.history) or result.status not in _SMOOTHED:
+            return
+        with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
+            self._recording.close()
+            try:
+                self._solve(self._log)
+            except UndeterminedError as reason:
+                logger.info("no final bundle adjustment: %s", reason)
+
+    def _solve(self, log: FrameLog) -> None:
+        result = self._result
+        calibrated = result.logs.calibration.latest
+        result.final_ba = adjust_recording(
+            log,
+            result.trajectory,
+            result.input.rig if calibrated is None else calibrated.rig,
+            result.config.backend,
+            result.config.final_ba,
+            self._progress.adjusting,
+        )
+        summary = result.final_ba.summary
+        logger.info(
+            "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",
+            summary.keyframes,
+            summary.features,
+            summary.iterations,
+            summary.seconds,
+        )
+
+    def _give_up(self, error: Exception) -> None:
+        self._log = None
+        with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
+            raise error

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the stages of a run have in common: three calls, and the frame that each of them is given.
+
+Tracking and estimation make an `EstimatedFrame` of every packet of a recording. Each stage is given
+every frame. After the last frame the stages finish in order, so that a later stage finds the
+results of the earlier ones in the `RunResult`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import SlamGraphError
+from slam_graph.frontend.frontend_protocol import Feedback
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
+
+__all__ = ["COMPLETED", "EstimatedFrame", "Stage", "warn_on_failure"]
+
+COMPLETED = ("ok", "low_coverage")
+"""Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
+
+_MESSAGE_LENGTH = 200
+"""Messages of other libraries are cut to this many characters."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedFrame:
+    """A frame of the recording, with what the front end and the estimator made of it.
+
+    Attributes:
+        packet: the frame and the IMU samples before it, as read.
+        features: what the front end found in the frame.
+        state: the causal estimate at its time, or None before initialisation.
+        landmark_ids: (N,) ids of the features whose positions are estimated now.
+        landmarks: (N, 3) their positions in the world, m.
+        rejected: (M,) ids of the features that the χ² gate rejected.
+        imu_noise: factors on the white noise of gyroscope and accelerometer that are assumed now.
+        initialized: whether the estimator has started.
+    """
+
+    packet: Packet
+    features: FeatureFrame
+    state: NavState | None
+    landmark_ids: IntArray
+    landmarks: FloatArray
+    rejected: IntArray
+    imu_noise: tuple[float, float]
+    initialized: bool
+
+    @property
+    def image(self) -> np.ndarray | None:
+        """The image of the first camera, if there is one."""
+        frame = self.packet.frame
+        return frame.images[0] if isinstance(frame, CameraFrame) else None
+
+    @property
+    def imu(self) -> ImuData:
+        """The IMU samples since the frame before."""
+        return self.packet.imu
+
+    def feedback(self) -> Feedback:
+        """What the front end is told about the features."""
+        return Feedback.of(self.state, self.rejected, self.landmark_ids, self.landmarks)
+
+
+class Stage:
+    """One part of a run. This base class does nothing: a stage overrides what it needs."""
+
+    def begin(self, resources: ExitStack) -> None:
+        """Called once, before the first frame.
+
+        Args:
+            resources: closed when the run is over, however it ends.
+        """
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Called for each frame, in the order of time."""
+
+    def finish(self) -> None:
+        """Called once, when the last frame is done, however the run ended."""
+
+
+@contextmanager
+def warn_on_failure(diagnostics: Diagnostics, kind: str, consequence: str) -> Iterator[None]:
+    """Turn a failure of the block into a counted warning: the causal result is not lost by it.
+
+    Args:
+        diagnostics: counts the warning.
+        kind: of the warning.
+        consequence: begins the message: what the run lacks now.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        diagnostics.warn(kind, f"{consequence}: interrupted")
+    except Exception as error:
+        if not isinstance(
+            error, SlamGraphError | cv2.error | RuntimeError | np.linalg.LinAlgError | OSError
+        ):
+            logger.exception("internal error")
+        reason = " ".join(str(error).split())[:_MESSAGE_LENGTH]
+        diagnostics.warn(kind, f"{consequence}: {reason}")

@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a run, read back from its folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.config import RunConfig, load_config
+from slam_graph.errors import DataError
+from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.maps.map_model import SlamMap
+from slam_graph.results import run_files as names
+from slam_graph.results.map_output import MAP_NAME, load_map
+from slam_graph.results.point_map import read_ply
+from slam_graph.results.result_files import LATEST
+from slam_graph.sensors.kalibr_calibration import read_kalibr
+from slam_graph.sensors.rig import Rig
+
+__all__ = ["SavedRun", "load_result"]
+
+
+def load_result(folder: Path | str) -> SavedRun:
+    """Read back what `RunResult.save` or `slam-graph run` wrote.
+
+    Args:
+        folder: of a run, or of the runs of a recording, of which the latest is taken.
+
+    Raises:
+        DataError: if there is no result of a run.
+    """
+    folder = Path(folder)
+    for found in (folder, folder / LATEST):
+        if (found / names.METRICS).is_file() and (found / names.TRAJECTORY).is_file():
+            return SavedRun(found)
+    raise DataError(
+        f"{folder}: no result of a run here ({names.METRICS} and {names.TRAJECTORY}); "
+        "name the folder that `slam-graph run` wrote"
+    )
+
+
+class SavedRun:
+    """A result that was saved; each file is read when it is first asked for.
+
+    It has the accessors of `RunResult` as far as the files allow; there are no full covariances.
+    An accessor raises `DataError` if its file is missing or damaged.
+
+    Args:
+        folder: with the files.
+
+    Attributes:
+        folder: with the files.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+
+    def __repr__(self) -> str:
+        table = self.metrics
+        extent = table["extent"]
+        return (
+            f"SavedRun({table['dataset']['name']}, {table['algorithm']}: {self.status}, "
+            f"{extent['estimated_frames']} states of {extent['frames']} frames)"
+        )
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """The content of `metrics.json`."""
+        path = self.folder / names.METRICS
+        try:
+            table: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+        except ValueError as error:
+            raise DataError(f"{path}: not JSON ({error})") from error
+        return table
+
+    @property
+    def status(self) -> str:
+        """How the run ended, in one word."""
+        return str(self.metrics["status"])
+
+    @property
+    def message(self) -> str:
+        """Why the run did not end well; empty if it did."""
+        return str(self.metrics["message"])
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """All settings of the run.
+
+        Raises:
+            ConfigError: if this version does not know a setting any more; the message says what
+                became of it.
+        """
+        return load_config(self.folder / names.CONFIG)
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The sensors that were used, with the calibration from before the run."""
+        return read_kalibr(self.folder / names.RIG)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The causal estimate, with velocities and biases."""
+        poses = _trajectory(self.folder, names.TRAJECTORY)
+        stamps, states = self._states
+        if poses is None or not np.array_equal(stamps, poses.stamps_ns):
+            raise DataError(f"{self.folder}: {names.STATES} and {names.TRAJECTORY} differ in time")
+        return replace(
+            poses,
+            velocities=_columns(states, names.VELOCITY),
+            accel_biases=_columns(states, names.ACCEL_BIAS),
+            gyro_biases=_columns(states, names.GYRO_BIAS),
+        )
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(N, 15) standard deviations of the states, in the order of `NavState.covariance`."""
+        return _columns(self._states[1], names.SIGMAS)
+
+    @cached_property
+    def smoothed(self) -> Trajectory | None:
+        """The trajectory of the final bundle adjustment, if there is one."""
+        return _trajectory(self.folder, names.SMOOTHED)
+
+    @property
+    def best_trajectory(self) -> Trajectory:
+        """The smoothed trajectory if there is one, else the causal one."""
+        return self.trajectory if self.smoothed is None else self.smoothed
+
+    @cached_property
+    def loop_closed(self) -> Trajectory | None:
+        """The best trajectory after loop closure, if loops were to be closed."""
+        return _trajectory(self.folder, names.LOOP_CLOSED)
+
+    @cached_property
+    def in_map(self) -> Trajectory | None:
+        """Poses in the world of a known map, of the frames where they are known."""
+        return _trajectory(self.folder, names.IN_MAP)
+
+    @cached_property
+    def groundtruth(self) -> Trajectory | None:
+        """The ground truth around the part that was run, if there is one."""
+        return _trajectory(self.folder, names.GROUNDTRUTH)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """(P, 3) last estimates of the features that were in the state, in the world, m."""
+        return read_ply(self.folder / names.POINTS)
+
+    @cached_property
+    def slam_map(self) -> SlamMap | None:
+        """The map, if one was saved."""
+        path = self.folder / MAP_NAME
+        return load_map(path) if path.is_file() else None
+
+    @property
+    def coverage(self) -> float:
+        """Estimated time over the time asked for, from 0 to 1."""
+        return float(self.metrics["extent"]["coverage"])
+
+    @cached_property
+    def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:
+        return names.read_states(self.folder / names.STATES)
+
+
+def _trajectory(folder: Path, name: str) -> Trajectory | None:
+    """A trajectory of a folder, or None if there is none of this name."""
+    path = folder / name
+    return names.read_tum(path) if path.is_file() else None
+
+
+def _columns(states: dict[str, FloatArray], columns: tuple[str, ...]) -> FloatArray:
+    """Some columns side by side."""
+    return np.column_stack([states[column] for column in columns])
