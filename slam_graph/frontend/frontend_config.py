@@ -99,11 +99,11 @@ class FrontendConfig(Settings):
     """Number of features aimed at in the first camera; the other cameras look for these same ones.
     More make the estimate less dependent on single ones, and cost time in front and back end."""
 
-    grid: tuple[PositiveCount, PositiveCount] = (8, 6)
+    grid: tuple[PositiveCount, PositiveCount] = expert((8, 6))
     """Columns and rows of the grid over which features are spread evenly. Fit it to the shape of
     the image; with fewer cells features crowd where the texture is strongest."""
 
-    min_distance_px: PositivePixels = 12.0
+    min_distance_px: PositivePixels = expert(12.0)
     """Least distance of a new feature from every other one. Scale it with the resolution."""
 
     prediction: Literal["none", "flow", "gyroscope", "state"] = "gyroscope"
