@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.policies import AlgorithmConfig
@@ -130,6 +131,19 @@ class RunConfig(Settings):
     """How the run is located in a map that was saved before."""
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
+
+    @field_validator("backend")
+    @classmethod
+    def _engine_can_calibrate(cls, backend: BackendConfig, info: ValidationInfo) -> BackendConfig:
+        """Refuse to estimate a calibration with an engine that cannot."""
+        engine = getattr(info.data.get("algorithm"), "engine", "square_root")
+        if engine != "square_root" and backend.calibration.anything:
+            reason = (
+                f"has parameters to calibrate, but engine '{engine}' takes the calibration as it "
+                "is; remove 'calibration', or use msckf, swf, okvis, ekf or iekf"
+            )
+            raise PydanticCustomError("unused", "{reason}", {"reason": reason})
+        return backend
 
 
 def load_config(

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts that have names: the package's own, those of a program, and those of installed plugins.
+"""Registries of named parts, such as detectors, which programs and installed plugins can extend.
 
-A `Registry` maps names to implementations of one kind of part, such as detectors. There are three
-ways into it:
+A `Registry` maps names to the implementations of one kind of part. They are registered in one of
+three ways:
 
-- the package's own parts stand in one module, `home`, which is imported on the first look-up;
-- a program registers with a decorator, `@DETECTORS.register("mine")`;
-- an installed package declares a Python entry point in the group of the registry. Its name is known
-  without importing it, and it is imported when the name is used.
+- by this package, with a decorator in one module, `home`, which is imported when it is needed;
+- by a program, with the same decorator, `@DETECTORS.register("mine")`;
+- by an installed package, with a Python entry point in the group of the registry. The name is known
+  without importing the package, which is imported when the name is used.
 
-A plugin that cannot be imported raises an error only where its name is asked for.
+A plugin that cannot be imported raises an error only where its name is used.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class UnknownNameError(ConfigError, KeyError):
 class Registry(Mapping[str, PartT], Generic[PartT]):
     """Parts of one kind by name.
 
-    Iterating gives the names: first those registered, in their order, then those of plugins.
+    It is a mapping whose names are known without importing plugins: first the package's own, then
+    those of programs, then those of plugins. An unknown name raises `UnknownNameError`.
 
     Args:
         group: group of entry points, such as `slam_graph.detectors`.
@@ -70,7 +71,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         """A decorator that registers what it decorates, and returns it unchanged.
 
         Raises:
-            ConfigError: if something else has this name, or what is decorated is no such part.
+            ConfigError: if another part has this name, or this is no such part.
         """
 
         def registered(part: RegisteredT) -> RegisteredT:
@@ -137,7 +138,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         return f"unknown {self.kind} '{name}'; {hint}{every}"
 
     def _own(self) -> dict[str, PartT]:
-        """What was registered here, after the package's own parts."""
+        """What was registered with a decorator, once the package's own parts are there."""
         if self._home is not None:
             home, self._home = self._home, None  # none while it is imported: it registers here
             try:
@@ -189,8 +190,8 @@ class Choice:
     The name must be known when the setting is read; the JSON schema lists the names.
 
     Args:
-        registry: where the names are looked up.
-        others: names that are right too, such as "auto".
+        registries: a name in any of them is right; the first one words the error.
+        others: further names that are right, such as "auto".
     """
 
     def __init__(self, *registries: Registry[Any], others: tuple[str, ...] = ()) -> None:

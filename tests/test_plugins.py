@@ -21,6 +21,7 @@ from slam_graph.settings.tree import ConfigTree, validate
 
 Shape = Callable[[float], float]
 GROUP = "slam_graph.test_shapes"
+TIMEOUT_S = 600
 
 
 def shapes() -> Registry[Shape]:
@@ -119,11 +120,26 @@ def test_a_setting_names_a_part(site: Path) -> None:
         validate(Drawing, tree)
 
 
+def test_the_names_that_are_known_without_an_import_are_those_registered() -> None:
+    code = (
+        "import sys\n"
+        "from slam_graph.frontend.frontend_config import DESCRIPTORS, DETECTORS, FRONTENDS\n"
+        "for registry in (DETECTORS, DESCRIPTORS, FRONTENDS):\n"
+        "    before = list(registry)\n"
+        "    assert 'cv2' not in sys.modules or registry is not DETECTORS\n"
+        "    assert [registry[name] for name in before]\n"
+        "    assert list(registry) == before, registry.kind\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert done.returncode == 0, done.stderr
+
+
 # --- a package that is installed ------------------------------------------------------------------
 
 EXAMPLE = Path(__file__).parent / "plugin_example"
 ROOT = Path(__file__).parent.parent
-TIMEOUT_S = 600
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +207,14 @@ def test_a_plugin_brings_a_format_and_a_front_end(
     rows = np.fromfile(tmp_path / "tracks" / "features.bin", [("id", "<i8"), ("rest", "<f8", (4,))])
     assert len(rows) > 100
     assert np.all(rows["id"] % 2 == 0)
+
+
+def test_a_plugin_brings_a_pose_selection(environment: dict[str, str], tmp_path: Path) -> None:
+    options = ("--duration", "12", "--set", "algorithm.cost.past_poses=second_newest_leaves")
+    done = slam_graph(environment, tmp_path, "run", "demo", "--output", "out", *options)
+    assert done.returncode == 0, done.stderr
+    (used,) = tmp_path.glob("out/*/latest/config.yaml")
+    assert "past_poses: second_newest_leaves" in used.read_text()
 
 
 def test_a_plugin_that_cannot_be_loaded_is_named_where_it_is_used(

@@ -33,7 +33,7 @@ class AdaptiveNoiseConfig(Settings):
     without vibration whose noise was measured."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        name: f"is a constant now: {constant} in slam_graph/backend/cost/adaptive_noise.py"
+        name: f"is a constant now: {constant} in backend/cost/adaptive_noise.py"
         for name, constant in (
             ("whiteness_s", "PERSISTENCE_TIME_S"),
             ("size_s", "SIZE_TIME_S"),
@@ -63,9 +63,7 @@ class NoiseConfig(Settings):
     for little between the two frames around. Raise it for an IMU slower than 33 Hz."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "imu_gap_scale": (
-            "is a constant now: IMU_GAP_SCALE in slam_graph/backend/cost/adaptive_noise.py"
-        ),
+        "imu_gap_scale": ("is a constant now: IMU_GAP_SCALE in backend/cost/adaptive_noise.py"),
     }
 
 
@@ -82,7 +80,7 @@ class TriangulationConfig(Settings):
     """Smallest accepted angle between two rays to a feature."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "iterations": "is a constant now: STEPS in slam_graph/backend/cost/triangulation.py",
+        "iterations": "is a constant now: STEPS in backend/cost/triangulation.py",
     }
 
 
@@ -97,7 +95,7 @@ class GatingConfig(Settings):
     vanish, but needs a better start; `none` is for data without outliers, such as simulations."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "robust_width": "is a constant now: WIDTH_2D in slam_graph/backend/cost/robust_loss.py",
+        "robust_width": "is a constant now: WIDTH_2D in backend/cost/robust_loss.py",
     }
 
 
@@ -121,7 +119,7 @@ class ZeroVelocityConfig(Settings):
 
     moved: ClassVar[Mapping[str, str]] = {
         f"{name}_sigma": (
-            f"is a constant now: {name.upper()}_SIGMA in slam_graph/backend/cost/zero_velocity.py"
+            f"is a constant now: {name.upper()}_SIGMA in backend/cost/zero_velocity.py"
         )
         for name in ("velocity", "position", "rotation")
     }
@@ -164,7 +162,7 @@ class InitializationConfig(Settings):
     covariances do not contain their uncertainty."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        name: f"is a constant now: {constant} in slam_graph/backend/initialization/{file}.py"
+        name: f"is a constant now: {constant} in backend/initialization/{file}.py"
         for name, constant, file in (
             ("static_disparity_px", "STATIC_DISPARITY_PX", "initializer"),
             ("frame_spacing_s", "FRAME_SPACING_S", "initializer"),

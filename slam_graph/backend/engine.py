@@ -11,11 +11,13 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.marginalization.marginalize import marginalize_step
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
+from slam_graph.backend.window_graph import WindowGraph, window_graph
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
 
@@ -32,6 +34,7 @@ class SquareRootEngine:
             context.algorithm.cost, context.projection, context.config, context.diagnostics
         )
         self._posterior: SquareRootInformation | None = None
+        self._cost: Cost | None = None
 
     def step(
         self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
@@ -51,7 +54,7 @@ class SquareRootEngine:
             self._describe(window, constructed, minimum, report)
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
-        self._posterior = minimum.posterior
+        self._posterior, self._cost = minimum.posterior, constructed.cost
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
         return state
@@ -85,3 +88,10 @@ class SquareRootEngine:
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
         return window.points()
+
+    def factor_graph(self, window: Window) -> WindowGraph:
+        """The cost of the last step, after its Gauss-Newton steps and before marginalization."""
+        cost = self._cost
+        if cost is None:  # nothing but the start
+            cost = Cost(window.state, self._context.projection, self._context.config, window.prior)
+        return window_graph(cost, self._context.config.noise.pixel_sigma)

@@ -26,6 +26,7 @@ from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
+from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.imu_buffer import ImuBuffer
@@ -119,4 +120,8 @@ class Engine(Protocol):
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
+        ...
+
+    def factor_graph(self, window: Window) -> WindowGraph:
+        """The cost of the last step as a factor graph."""
         ...

@@ -30,6 +30,7 @@ from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
+from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry.trajectory import NavState
@@ -239,6 +240,20 @@ class Estimator:
         if missing:
             raise EstimationError(f"not variables of the last step: {', '.join(missing)}")
         return information.covariance_of(keys)
+
+    def factor_graph(self) -> WindowGraph:
+        """The cost of the last step as a factor graph of GTSAM with its values.
+
+        For this package's engine: marginal prior, dynamics, and a projection factor for each
+        observation, after the Gauss-Newton steps and before marginalization. For GTSAM's smoothers:
+        what they hold.
+
+        Raises:
+            EstimationError: if there is no state yet.
+        """
+        if self.window is None:
+            raise EstimationError("there is no state yet, and so no factor graph")
+        return self._engine.factor_graph(self.window)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

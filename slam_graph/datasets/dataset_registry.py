@@ -115,7 +115,7 @@ def open_dataset(
     Args:
         path: file or folder; the word ``demo`` stands for the tracks in GTSAM's wheel.
         format: name in `DATASETS`; None to find it by the path.
-        cameras: use only the first so many; None for all.
+        cameras: number of cameras to use, the first ones; None for all.
         calibration: Kalibr camera chain to use instead of the recording's calibration.
         groundtruth: EuRoC CSV, TUM file or EuRoC folder to use instead of the recording's own.
         diagnostics: where faults are counted.

@@ -204,7 +204,7 @@ class ReaderOptions:
     """What a reader is asked for besides the path of the recording.
 
     Attributes:
-        cameras: use only the first so many; None for all.
+        cameras: number of cameras to use, the first ones; None for all.
         calibration: Kalibr camera chain to use instead of the recording's own calibration.
         groundtruth: file or folder to use instead of the recording's own ground truth.
         sources: where each sensor is, in formats that leave it open.

@@ -294,7 +294,7 @@ def _trajectory(states: list[NavState]) -> Trajectory:
 
 def _concatenated(parts: list[Trajectory]) -> Trajectory:
     """Trajectories with velocities and biases, concatenated in time."""
-    names = ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases", "accel_biases")
+    names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
     return Trajectory(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     )

@@ -100,7 +100,8 @@ class Cost:
     loss: RobustLoss | None = None
 
     @property
-    def _robust(self) -> RobustLoss:
+    def robust(self) -> RobustLoss:
+        """The loss on reprojection residuals."""
         return self.loss or RobustLoss(self.config.gating.robust_loss)
 
     def layout(self) -> Layout:
@@ -152,7 +153,7 @@ class Cost:
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
         errors = np.sqrt(self.squared_errors(obs, points))
-        return float(np.sum(self._robust.value(errors)))
+        return float(np.sum(self.robust.value(errors)))
 
     def squared_errors(self, obs: Observations, points: FloatArray | None) -> FloatArray:
         """Squared residuals (N,) of observations at the current estimates, in units of σ².
@@ -191,7 +192,7 @@ class Cost:
             self._geometry(rig, values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
-        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self._robust)
+        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.robust)
 
     def _geometry(
         self,

@@ -23,6 +23,7 @@ from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
+from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame
@@ -65,6 +66,17 @@ class SmootherEngine:
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
         return self._features.active, stacked_points(self._estimate, self._features.active.tolist())
+
+    def factor_graph(self, window: Window) -> WindowGraph:
+        """All factors and estimates that the smoother holds."""
+        solver = self._solver or self._begin(window)
+        held = solver.factors()
+        graph = gtsam.NonlinearFactorGraph()
+        for number in range(held.size()):
+            if held.at(number) is not None:
+                graph.push_back(held.at(number))
+        values = gtsam.Values(solver.everything()[0])
+        return WindowGraph(graph, values, values, (None,) * graph.size())
 
     def step(
         self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport

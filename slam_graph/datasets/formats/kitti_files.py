@@ -20,6 +20,15 @@ from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import pose_from_matrix
 
+__all__ = [
+    "CalibrationFile",
+    "increasing",
+    "read_calibration",
+    "read_dates",
+    "read_seconds",
+    "rectified_camera",
+]
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFile:

@@ -31,6 +31,14 @@ import numpy as np
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
 
+__all__ = [
+    "frame_record",
+    "load_state",
+    "load_trajectory",
+    "save_state",
+    "save_trajectory",
+]
+
 FORMAT_NAME = "slam_graph-tracks"
 FORMAT_VERSION = 1
 

@@ -18,6 +18,8 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.camera_model import CAMERA_MODELS
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
+__all__ = ["read_bag_rig"]
+
 STATIC_TOPIC = "/tf_static"
 
 

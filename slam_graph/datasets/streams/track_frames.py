@@ -15,6 +15,8 @@ from slam_graph.datasets.sequence import FrameStream
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
+__all__ = ["TRACK_ROW", "StampCounter", "TrackTable", "frames_from_tables"]
+
 TRACK_ROW = np.dtype(
     [
         ("stamp", "i8"),

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The window as a factor graph: its linearisation has the engine's normal equations."""
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from flight import FISHEYE, RADTAN, Flight, packets, rig, room
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import (
+    BackendConfig,
+    CalibrationConfig,
+    InitializationConfig,
+)
+from slam_graph.backend.engine import SquareRootEngine
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.solve.gauss_newton import linearized
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.config import algorithm_names, load_config
+from slam_graph.errors import EstimationError
+from slam_graph.sensors.camera import Camera
+
+OWN = [n for n in algorithm_names() if load_config(algorithm=n).algorithm.engine == "square_root"]
+SMOOTHERS = [name for name in algorithm_names() if name not in OWN]
+SIGMAS = np.array([0.02, 0.05, 0.1, 0.1, 0.01])
+DOUBLE_SPHERE = Camera(200.0, 201.0, 254.0, 256.0, "double_sphere", (-0.1, 0.55), 512, 512)
+EVERYTHING = CalibrationConfig(extrinsics=True, time_offset=True, intrinsics=True, distortion=True)
+
+
+def flown(
+    name: str,
+    camera: Camera = RADTAN,
+    cameras: int = 2,
+    calibration: CalibrationConfig | None = None,
+) -> Estimator:
+    """An estimator after 1.6 s of noisy flight."""
+    config = BackendConfig(
+        initialization=InitializationConfig(mode="given"),
+        calibration=calibration or CalibrationConfig(),
+    )
+    mounted, rng = rig(cameras, camera), np.random.default_rng(5)
+    estimator = Estimator(mounted, load_config(algorithm=name).algorithm, config)
+    estimator.start(Flight().nav_state(0.0, SIGMAS))
+    for packet in packets(Flight(), mounted, room(60, rng), 1.6, rng, 20.0):
+        estimator.add_imu(packet.imu)
+        assert estimator.add_frame(packet.frame) is not None or not estimator.costs
+    return estimator
+
+
+def eliminated(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Information and its right-hand side over some variables, all others eliminated."""
+    ordering, inside = gtsam.Ordering(), set(keys)
+    others = [k for k in linear.keyVector() if k not in inside]
+    for key in [*others, *keys]:
+        ordering.push_back(key)
+    A, b = linear.jacobian(ordering)
+    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    first = 3 * len(others)  # all that are eliminated are features
+    R, d = R[first:-1, first:-1], R[first:-1, -1]
+    return R.T @ R, R.T @ d
+
+
+def check(estimator: Estimator) -> None:
+    engine = estimator._engine
+    assert isinstance(engine, SquareRootEngine)
+    assert engine._cost is not None
+    expected: SquareRootInformation = linearized(engine._cost)
+    window = estimator.factor_graph()
+    known = set(window.values.keys())
+    assert known.issuperset(expected.layout.dims)
+    extra = {k for k in known if k not in expected.layout}
+    assert all(chr(gtsam.Symbol(k).chr()) == "l" for k in extra), "only features are eliminated"
+    information, right = eliminated(window.linearize(), list(expected.layout.dims))
+    theirs = expected.R.T @ expected.R
+    scale = np.sqrt(np.diag(theirs))
+    np.testing.assert_allclose(
+        information / np.outer(scale, scale), theirs / np.outer(scale, scale), atol=1e-9
+    )
+    size = max(float(np.abs(expected.d).max()), 1.0)
+    np.testing.assert_allclose(right / scale, expected.R.T @ expected.d / scale, atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("name", OWN)
+def test_it_has_the_normal_equations_of_the_engine(name: str, cameras: int) -> None:
+    estimator = flown(name, cameras=cameras)
+    check(estimator)
+    window = estimator.factor_graph()
+    points = [k for k in window.values.keys() if chr(gtsam.Symbol(k).chr()) == "l"]  # noqa: SIM118
+    assert len(points) > 5
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("name", OWN)
+def test_so_it_has_with_the_calibration_as_variables(name: str, cameras: int) -> None:
+    check(flown(name, cameras=cameras, calibration=EVERYTHING))
+
+
+@pytest.mark.parametrize("camera", [FISHEYE, DOUBLE_SPHERE], ids=lambda c: c.distortion)
+def test_so_it_has_with_other_cameras(camera: Camera) -> None:
+    check(flown("okvis", camera))
+
+
+def test_it_is_saved_and_read_back(tmp_path: Path) -> None:
+    for name, calibration in (("okvis", None), ("msckf", EVERYTHING)):
+        window = flown(name, calibration=calibration).factor_graph()
+        files = window.save(tmp_path / name)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.deserialize(files[0].read_text())
+        values.deserialize(files[1].read_text())
+        assert graph.size() == window.graph.size()
+        assert graph.error(values) == pytest.approx(window.graph.error(window.values), rel=1e-9)
+        assert files[2].read_text().startswith("graph {")
+
+
+@pytest.mark.parametrize("name", SMOOTHERS)
+def test_smoothers_have_a_graph_too(name: str) -> None:
+    estimator = flown(name)
+    window = estimator.factor_graph()
+    assert window.graph.size() > 10
+    assert window.linearize().size() == window.graph.size()
+
+
+def test_without_a_state_there_is_none() -> None:
+    estimator = Estimator(rig(), load_config().algorithm)
+    with pytest.raises(EstimationError, match="no state"):
+        estimator.factor_graph()
