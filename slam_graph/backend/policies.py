@@ -168,7 +168,7 @@ class SmootherPolicy(Settings):
     """How GTSAM's own smoothers are used, where one of them is the engine."""
 
     lag_s: float = Field(4.0, gt=0)
-    """How long states stay in a fixed lag (`isam2` keeps all): longer is more accurate and slower."""
+    """How long states stay in a fixed lag (`isam2` keeps all). Longer: more accurate, slower."""
     spacing_s: float = expert(0.09, ge=0)
     """Least time between two states in the graph; frames between them are predicted by the IMU."""
     factorization: Literal["cholesky", "qr"] = expert("cholesky")
