@@ -27,7 +27,7 @@ __all__ = [
 class AdaptiveNoiseConfig(Settings):
     """White noise of the IMU that is estimated from how the images correct its predictions."""
 
-    enabled: bool = True
+    enabled: bool = expert(True)
     """Raise the IMU's noise densities while the images correct its predictions by more than these
     allow. Switch it off to use the densities of the calibration as they are, for example for an IMU
     without vibration whose noise was measured."""
@@ -87,7 +87,7 @@ class TriangulationConfig(Settings):
 class GatingConfig(Settings):
     """Outlier rejection inside the back end."""
 
-    confidence: float = Field(0.95, gt=0, lt=1)
+    confidence: float = expert(0.95, gt=0, lt=1)
     """Share of the correct features that the χ² gate (Mahalanobis distance) accepts. Lower it if
     moving objects disturb the estimate; more correct features are then lost as well."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"

@@ -179,7 +179,7 @@ class SmootherPolicy(Settings):
     """How many updates from one such check to the next (iSAM2)."""
     max_iterations: int = expert(5, ge=1)
     """Levenberg-Marquardt steps at most in one update (`fixed_lag_batch`)."""
-    max_features: int = Field(40, ge=1)
+    max_features: int = expert(40, ge=1)
     """How many features are tracked in the graph at once: more are more accurate and slower."""
     robust_loss: Literal["none", "huber", "cauchy"] = expert("cauchy")
     """Loss on reprojection residuals, instead of that of `backend.gating`: an outlier that is in

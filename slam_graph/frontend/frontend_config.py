@@ -106,7 +106,7 @@ class FrontendConfig(Settings):
     min_distance_px: PositivePixels = expert(12.0)
     """Least distance of a new feature from every other one. Scale it with the resolution."""
 
-    prediction: Literal["none", "flow", "gyroscope", "state"] = "gyroscope"
+    prediction: Literal["none", "flow", "gyroscope", "state"] = expert("gyroscope")
     """Where the search for a feature begins. none: where it was; flow: moved on as in the last
     frame; gyroscope: the same with the rotation that the gyroscope measured; state: where the
     state and the map of the back end place it. Use `flow` if gyroscope or extrinsics are poor."""
@@ -120,7 +120,7 @@ class FrontendConfig(Settings):
     """Largest epipolar distance of an inlier between two frames; null is 1 px for `klt` and 1.5 px
     for descriptors. Raise it for a poor calibration, if many features are `rejected_ransac`."""
 
-    equalization: Literal["none", "histogram", "clahe"] = "none"
+    equalization: Literal["none", "histogram", "clahe"] = expert("none")
     """Contrast equalization of every image: none, of the whole histogram, or adaptive (CLAHE). Try
     `clahe` where images are dark or of low contrast and few features are found."""
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import Field
-
 from slam_graph.settings.base import Settings, expert
 
 __all__ = ["KeyframeConfig", "LoopClosureConfig", "PlaceConfig", "VerificationConfig"]
@@ -31,7 +29,7 @@ class KeyframeConfig(Settings):
         triangulation="TRIANGULATION",
     )
 
-    distance_m: float = Field(0.5, gt=0)
+    distance_m: float = expert(0.5, gt=0)
     """Distance from the last keyframe at which a frame becomes one. Less where flights stay within
     a metre or two, or maps are to be merged; more for large scenes, to save time and memory."""
     angle_rad: float = expert(0.35, gt=0)
