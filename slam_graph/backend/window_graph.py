@@ -128,14 +128,14 @@ def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
         losses.append(None)
     loss = cost.robust
     projections = _Projections(cost.rig, cost.state, sigma_px, loss)
-    if cost.tracked is not None:
-        projections.add(graph, cost.tracked)
-    if cost.fresh is not None:
-        for j, point in zip(cost.fresh.obs.ids.tolist(), cost.fresh.points, strict=True):
+    if cost.landmarks is not None:
+        projections.add(graph, cost.landmarks)
+    if cost.tracks is not None:
+        for j, point in zip(cost.tracks.obs.ids.tolist(), cost.tracks.points, strict=True):
             if not values.exists(L(j)):
                 values.insert(L(j), point)
                 first.insert(L(j), point)
-        projections.add(graph, cost.fresh.obs)
+        projections.add(graph, cost.tracks.obs)
     robust = None if loss.name == "none" else loss
     losses += [robust] * (graph.size() - len(losses))
     return WindowGraph(graph, values, first, tuple(losses))

@@ -16,7 +16,7 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.cost import NewFeatures
+from slam_graph.backend.cost.cost import TrackFeatures
 from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES, WaitingTracks
 from slam_graph.backend.cost.feature_tracks import (
     FeatureTracks,
@@ -85,7 +85,7 @@ class FeatureSelection:
         in_state: int,
         dynamic: IntArray,
         removals: Removals,
-    ) -> NewFeatures | None:
+    ) -> TrackFeatures | None:
         """Triangulated features that are in the cost with all of their observations.
 
         Args:
@@ -111,7 +111,7 @@ class FeatureSelection:
         self._diagnostics.counts["feature_not_triangulated"] += int(np.sum(lost))
         if not self._features.relinearized:
             removals.add_features(Outcome.NOT_TRIANGULATED, ids[lost])
-        return NewFeatures(obs, points, entering).subset(good & (entering | used))
+        return TrackFeatures(obs, points, entering).subset(good & (entering | used))
 
     def _candidates(
         self,
@@ -125,7 +125,7 @@ class FeatureSelection:
         tracks, policy = window.tracks, self._policy
         ids, lengths = tracks.lengths()
         removals.add_features(Outcome.DYNAMIC, dynamic)
-        outside = ~is_in(ids, window.features) & ~is_in(ids, dynamic)
+        outside = ~is_in(ids, window.state_features) & ~is_in(ids, dynamic)
         ids, lengths = ids[outside], lengths[outside]
         live = is_in(ids, tracks.seen)
         lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
@@ -144,7 +144,7 @@ class FeatureSelection:
         self, window: Window, obs: Observations, lasting: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (J, 3) of features, those of the last step where there are, and their worth."""
-        known_ids, known_points = window.landmarks
+        known_ids, known_points = window.kept_points
         good = is_in(obs.ids, known_ids)
         points = np.zeros((len(obs.ids), 3))
         points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
