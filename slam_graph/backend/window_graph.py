@@ -76,7 +76,8 @@ class WindowGraph:
                 jacobian.getA()[:] *= np.sqrt(here / there)
             if at is points:
                 _turn(jacobian, tangents)
-            jacobian.getb()[:] = gtsam.JacobianFactor(factor.linearize(self.values)).getb()
+            now = gtsam.JacobianFactor(factor.linearize(self.values))  # owns what getb() shows
+            jacobian.getb()[:] = now.getb()
             linear.add(jacobian)
         return linear
 
