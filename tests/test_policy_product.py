@@ -48,7 +48,6 @@ LOOSE = BackendConfig(
 )
 
 
-@POSE_SELECTIONS.register("test_without_second_newest")
 def without_second_newest(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
     """Drops a pose out of the middle; what it saw is used."""
     past = window.past
@@ -59,7 +58,19 @@ def _seen_thrice(tracks: WaitingTracks) -> BoolArray:
     return (tracks.lengths >= 3) | tracks.leaving
 
 
-FEATURE_POLICIES.register("test_seen_thrice")(FeaturePolicy(_seen_thrice))
+FROM_OUTSIDE = ("second_newest_leaves", "seen_thrice")
+"""A pose selection and a feature policy that are not of the package."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def outside() -> Iterator[None]:
+    poses, features = FROM_OUTSIDE
+    with (
+        POSE_SELECTIONS.registered(poses, without_second_newest),
+        FEATURE_POLICIES.registered(features, FeaturePolicy(_seen_thrice)),
+    ):
+        yield
+
 
 CHOICES: tuple[Options, ...] = (
     values_of("cost.max_past_poses", (FEW, MANY)),
@@ -82,7 +93,9 @@ STEPS: Options = {
 
 def accepted(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
     """All algorithms that are accepted with a selection of poses and a feature policy."""
-    from_outside = "test" in past_poses + features  # for these, one kind of step
+    from_outside = (
+        past_poses in FROM_OUTSIDE or features in FROM_OUTSIDE
+    )  # for these, one kind of step
     return combinations(
         values_of("cost.past_poses", (past_poses,)),
         values_of("cost.features", (features,)),
@@ -143,8 +156,8 @@ def check_ledger(tracks: FeatureTracks) -> None:
     assert tracks.added == len(tracks) + sum(tracks.outcomes.values())
 
 
-@pytest.mark.parametrize("features", list(FEATURE_POLICIES))
-@pytest.mark.parametrize("past_poses", list(POSE_SELECTIONS))
+@pytest.mark.parametrize("features", [*FEATURE_POLICIES, FROM_OUTSIDE[1]])
+@pytest.mark.parametrize("past_poses", [*POSE_SELECTIONS, FROM_OUTSIDE[0]])
 def test_no_measurement_counts_twice(
     past_poses: str, features: str, batches: list[tuple[Rig, Batch]]
 ) -> None:

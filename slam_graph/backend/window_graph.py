@@ -62,8 +62,8 @@ class WindowGraph:
         for key in self.values.keys():  # noqa: SIM118
             kind = chr(gtsam.Symbol(key).chr())
             if kind == "e":  # increments are added to the offset from the first estimate
-                first, now = points.atPose3(key), self.values.atPose3(key)
-                tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(now))
+                first, pose = points.atPose3(key), self.values.atPose3(key)
+                tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(pose))
             if kind in CALIBRATION_KINDS:
                 _copy_calibration(self.values, points, key)
         linear = gtsam.GaussianFactorGraph()
