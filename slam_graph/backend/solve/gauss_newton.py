@@ -24,7 +24,7 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e6
 MAX_REPEATED_STEPS = 4
-"""How often a step is repeated at most where it is too large to be linear."""
+"""Steps in all, at most, where the calibration moves too far for the first to be linear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
