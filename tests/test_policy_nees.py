@@ -24,7 +24,7 @@ from slam_graph.settings.tree import ConfigTree, validate
 
 SAMPLE_SEED = "SLAM_GRAPH_SAMPLE_SEED"
 SAMPLED = 4
-FLIGHTS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 4)
+FLIGHTS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 5)
 DURATION_S = 5.0
 POSE_DOF = 6
 FALSE_ALARMS = 1e-4
@@ -38,8 +38,8 @@ def sample_seed() -> int:
 
 
 def sampled(seed: int) -> list[AlgorithmConfig]:
-    """Some of the combinations of policies."""
-    everything = list(product())
+    """Some of the combinations of policies; the same ones whatever other tests register."""
+    everything = [algorithm for algorithm in product() if "test_" not in algorithm.name]
     rows = np.random.default_rng(seed).choice(len(everything), SAMPLED, replace=False)
     return [everything[row] for row in rows]
 
