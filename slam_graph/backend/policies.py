@@ -93,9 +93,9 @@ class CostPolicy(Settings):
             )
         if holds_none and (self.past_poses, self.features) == ("evenly_spaced", "every_step"):
             raise ValueError(
-                "features: every_step makes features part of the prior when a pose that saw them "
-                "leaves, and past_poses: evenly_spaced drops its observations, so none would be; use "
-                "most_recent or keyframes, or max_state_features above 0"
+                "features: every_step makes a feature part of the prior when a pose that saw it "
+                "leaves, and past_poses: evenly_spaced drops its observations, so none would be; "
+                "use most_recent or keyframes, or max_state_features above 0"
             )
         if holds_none:
             self._refuse(
