@@ -52,9 +52,9 @@ def test_the_table_of_outcomes_is_the_code() -> None:
             if isinstance(node, ast.ClassDef):
                 for inner in node.body:
                     if isinstance(inner, ast.FunctionDef):
-                        uses[f"{node.name}.{inner.name}"] = ast.unparse(node)
+                        uses[f"{node.name}.{inner.name}"] = ast.unparse(inner)
             elif isinstance(node, ast.FunctionDef):
-                uses[node.name] = source
+                uses[node.name] = ast.unparse(node)
     for value, function in rows.items():
         assert function in uses, f"{value}: no {function}"
         assert f"Outcome.{Outcome(value).name}" in uses[function], f"{function}: not {value}"

@@ -10,8 +10,11 @@ import pytest
 from flight import Flight, packets, rig, room
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend import engine
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.solve.gauss_newton import Minimum, minimize
 from slam_graph.config import load_config
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
@@ -289,3 +292,38 @@ def test_a_dropped_frame_rejects_no_features(recording: list[Packet], name: str)
     assert estimator.add_frame(packet.frame) is None
     assert len(estimator.rejected) == 0
     assert estimator.innovations.tested == 0
+
+
+def test_a_solve_that_fails_loses_no_track(
+    recording: list[Packet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The step is taken on the IMU alone; poses and observations wait for the next one."""
+    estimator = Estimator(RIG, load_config(algorithm="msckf").algorithm, GIVEN)
+    estimator.start(FALGORITHM.nav_state(0.0, SURE))
+    failed = iter([True] + 10 * [False])
+
+    def sometimes(cost: Cost, *arguments: Any) -> Minimum:
+        if cost.tracks is not None and next(failed):
+            raise np.linalg.LinAlgError
+        return minimize(cost, *arguments)
+
+    for packet in recording[:20]:
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+    window = estimator.window
+    assert window is not None
+    monkeypatch.setattr(engine, "minimize", sometimes)
+    for packet in recording[20:30]:
+        assert isinstance(packet.frame, FeatureFrame)
+        waiting, past = len(window.tracks), list(window.past)
+        settled, frame = sum(window.tracks.outcomes.values()), window.frame
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+        if estimator.diagnostics.counts["features_degenerate"]:
+            seen = sum(len(camera) for camera in packet.frame.cameras)
+            assert len(window.tracks) == waiting + seen
+            assert sum(window.tracks.outcomes.values()) == settled
+            assert window.past == [*past, frame]
+            assert len(estimator.rejected) == 0
+            return
+    pytest.fail("no step had tracks")

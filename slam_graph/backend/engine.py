@@ -70,7 +70,7 @@ class SquareRootEngine:
         except np.linalg.LinAlgError:
             warning = "the features of one frame are not used, and go on waiting"
             self._context.diagnostics.warn("features_degenerate", warning)
-            constructed = constructed.without_features(window)
+            constructed = self._construction.without_features(window)
             return constructed, minimize(constructed.cost, policy)
 
     def _describe(
@@ -94,4 +94,6 @@ class SquareRootEngine:
         cost = self._cost
         if cost is None:  # nothing but the start
             cost = Cost(window.state, self._context.projection, self._context.config, window.prior)
-        return window_graph(cost, self._context.config.noise.pixel_sigma)
+        everything = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)
+        determined = cost.part(cost.factors, everything)  # without features that lost observations
+        return window_graph(determined, self._context.config.noise.pixel_sigma)

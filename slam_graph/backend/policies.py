@@ -111,6 +111,11 @@ class CostPolicy(Settings):
                 ("keyframe_overlap", "keyframe_parallax_rad"),
                 f"past_poses: {self.past_poses} selects no keyframes",
             )
+            if self.past_poses == "evenly_spaced" and self.max_past_poses < 2:
+                raise ValueError(
+                    "past_poses: evenly_spaced keeps the oldest and the newest pose, so "
+                    "max_past_poses must be 2 at least; or use most_recent"
+                )
             if self.recent_frames > self.max_past_poses + 1:
                 raise ValueError(
                     f"recent_frames: {self.recent_frames} are more than the poses that stay: "
@@ -156,6 +161,17 @@ class GaussNewtonPolicy(Settings):
     damping: Literal["none", "levenberg_marquardt"] = "none"
     """Plain Gauss-Newton, or Levenberg-Marquardt, which repeats a step that raises the cost with
     damping: use it with several steps."""
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> GaussNewtonPolicy:
+        """Refuse what a single step makes of no effect."""
+        default = type(self).model_fields["tolerance"].default
+        if self.max_steps == 1 and self.tolerance not in (default, 0.0):
+            raise ValueError(
+                f"tolerance: {self.tolerance} has no effect with max_steps: 1; remove the line, or "
+                "take more steps"
+            )
+        return self
 
 
 class MarginalizationPolicy(Settings):

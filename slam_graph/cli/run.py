@@ -85,7 +85,7 @@ def run(
         ),
     ] = None,
     save_graph: Annotated[
-        list[float] | None,
+        list[str] | None,
         typer.Option(
             "--save-graph",
             metavar="STAMP",
@@ -124,9 +124,25 @@ def run(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
         result, folder, files = execute(
-            sequence, settings, output, rerun, progress, log, graph_times=save_graph or ()
+            sequence,
+            settings,
+            output,
+            rerun,
+            progress,
+            log,
+            graph_times=[_time(text) for text in save_graph or ()],
         )
     report(result, folder, files, as_json)
+
+
+def _time(text: str) -> int | float:
+    """Seconds, or a stamp in ns, which a float could not hold."""
+    try:
+        return int(text) if text.isdecimal() else float(text)
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"'{text}' is neither seconds nor a stamp in ns", param_hint="--save-graph"
+        ) from error
 
 
 def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) -> None:
@@ -150,7 +166,7 @@ def execute(
     progress: bool,
     log: list[str],
     known_map: SlamMap | None = None,
-    graph_times: SequenceOf[float] = (),
+    graph_times: SequenceOf[int | float] = (),
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
     from slam_graph.pipeline.run import run as run_pipeline

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 from slam_graph.backend.estimator import Estimator
 from slam_graph.diagnostics import Diagnostics
@@ -13,8 +14,8 @@ from slam_graph.results.run_result import RunResult
 
 __all__ = ["GraphKeeping"]
 
-_FIRST_STAMP = 1e9
-"""Numbers from here on are stamps in nanoseconds, smaller ones seconds after the first frame."""
+_FIRST_STAMP = 1_000_000_000
+"""Whole numbers from here on are stamps in nanoseconds."""
 
 
 class GraphKeeping(Stage):
@@ -23,7 +24,8 @@ class GraphKeeping(Stage):
     Args:
         result: gets the graphs.
         estimator: the back end.
-        times: in seconds after the first frame of the run, or stamps in ns (from 1e9 on).
+        times: in seconds after the first frame of the run; whole numbers from 1e9 on are stamps
+            in ns (a float cannot hold them).
         diagnostics: counts the times after the last state.
     """
 
@@ -31,13 +33,13 @@ class GraphKeeping(Stage):
         self,
         result: RunResult,
         estimator: Estimator,
-        times: Sequence[float],
+        times: Sequence[int | float],
         diagnostics: Diagnostics,
     ) -> None:
         self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
         start_ns = result.input.start_ns
         self._stamps_ns = sorted(
-            round(time) if time >= _FIRST_STAMP else start_ns + round(time * 1e9) for time in times
+            time if _is_stamp(time) else start_ns + round(time * 1e9) for time in times
         )
 
     def frame(self, frame: EstimatedFrame) -> None:
@@ -52,3 +54,8 @@ class GraphKeeping(Stage):
         """Warn of times for which there was no state."""
         for stamp_ns in self._stamps_ns:
             self._diagnostics.warn("graph_not_saved", f"no state at or after {stamp_ns} ns")
+
+
+def _is_stamp(time: int | float) -> TypeGuard[int]:
+    """Whether a time is a stamp, not seconds."""
+    return isinstance(time, int) and time >= _FIRST_STAMP

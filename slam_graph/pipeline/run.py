@@ -46,7 +46,7 @@ def run(
     recorder: Recorder | None = None,
     known_map: SlamMap | None = None,
     *,
-    graph_times: SequenceOf[float] = (),
+    graph_times: SequenceOf[int | float] = (),
     overrides: Iterable[str] | Mapping[str, Any] = (),
     **options: Any,
 ) -> RunResult:
@@ -66,7 +66,7 @@ def run(
         recorder: records the front end's output, for a replay.
         known_map: a map to locate every frame in, beside the estimate in the run's own world.
         graph_times: when to keep the factor graph of the back end, in seconds after the first frame
-            or stamps in ns; `RunResult.graphs` has them.
+            or stamps in ns (int); `RunResult.graphs` has them.
         overrides: changes of the settings, as for `load_config`.
         options: top-level settings by name, as for `load_config`: `algorithm`, `duration_s`, …
 

@@ -53,7 +53,8 @@ class ConstructedCost:
         poses: which past poses stay.
         moving: the past frames whose velocity and bias stay too.
         features: ids of the features that stay in the state, ascending.
-        leaving: (J,) those of the cost's tracks that become part of the prior.
+        absorbed: (J,) those of the cost's tracks that become part of the prior.
+        loses_pose: (J,) those of them that a pose which leaves has seen.
         keep_lost_features: whether features that leave the state are kept for when they are seen
             again.
         removals: observations that go without being used.
@@ -66,7 +67,8 @@ class ConstructedCost:
     poses: PoseSelection
     moving: list[int]
     features: IntArray
-    leaving: BoolArray
+    absorbed: BoolArray
+    loses_pose: BoolArray
     keep_lost_features: bool
     removals: Removals = field(default_factory=Removals)
     predicted: SquareRootInformation | None = None
@@ -85,22 +87,6 @@ class ConstructedCost:
         if known.dof:
             return known
         return replace(known, distance=joint, dof=known.passed_dof)  # nothing was gated before
-
-    def without_features(self, window: Window) -> ConstructedCost:
-        """The same step on prior and dynamics alone; the observations go on waiting."""
-        cost = replace(self.cost, state=window.state.copy(), landmarks=None, tracks=None)
-        known = is_in(self.features, window.state_features)
-        none = np.zeros(0, np.bool_)
-        return replace(
-            self,
-            cost=cost,
-            linear=None,
-            features=self.features[known],
-            leaving=none,
-            removals=Removals(),
-            predicted=None,
-            innovations=Innovations(),
-        )
 
 
 class CostConstruction:
@@ -137,9 +123,7 @@ class CostConstruction:
                 takes the place of the last one.
         """
         self.rejected = np.zeros(0, np.int64)
-        state, factors = window.state.copy(), list(window.factors)
-        cost = Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
-        removals = Removals()
+        cost, removals = self._prior_and_dynamics(window), Removals()
         if still:
             poses = PoseSelection(window.past[:-1], keyframes=frozenset(window.keyframes))
             removals.add_features(Outcome.STANDSTILL, window.state_features)
@@ -159,13 +143,29 @@ class CostConstruction:
                 np.concatenate([removals.ids(), window.state_features, cost.ids_of(used)])
             )
             useful = window.tracks.frames(without=gone)
-            poses = replace(poses, kept=[i for i in poses.kept if i in useful])
+            kept = [i for i in poses.kept if i in useful]
+            poses = replace(poses, kept=kept, keyframes=poses.keyframes.intersection(kept))
         features = self._in_state(window, cost)
         constructed = self._constructed(window, cost, poses, features, removals)
-        constructed.leaving = self._leaving(window, cost, poses)
+        if cost.tracks is not None:
+            seen = seen_by_leaving(window.tracks, window.past, poses)
+            constructed.loses_pose = is_in(cost.tracks.obs.ids, seen)
+            constructed.absorbed = self._absorbed(cost.tracks, constructed.loses_pose)
         constructed.linear, constructed.predicted = linear, predicted
         constructed.innovations = gate.innovations
         return constructed
+
+    def without_features(self, window: Window) -> ConstructedCost:
+        """The step on prior and dynamics alone: all poses stay, all observations go on waiting."""
+        self.rejected = np.zeros(0, np.int64)
+        poses = PoseSelection(list(window.past), keyframes=frozenset(window.keyframes))
+        cost = self._prior_and_dynamics(window)
+        return self._constructed(window, cost, poses, window.state_features, Removals())
+
+    def _prior_and_dynamics(self, window: Window) -> Cost:
+        """The cost without images."""
+        state, factors = window.state.copy(), list(window.factors)
+        return Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
 
     def _selected_poses(self, window: Window) -> PoseSelection:
         poses = self._select_poses(window, self.policy, self.rig)
@@ -189,7 +189,7 @@ class CostConstruction:
         moving = [i for i in window.moving if i in recent and i in poses.kept]
         keep_lost = self.policy.keep_lost_features and window.lost_features.open
         none = np.zeros(0, np.bool_)
-        return ConstructedCost(cost, None, poses, moving, features, none, keep_lost, removals)
+        return ConstructedCost(cost, None, poses, moving, features, none, none, keep_lost, removals)
 
     # --- after the steps -------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class CostConstruction:
         )
         cost.tracks = replace(cost.tracks, obs=obs.rows(fits))
         alone = cost.tracks.obs.counts < 2
-        constructed.removals.add_features(Outcome.OUTLIER, obs.ids[constructed.leaving & alone])
+        constructed.removals.add_features(Outcome.OUTLIER, obs.ids[constructed.absorbed & alone])
         spoiled = cost.tracks.in_state & (np.bincount(obs.feature[~fits], None, len(obs.ids)) > 0)
         if spoiled.any():
             self._postpone(constructed, cost.tracks, spoiled)
@@ -229,7 +229,7 @@ class CostConstruction:
         cost.tracks = replace(tracks, in_state=tracks.in_state & ~spoiled)
         cost.state.remove(L(int(j)) for j in ids)
         constructed.features = constructed.features[~is_in(constructed.features, ids)]
-        constructed.leaving = constructed.leaving & ~spoiled
+        constructed.absorbed = self._absorbed(cost.tracks, constructed.loses_pose)
 
     def _count_failures(self, window: Window, obs: Observations, fits: BoolArray) -> None:
         """Note in how many consecutive frames each feature was an outlier; `fits` (N,) is of `obs`.
@@ -315,11 +315,8 @@ class CostConstruction:
             ids = np.union1d(ids, cost.tracks.obs.ids[cost.tracks.in_state])
         return ids
 
-    def _leaving(self, window: Window, cost: Cost, poses: PoseSelection) -> BoolArray:
-        """Which new features (J,) become part of the prior: all, or those that lose a pose."""
-        if cost.tracks is None:
-            return np.zeros(0, np.bool_)
+    def _absorbed(self, tracks: TrackFeatures, loses_pose: BoolArray) -> BoolArray:
+        """Which tracks (J,) become part of the prior: all, or those that enter or lose a pose."""
         if not self._features.relinearized:
-            return np.ones(len(cost.tracks.points), np.bool_)
-        seen = seen_by_leaving(window.tracks, window.past, poses)
-        return cost.tracks.in_state | is_in(cost.tracks.obs.ids, seen)
+            return np.ones(len(tracks.points), np.bool_)
+        return tracks.in_state | loses_pose

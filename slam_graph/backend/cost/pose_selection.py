@@ -66,7 +66,7 @@ def evenly_spaced(window: Window, policy: CostPolicy, rig: RigProjection) -> Pos
     frames = window.past
     if len(frames) <= policy.max_past_poses:
         return PoseSelection(list(frames))
-    leaving = frozenset(frames[1:-1:3])
+    leaving = frozenset(frames[1 : -policy.recent_frames : 3])
     return PoseSelection([frame for frame in frames if frame not in leaving], leaving)
 
 

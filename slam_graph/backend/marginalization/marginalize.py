@@ -50,7 +50,7 @@ def marginalize_step(
         stays = [staying.issuperset(factor.keys()) for factor in window.factors]
         leaving = [f for f, stay in zip(window.factors, stays, strict=True) if not stay]
         factors = [f for f, stay in zip(window.factors, stays, strict=True) if stay]
-        posterior = linearized(constructed.cost.part(leaving, constructed.leaving))
+        posterior = linearized(constructed.cost.part(leaving, constructed.absorbed))
     points: LinearizationPoints = "current"
     if algorithm.marginalization.first_estimates:
         points = "corrected" if minimum.repeated else "first"
@@ -69,7 +69,7 @@ def _keep_points(window: Window, constructed: ConstructedCost) -> None:
     tracks = constructed.cost.tracks
     if tracks is None:
         return
-    again = ~constructed.leaving
+    again = ~constructed.absorbed
     window.last_points = tracks.obs.ids, tracks.points
     window.kept_points = tracks.obs.ids[again], tracks.points[again]
 
@@ -79,7 +79,7 @@ def _settle_observations(window: Window, constructed: ConstructedCost) -> None:
     cost, removals = constructed.cost, constructed.removals
     if cost.landmarks is not None:
         removals.add_features(Outcome.USED, cost.landmarks.ids)
-    removals.add_features(Outcome.USED, cost.ids_of(constructed.leaving))
+    removals.add_features(Outcome.USED, cost.ids_of(constructed.absorbed))
     removals.apply(window.tracks)
     window.tracks.keep_frames([*constructed.poses.kept, window.frame])
 
