@@ -33,12 +33,8 @@ from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.calibration_estimate import CalibrationEstimate
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["Estimator"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import CalibrationEstimate, FeatureFrame, FeatureObservations, ImuData, Rig
 
 IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""

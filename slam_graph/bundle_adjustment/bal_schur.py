@@ -33,18 +33,6 @@ from slam_graph.bundle_adjustment.bal_cost import BalCost
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalPart
 from slam_graph.errors import EstimationError
 
-__all__ = [
-    "GAUGE_DIM",
-    "BalStep",
-    "NormalEquations",
-    "Structure",
-    "damped_step",
-    "gauge_directions",
-    "normal_equations",
-    "restore_gauge",
-    "structure",
-]
-
 GAUGE_DIM = 7
 """Unobservable directions: translation, rotation and scale of the world."""
 

@@ -10,12 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.backend.solve.damped_steps import (
-    Attempt,
-    GainRatioDamping,
-    StepSettings,
-    levenberg_marquardt,
-)
+from slam_graph.backend import Attempt, GainRatioDamping, StepSettings, levenberg_marquardt
 from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, initial_estimates, retract
 from slam_graph.bundle_adjustment.bal_policy import (
     BalMinimum,
@@ -41,8 +36,6 @@ from slam_graph.bundle_adjustment.bal_schur import (
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-
-__all__ = ["adjust_bundle"]
 
 INITIAL_DAMPING = 1e-4
 """Of the first step, relative to the diagonal of the information."""

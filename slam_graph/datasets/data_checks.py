@@ -19,11 +19,8 @@ from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.datasets.streams.image_sequence import GroupedSequence
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig
-
-__all__ = ["Finding", "check_sequence"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, ImuNoise, Rig
 
 WINDOW_NS = 1_000_000_000
 """Length of the windows of which the calmest is used."""

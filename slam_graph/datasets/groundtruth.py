@@ -21,10 +21,8 @@ from slam_graph.datasets.streams.csv_rows import (
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.euroc_calibration import read_body_T_sensor
-
-__all__ = ["check_groundtruth", "find_groundtruth", "read_groundtruth", "resolve_groundtruth"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import read_body_T_sensor
 
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders of poses in EuRoC and similar recordings, in the order of preference."""

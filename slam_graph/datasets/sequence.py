@@ -25,19 +25,8 @@ from slam_graph.datasets.groundtruth import (
     resolve_groundtruth,
 )
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
-from slam_graph.sensors.rig import Rig
-
-__all__ = [
-    "Extent",
-    "FrameStream",
-    "ReaderOptions",
-    "RecordedSequence",
-    "Sequence",
-    "SequenceInfo",
-    "within",
-]
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""

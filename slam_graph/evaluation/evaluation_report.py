@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import ErrorSeries, ape
+from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
 from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
-from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
-from slam_graph.geometry.trajectory_alignment import (
+from slam_graph.geometry import (
     AlignmentMode,
     Similarity,
+    StateHistory,
+    Trajectory,
     align_first_pose,
     align_yaw,
 )

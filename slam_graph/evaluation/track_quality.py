@@ -11,11 +11,9 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.frontend import epipolar_distance, essential_matrix
+from slam_graph.geometry import Trajectory, interpolate
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
 GAP_FRAMES = 5
 """Features are compared with themselves so many frames before: over one frame the true motion is

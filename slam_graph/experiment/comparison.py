@@ -11,7 +11,6 @@ from typing import Any
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.comparison_plan import (
-    WITHOUT_FEJ,
     Comparison,
     Progress,
     load_configs,
@@ -22,15 +21,6 @@ from slam_graph.experiment.comparison_report import write_report
 from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import Task
-
-__all__ = [
-    "DEFAULT_ALGORITHMS",
-    "WITHOUT_FEJ",
-    "Comparison",
-    "compare",
-    "load_configs",
-    "with_variants",
-]
 
 DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.evaluation.consistency import mean_bounds
+from slam_graph.evaluation import mean_bounds
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
     ALIGNMENTS,
@@ -21,10 +21,8 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results.result_files import appearing
-from slam_graph.visualization.comparison_plots import Curve, Panel, plot_panels
-
-__all__ = ["NEES_DOF", "Figure", "draw"]
+from slam_graph.results import appearing
+from slam_graph.visualization import Curve, Panel, plot_panels
 
 BINS = 200
 """Number of equal bins of time or distance in which series are averaged, also over the seeds."""

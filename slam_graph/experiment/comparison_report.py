@@ -26,10 +26,7 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results.metrics import finite, versions
-from slam_graph.results.result_files import write_text
-
-__all__ = ["COLUMNS", "cells", "write_report"]
+from slam_graph.results import finite, versions, write_text
 
 COLUMNS = (
     "algorithm",

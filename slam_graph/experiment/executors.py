@@ -16,8 +16,6 @@ from typing import Protocol
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.tasks import Task
 
-__all__ = ["DaskCluster", "Executor", "LocalProcesses"]
-
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment of a task: tasks run in parallel, so BLAS uses one thread in each."""
 

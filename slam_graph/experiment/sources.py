@@ -8,15 +8,10 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import Sequence, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.settings.base import Settings
-from slam_graph.settings.tree import ConfigTree, override, validate
-from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig, StartConfig
-from slam_graph.simulation.simulator import simulate
-
-__all__ = ["Source", "find_sources"]
+from slam_graph.settings import ConfigTree, Settings, override, validate
+from slam_graph.simulation import TRAJECTORIES, SimulationConfig, StartConfig, simulate
 
 PREFIX = "sim:"
 

@@ -22,9 +22,7 @@ from slam_graph.frontend.outliers import (
     map_inliers,
 )
 from slam_graph.frontend.prediction import PointPredictor
-from slam_graph.sensors.rig import RigCamera
-
-__all__ = ["CameraTracker"]
+from slam_graph.sensors import RigCamera
 
 MERGE_DISTANCE_PX = 3.0
 """Of two features closer than this the younger one is dropped: they track the same corner."""

@@ -19,16 +19,6 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
 
-__all__ = [
-    "BRISK_OCTAVES",
-    "DETECTORS",
-    "ORB_EDGE_PX",
-    "ORB_LEVELS",
-    "Detector",
-    "refine",
-    "require",
-]
-
 INSTALL = "pip install 'slam-graph[descriptors]'"
 
 CORNER_WINDOW_PX = 7

@@ -15,9 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
-from slam_graph.sensors.camera import Camera
-
-__all__ = ["BORDER_PX", "FeatureExtractor", "camera_mask"]
+from slam_graph.sensors import Camera
 
 BORDER_PX = 5
 """Features are neither found nor kept within this distance of the edge of the image, where the

@@ -15,16 +15,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.plugins import Choice, Registry
-from slam_graph.settings.base import Settings, expert
+from slam_graph.settings import Settings, expert
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
     from slam_graph.frontend.descriptors import Descriptor
     from slam_graph.frontend.detectors import Detector
     from slam_graph.frontend.frontend_protocol import Frontend
-    from slam_graph.sensors.rig import Rig
-
-__all__ = ["DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"]
+    from slam_graph.sensors import Rig
 
 DETECTORS: Registry[Callable[[FrontendConfig], Detector]] = Registry(
     "slam_graph.detectors",

@@ -21,12 +21,15 @@ from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["ImageFrontend"]
+from slam_graph.sensors import (
+    STANDARD_GRAVITY,
+    Camera,
+    CameraFrame,
+    FeatureFrame,
+    FeatureObservations,
+    ImuData,
+    Rig,
+)
 
 FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""

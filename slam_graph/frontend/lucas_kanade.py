@@ -17,8 +17,6 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
 
-__all__ = ["CornerTracking", "LucasKanade"]
-
 ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
 

@@ -18,9 +18,7 @@ from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks
 from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.sensors.camera import Camera
-
-__all__ = ["DescriptorMatching", "descriptor_distances", "match"]
+from slam_graph.sensors import Camera
 
 KEYPOINTS = 500
 """Keypoints described in each image: two to three times the default number of features, so that

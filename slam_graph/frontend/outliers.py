@@ -13,18 +13,6 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
 
-__all__ = [
-    "MIN_POINTS",
-    "coherent_groups",
-    "direction_inliers",
-    "eight_point",
-    "epipolar_distance",
-    "essential_matrix",
-    "fundamental_inliers",
-    "map_inliers",
-    "triangulated_depths",
-]
-
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
 

@@ -15,9 +15,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.frontend.motion import ImuMotion
-from slam_graph.sensors.rig import RigCamera
-
-__all__ = ["PointPredictor", "Prediction", "neighbour_flow"]
+from slam_graph.sensors import RigCamera
 
 NEAREST_DEPTH_M = 0.1
 """Points of the map nearer than this, or behind the camera, are not used for prediction."""

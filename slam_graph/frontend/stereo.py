@@ -25,10 +25,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig, RigCamera
-
-__all__ = ["StereoMatcher", "reference_cameras"]
+from slam_graph.sensors import Camera, Rig, RigCamera
 
 OVERLAP_GRID = 8
 """Rays through OVERLAP_GRID x OVERLAP_GRID pixels are followed into the other camera."""

@@ -9,9 +9,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from slam_graph.settings.base import Settings, expert
-
-__all__ = ["KeyframeConfig", "LoopClosureConfig", "PlaceConfig", "VerificationConfig"]
+from slam_graph.settings import Settings, expert
 
 
 def _constants(file: str, **names: str) -> dict[str, str]:

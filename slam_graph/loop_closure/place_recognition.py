@@ -21,16 +21,6 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.loop_closure.loop_config import PlaceConfig
 from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 
-__all__ = [
-    "SAME_PLACE",
-    "PlaceDatabase",
-    "PlaceRecognition",
-    "Vocabulary",
-    "WordVector",
-    "best_places",
-    "majority",
-]
-
 TRAINING_DESCRIPTORS = 30_000
 """Largest number of descriptors that a vocabulary is trained on, for its time (some seconds)."""
 TRAINING_ROUNDS = 6

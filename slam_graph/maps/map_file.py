@@ -23,15 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.place_recognition import Vocabulary
+from slam_graph.loop_closure import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.sensors.calibration_yaml import parse_yaml
-from slam_graph.sensors.euroc_calibration import read_imu_noise
-from slam_graph.sensors.kalibr_calibration import IMU_KEY, chain_cameras, kalibr_table
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["ARRAYS", "arrays_of", "read_map", "write_map"]
+from slam_graph.pose_graph import Poses
+from slam_graph.sensors import IMU_KEY, Rig, chain_cameras, kalibr_table, parse_yaml, read_imu_noise
 
 _MAX_COORDINATE_M = 1e8
 _MAX_NORMALIZED = 1e4

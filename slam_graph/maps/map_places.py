@@ -11,14 +11,18 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.loop_config import VerificationConfig
-from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
-from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
-from slam_graph.loop_closure.place_recognition import SAME_PLACE, PlaceDatabase, best_places
+from slam_graph.loop_closure import (
+    SAME_PLACE,
+    Descriptors,
+    Keyframe,
+    Loop,
+    LoopVerifier,
+    PlaceDatabase,
+    VerificationConfig,
+    best_places,
+)
 from slam_graph.maps.map_model import SlamMap, in_body
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["MapPlaces", "PlaceMatch"]
+from slam_graph.sensors import Rig
 
 _HALF_TURN_M = 4.0
 """Distance that a rotation by 180° counts as."""

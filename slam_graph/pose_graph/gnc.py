@@ -37,8 +37,6 @@ from slam_graph.pose_graph.gtsam_graph import (
 from slam_graph.pose_graph.loop_consistency import confirmed_loops
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
-__all__ = ["graduated_nonconvexity", "truncated_weights"]
-
 _CONTROL_FACTOR = 1.4
 """Growth of μ from one update of the weights to the next, as in the paper."""
 

@@ -30,15 +30,6 @@ from slam_graph.pose_graph.gtsam_graph import (
 )
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
-__all__ = [
-    "PoseGraphCost",
-    "chi2_table",
-    "construct",
-    "inlier_bound",
-    "loss_weights",
-    "uncertain_edges",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraphCost:

@@ -28,8 +28,6 @@ from slam_graph.sensors.euroc_calibration import (
 )
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
-__all__ = ["IMU_KEY", "chain_cameras", "kalibr_table", "read_kalibr", "write_kalibr"]
-
 IMU_KEY = "imu0"
 
 

@@ -14,8 +14,6 @@ from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.views import View
 from slam_graph.simulation.world import World
 
-__all__ = ["Landmarks", "ahead", "moving_box", "on_walls"]
-
 CHECK_PERIOD_S = 0.5
 """Time between two checks whether the cameras see enough landmarks ahead."""
 

@@ -13,8 +13,6 @@ from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import MovingObjectConfig, random_stream
 from slam_graph.simulation.world import Panel
 
-__all__ = ["MovingBoard"]
-
 SMOOTHING_NS = 1_000_000_000
 """The path of the board is that of the camera, averaged over this time before and after."""
 SMOOTHING_SAMPLES = 21

@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
-from slam_graph.sensors.measurements import CameraFrame
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors import CameraFrame, Rig, RigCamera
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.moving_object import MovingBoard
 from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
-
-__all__ = ["Renderer"]
 
 NEAREST_M = 1e-3
 LIGHT = np.array([0.25, 0.45, 0.86])

@@ -11,20 +11,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
-from slam_graph.settings.base import Settings, expert
-from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
-
-__all__ = [
-    "FlightConfig",
-    "ImageConfig",
-    "LandmarkConfig",
-    "MovingObjectConfig",
-    "SimulatedImuConfig",
-    "SimulationConfig",
-    "StartConfig",
-    "TrackConfig",
-    "load_simulation_config",
-]
+from slam_graph.settings import ConfigTree, Settings, expert, override, read_tree, validate
 
 TRAJECTORIES = ("figure8", "rooms", "random")
 """Names of the generated trajectories; any other text is the path of a recorded one."""

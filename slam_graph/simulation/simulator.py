@@ -18,9 +18,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera, pose_from_matrix
+from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera, pose_from_matrix, read_kalibr
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion
@@ -40,8 +38,6 @@ from slam_graph.simulation.splines import fit, stamps_between
 from slam_graph.simulation.trajectories import fly
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import room_around, three_rooms
-
-__all__ = ["euroc_rig", "simulate"]
 
 DEFAULT_DURATION_S = 60.0
 

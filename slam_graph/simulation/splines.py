@@ -10,10 +10,8 @@ from scipy.interpolate import BPoly, CubicSpline, make_lsq_spline
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.simulation.motion import SplineMotion
-
-__all__ = ["continuous", "fit", "stamps_between", "through_waypoints"]
 
 KNOT_SPACING_S = 0.1
 """Distance of the knots of a fitted spline: it follows motions of up to about 4 Hz and smooths

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from slam_graph.simulation.simulation_config import random_stream
 
-__all__ = ["Atlas", "Grey", "paint"]
-
 Grey = NDArray[np.float32]
 """Grey values, or other single-precision numbers per pixel."""
 

@@ -11,16 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import TrackConfig, random_stream
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import World
-
-__all__ = ["TrackSimulator"]
 
 GRID = (8, 5)
 """Columns and rows of the grid over which new features are distributed."""

@@ -22,8 +22,6 @@ from slam_graph.simulation.motion import SplineMotion
 from slam_graph.simulation.simulation_config import FlightConfig
 from slam_graph.simulation.splines import continuous, through_waypoints
 
-__all__ = ["ROOM_PITCH_M", "fly"]
-
 WAYPOINT_PERIOD_S = 0.25
 RAMP_S = 1.5
 """Time from standing still to full speed."""

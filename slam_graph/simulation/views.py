@@ -9,11 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors import Camera, Rig, RigCamera
 from slam_graph.simulation.world import World
-
-__all__ = ["View", "camera_groups"]
 
 OVERLAP_DEPTH_M = 4.0
 """Depth at which the overlap of two cameras is determined."""

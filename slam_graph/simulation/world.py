@@ -12,8 +12,6 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.simulation.trajectories import ROOM_PITCH_M
 
-__all__ = ["Panel", "World", "box", "room_around", "three_rooms"]
-
 HEADROOM_M = 1.2
 """Distance of floor and ceiling from a trajectory."""
 

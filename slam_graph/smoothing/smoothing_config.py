@@ -9,9 +9,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from slam_graph.settings.base import Settings, expert
-
-__all__ = ["FinalBaConfig"]
+from slam_graph.settings import Settings, expert
 
 
 class FinalBaConfig(Settings):

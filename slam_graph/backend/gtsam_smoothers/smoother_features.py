@@ -25,9 +25,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactor
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["NewObservations", "SmootherFeatures"]
+from slam_graph.sensors import Rig
 
 GATE_SCALE = 4.0
 """The gate knows the covariance of the pose only, not of the feature: it is this much wider."""

@@ -37,10 +37,8 @@ from slam_graph.backend.solve.gauss_newton import minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import preintegrate
-
-__all__ = ["DynamicRefinement"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import preintegrate
 
 BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the batch problem is solved."""

@@ -24,10 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.sensors.imu_buffer import preintegrate
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-
-__all__ = ["estimate_gyro_bias"]
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, preintegrate
 
 MIN_COMMON = 8
 """Pairs of frames with fewer common features than this are left out."""

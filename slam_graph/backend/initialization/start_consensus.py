@@ -27,8 +27,6 @@ from slam_graph.backend.initialization.visual_inertial_alignment import (
     constrained_solution,
 )
 
-__all__ = ["static_features"]
-
 SAMPLES = 100
 """If half of the features are static, one sample of four has only such with a probability of
 0.998."""

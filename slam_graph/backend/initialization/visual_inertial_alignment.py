@@ -25,15 +25,6 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.solve.square_root import triangularize
 
-__all__ = [
-    "MIN_DEPTH_M",
-    "Alignment",
-    "Motion",
-    "align",
-    "alignment_equations",
-    "constrained_solution",
-]
-
 REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1

@@ -47,12 +47,7 @@ from slam_graph.datasets.streams.track_frames import (
     frames_from_tables,
 )
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["EqvioTracks", "is_eqvio_file", "wheel_tracks"]
+from slam_graph.sensors import Camera, ImuData, ImuNoise, Rig, RigCamera, read_kalibr
 
 HEADER = "row_type,"
 META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"

@@ -23,13 +23,16 @@ import yaml
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.euroc_calibration import camera_entry
-from slam_graph.sensors.kalibr_calibration import write_kalibr
-from slam_graph.sensors.measurements import CameraFrame, ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["EurocWriter", "convert_to_euroc", "refuse_existing"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import (
+    CameraFrame,
+    ImuData,
+    ImuNoise,
+    Rig,
+    RigCamera,
+    camera_entry,
+    write_kalibr,
+)
 
 CALIBRATION = "calibration.yaml"
 """The calibration in Kalibr's format, beside ``mav0``."""

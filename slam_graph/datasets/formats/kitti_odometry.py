@@ -29,11 +29,8 @@ from slam_graph.datasets.streams.csv_rows import parse, read_rows
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig, RigCamera
-
-__all__ = ["KittiOdometrySequence", "is_kitti_odometry"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import Rig, RigCamera, read_kalibr
 
 WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Turns x right, y down, z forward into the x forward, y left, z up of a world frame."""

@@ -39,12 +39,8 @@ from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["KittiRawSequence", "is_kitti_raw"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera, read_kalibr
 
 EARTH_RADIUS_M = 6_378_137.0
 

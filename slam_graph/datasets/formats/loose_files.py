@@ -25,18 +25,7 @@ from slam_graph.datasets.streams.csv_rows import (
 )
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.errors import DataError, closest
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = [
-    "LooseFiles",
-    "find_files",
-    "is_usable_rate",
-    "read_stamps",
-    "regular_stamps",
-    "stamps_from_names",
-]
+from slam_graph.sensors import ImuData, Rig, read_kalibr
 
 SHORTEST_PERIOD_NS = 100_000
 """Frames closer in time than this have stamps in another unit."""

@@ -43,14 +43,16 @@ from slam_graph.datasets.streams.track_frames import (
     frames_from_tables,
 )
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.calibration_yaml import read_yaml
-from slam_graph.sensors.euroc_calibration import read_camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["OpenvinsSimulation"]
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import (
+    ImuData,
+    ImuNoise,
+    Rig,
+    RigCamera,
+    read_camera,
+    read_kalibr,
+    read_yaml,
+)
 
 STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
 STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"

@@ -32,9 +32,7 @@ from slam_graph.datasets.streams.image_sequence import (
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
 from slam_graph.errors import DataError
-from slam_graph.sensors.measurements import CameraFrame
-
-__all__ = ["VideoSequence", "is_video"]
+from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
 

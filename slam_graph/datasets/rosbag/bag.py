@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
-__all__ = ["Bag", "Message", "is_bag"]
-
 ROS1_SUFFIX, ROS2_SUFFIXES = ".bag", (".mcap", ".db3")
 
 METADATA = "metadata.yaml"

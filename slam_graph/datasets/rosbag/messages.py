@@ -11,18 +11,6 @@ import numpy as np
 
 from slam_graph.datasets.streams.images import Fault, Image, decode_grey
 
-__all__ = [
-    "CAMERA_INFO",
-    "COMPRESSED_IMAGE",
-    "IMAGE",
-    "IMU",
-    "POSES",
-    "TRANSFORMS",
-    "image_of",
-    "inertial_of",
-    "pose_of",
-]
-
 IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"

@@ -14,11 +14,7 @@ from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
 from slam_graph.datasets.rosbag.topics import Topics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.camera_model import CAMERA_MODELS
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["read_bag_rig"]
+from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera
 
 STATIC_TOPIC = "/tf_static"
 

@@ -17,18 +17,6 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 
-__all__ = [
-    "ROWS_PER_BLOCK",
-    "STAMP_TEXT",
-    "Rows",
-    "count_rows",
-    "parse",
-    "read_rows",
-    "require_rows",
-    "stamp_from_seconds",
-    "stamps_from_seconds",
-]
-
 ROWS_PER_BLOCK = 1024
 """Rows in memory at a time: about five seconds of an IMU."""
 

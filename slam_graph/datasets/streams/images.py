@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 
-__all__ = ["Fault", "FileImages", "Image", "decode_grey", "find_damage", "prefetch"]
-
 T = TypeVar("T")
 
 Image = NDArray[np.uint8]

@@ -17,17 +17,7 @@ from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, count_rows, parse, read_rows, require_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.measurements import ImuData
-
-__all__ = [
-    "INTEGER_STAMPS",
-    "ImuArrays",
-    "ImuCleaner",
-    "ImuFile",
-    "ImuSource",
-    "clean_blocks",
-    "parse_imu_rows",
-]
+from slam_graph.sensors import ImuData
 
 GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not

@@ -41,8 +41,6 @@ def in_order(
     return np.array(kept, np.intp)
 
 
-__all__ = ["ABSENT", "Groups", "group_by_time", "in_order"]
-
 ABSENT = -1
 """Stands in a group for a camera that has no image in it."""
 

@@ -27,13 +27,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import (
-    ALIGNMENT_MODES,
-    AlignmentMode,
-    Similarity,
-    align,
-)
+from slam_graph.geometry import ALIGNMENT_MODES, AlignmentMode, Similarity, Trajectory, align
 
 
 @dataclass(frozen=True)

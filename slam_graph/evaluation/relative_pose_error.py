@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import (
+from slam_graph.evaluation.absolute_pose_error import (
     ErrorSeries,
     Statistics,
     aligned_pair,
@@ -28,8 +28,7 @@ from slam_graph.evaluation.choices import (
     PoseRelation,
     require_known,
 )
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.geometry import AlignmentMode, Trajectory
 
 DEFAULT_TOLERANCE = 0.1
 
