@@ -14,7 +14,7 @@ from scipy.stats import chi2, kstest
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, GatingConfig, NoiseConfig
-from slam_graph.backend.cost.cost import Cost, Linearization, NewFeatures
+from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
@@ -60,13 +60,13 @@ def trial(rng: np.random.Generator) -> Trial:
     return Trial(obs, layout, root @ root.T, state)
 
 
-def fresh_cost(case: Trial) -> tuple[Cost, Linearization]:
+def track_cost(case: Trial) -> tuple[Cost, Linearization]:
     """The features as new ones, triangulated from the wrong poses."""
     poses = [case.state.estimate.atPose3(X(i)).matrix() for i in range(FRAMES)]
     R, p = np.array(poses)[:, :3, :3], np.array(poses)[:, :3, 3]
     points = triangulate(case.obs, PROJECTION, R, p, CONFIG.triangulation).points
     cost = Cost(case.state, PROJECTION, CONFIG, SquareRootInformation.empty())
-    cost.fresh = NewFeatures(case.obs, points, np.zeros(len(points), np.bool_))
+    cost.tracks = TrackFeatures(case.obs, points, np.zeros(len(points), np.bool_))
     return cost, cost.linearize()
 
 
@@ -74,7 +74,7 @@ def tracked_cost(
     case: Trial, rng: np.random.Generator
 ) -> tuple[Cost, Linearization, FloatArray, Layout]:
     """The features as variables of the state, with errors and covariance of their own."""
-    truth = fresh_cost(case)[0].fresh
+    truth = track_cost(case)[0].tracks
     assert truth is not None
     layout = case.layout.extended(dims_of(L(j) for j in case.obs.ids.tolist()))
     sigma = 0.01
@@ -83,7 +83,7 @@ def tracked_cost(
     for j, point in zip(case.obs.ids.tolist(), truth.points, strict=True):
         case.state.insert_point(j, point + rng.normal(0.0, sigma, 3))
     cost = Cost(case.state, PROJECTION, CONFIG, SquareRootInformation.empty())
-    cost.tracked = case.obs
+    cost.landmarks = case.obs
     return cost, cost.linearize(), P, layout
 
 
@@ -100,17 +100,17 @@ def solved() -> list[tuple[Trial, Cost, Linearization]]:
     rng = np.random.default_rng(17)
     trials = [case for case in (trial(rng) for _ in range(300)) if len(case.obs.ids)]
     assert len(trials) > 200
-    return [(case, *fresh_cost(case)) for case in trials]
+    return [(case, *track_cost(case)) for case in trials]
 
 
 def quantiles(solved: list[tuple[Trial, Cost, Linearization]], scale: float) -> list[float]:
     """Of one feature of each scene, because those of one scene share the errors of its poses."""
     found = []
     for case, _, linear in solved:
-        assert linear.fresh is not None
-        fresh = linear.fresh
-        distances = squared_mahalanobis(fresh.r_2, fresh.N, scale * case.covariance)
-        found.append(float(chi2.cdf(distances[0], fresh.dof[0])))
+        assert linear.tracks is not None
+        tracks = linear.tracks
+        distances = squared_mahalanobis(tracks.r_2, tracks.N, scale * case.covariance)
+        found.append(float(chi2.cdf(distances[0], tracks.dof[0])))
     return found
 
 
@@ -164,10 +164,10 @@ def test_the_gate_passes_its_share_of_correct_features(
     passed: list[bool] = []
     for case, cost, linear in solved:
         gate = replace(cost, config=config).gate(linear, known(case.covariance, case.layout))
-        assert len(gate.tracked) == 0
-        passed += gate.fresh.tolist()
-        assert gate.innovations.tested == len(gate.fresh)
-        assert gate.innovations.rejected == np.sum(~gate.fresh)
+        assert len(gate.landmarks) == 0
+        passed += gate.tracks.tolist()
+        assert gate.innovations.tested == len(gate.tracks)
+        assert gate.innovations.rejected == np.sum(~gate.tracks)
     error = np.sqrt(confidence * (1 - confidence) / len(passed))
     assert abs(np.mean(passed) - confidence) < 4 * error + 0.01
 
@@ -182,10 +182,10 @@ def test_wrong_features_are_rejected_and_right_ones_are_not() -> None:
         bad = np.arange(len(case.obs.ids)) % 2 == 0
         rows = np.flatnonzero(bad[case.obs.feature] & (case.obs.slots == 3))
         case.obs.pixels[rows] += 15.0 * rng.choice([-1.0, 1.0], (len(rows), 2))
-        cost, linear = fresh_cost(case)
-        fresh = cost.gate(linear, known(case.covariance, case.layout)).fresh
-        caught, wrong = caught + int((~fresh[bad]).sum()), wrong + int(bad.sum())
-        spared, right = spared + int(fresh[~bad].sum()), right + int((~bad).sum())
+        cost, linear = track_cost(case)
+        tracks = cost.gate(linear, known(case.covariance, case.layout)).tracks
+        caught, wrong = caught + int((~tracks[bad]).sum()), wrong + int(bad.sum())
+        spared, right = spared + int(tracks[~bad].sum()), right + int((~bad).sum())
     assert wrong > 50
     assert caught == wrong
     assert spared > 0.9 * right
@@ -198,12 +198,12 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
         case = trial(rng)
     bad = np.arange(len(case.obs)) % 4 == 1
     cost, _, P, layout = tracked_cost(case, rng)
-    assert cost.tracked is not None
+    assert cost.landmarks is not None
     case.obs.pixels[bad] += 60.0
     gate = cost.gate(cost.linearize(), known(P, layout))
-    assert len(gate.fresh) == 0
-    assert not gate.tracked[bad].any()
-    assert gate.tracked[~bad].mean() > 0.8
+    assert len(gate.tracks) == 0
+    assert not gate.landmarks[bad].any()
+    assert gate.landmarks[~bad].mean() > 0.8
 
 
 def test_thresholds_are_quantiles() -> None:

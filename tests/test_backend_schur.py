@@ -9,7 +9,7 @@ from flight import Flight, rig, room, scene
 from slam_graph.backend.cost.feature_factors import reduce_features, whiten
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.schur import condense_features, information_root
+from slam_graph.backend.cost.schur import information_root, sum_features
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -20,7 +20,7 @@ def test_sum_of_features_equals_their_null_space_rows(cameras: int, span_s: floa
     times = np.linspace(0.0, span_s, 6)
     obs, geometry = scene(Flight(), mounted, room(400, rng), times, rng)
     linear = whiten(obs, RigProjection(mounted), geometry, geometry, 1.0, RobustLoss())
-    apart, together = reduce_features(obs, linear), condense_features(obs, linear)
+    apart, together = reduce_features(obs, linear), sum_features(obs, linear)
 
     rows, compact = apart.null_space_rows(), together.null_space_rows()
     scale = np.abs(rows.T @ rows).max()

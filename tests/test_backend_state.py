@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import B, E, L, T, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.marginalization.marginalize import marginalize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
@@ -181,17 +181,17 @@ def test_a_cost_is_restored_with_its_features() -> None:
         state.insert_imu_state(frame, Flight().nav_state(float(t_s)))
     cost = Cost(state, RigProjection(cameras), BackendConfig(), SquareRootInformation.empty())
     cost.prior = cost.prior.extended(dims_of(X(i) for i in range(4)))
-    cost.fresh = NewFeatures(obs, truth.points, np.zeros(len(obs.ids), np.bool_))
+    cost.tracks = TrackFeatures(obs, truth.points, np.zeros(len(obs.ids), np.bool_))
     linear = cost.linearize()
     error = cost.value()
     before, estimate = cost.snapshot(), gtsam.Values(state.estimate)
     cost.apply(delta([X(i) for i in range(4)]), linear, cost.layout())
     assert cost.value() != error
-    assert np.abs(cost.fresh.points - truth.points).max() > 1e-3
+    assert np.abs(cost.tracks.points - truth.points).max() > 1e-3
     cost.restore(before)
     assert cost.state is state
     assert_same_values(state.estimate, estimate)
-    np.testing.assert_array_equal(cost.fresh.points, truth.points)
+    np.testing.assert_array_equal(cost.tracks.points, truth.points)
     assert cost.value() == pytest.approx(error, rel=1e-12)
 
 

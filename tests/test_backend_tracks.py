@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tracks of the window: under which angles two frames see the same features."""
 
+import ast
+import re
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.cost.feature_tracks import FeatureTracks
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))
@@ -33,3 +37,24 @@ def test_parallax_is_of_the_place_and_not_of_the_direction() -> None:
     cosine = np.sum(both * (both - there), axis=1)
     cosine /= np.linalg.norm(both, axis=1) * np.linalg.norm(both - there, axis=1)
     np.testing.assert_allclose(tracks.parallax(0, 2, turn.T), np.arccos(cosine), atol=1e-9)
+
+
+def test_the_table_of_outcomes_is_the_code() -> None:
+    """docs/engine.md names for each outcome the function that decides it, which uses it."""
+    root = Path(__file__).parent.parent
+    page = (root / "docs" / "engine.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \|[^|]*\| `([\w.]+)` \|$", page, re.M))
+    assert rows.keys() == {outcome.value for outcome in Outcome}
+    uses: dict[str, str] = {}
+    for path in (root / "slam_graph" / "backend").rglob("*.py"):
+        source = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ClassDef):
+                for inner in node.body:
+                    if isinstance(inner, ast.FunctionDef):
+                        uses[f"{node.name}.{inner.name}"] = ast.unparse(node)
+            elif isinstance(node, ast.FunctionDef):
+                uses[node.name] = source
+    for value, function in rows.items():
+        assert function in uses, f"{value}: no {function}"
+        assert f"Outcome.{Outcome(value).name}" in uses[function], f"{function}: not {value}"

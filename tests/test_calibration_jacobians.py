@@ -19,11 +19,11 @@ from test_estimator_first_estimates import CONFIG, WEAK, claimed_information
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
-from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.marginalization.observability import relinearized, unseen_directions
+from slam_graph.backend.marginalization.observability import relinearized, unobservable_directions
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.gauss_newton import minimize
@@ -156,17 +156,17 @@ def test_features_used_once_say_of_the_calibration_what_variables_would() -> Non
     for in_state in (False, True):
         variable = np.full(len(obs.ids), in_state)
         cost = Cost(state.copy(), CalibratedProjection(variables), BackendConfig(), prior)
-        cost.fresh = NewFeatures(obs, points, variable)
+        cost.tracks = TrackFeatures(obs, points, variable)
         if in_state:
             for j, point in zip(obs.ids.tolist(), points, strict=True):
                 cost.state.insert_point(j, point)
         posterior = minimize(cost, GaussNewtonPolicy(max_steps=1)).posterior
-        assert cost.fresh is not None
+        assert cost.tracks is not None
         posteriors.append((posterior.covariance_of(list(prior.layout.dims)), cost))
     (once, first), (kept, second) = posteriors
     np.testing.assert_allclose(once, kept, rtol=1e-6, atol=1e-12)
-    assert first.fresh is not None
-    for j, point in zip(obs.ids.tolist(), first.fresh.points, strict=True):
+    assert first.tracks is not None
+    for j, point in zip(obs.ids.tolist(), first.tracks.points, strict=True):
         np.testing.assert_allclose(second.state.estimate.atPoint3(L(j)), point, atol=1e-6)
     for key in variables.keys:
         np.testing.assert_allclose(first.state.offsets[key], second.state.offsets[key], atol=1e-7)
@@ -267,7 +267,7 @@ def test_linearisation_points_move_without_a_claim_on_the_world() -> None:
     for i, t_s in enumerate(TIMES.tolist()):
         state.insert_imu_state(i, Flight().nav_state(t_s))
     layout = Layout(dims_of(state.variables()))
-    directions = unseen_directions(state.first, layout)
+    directions = unobservable_directions(state.first, layout)
     rows = rng.normal(size=(3 * layout.size, layout.size))
     rows -= rows @ directions @ np.linalg.pinv(directions)  # sees nothing of the world
     empty = SquareRootInformation.empty().extended(layout.dims)
@@ -276,7 +276,7 @@ def test_linearisation_points_move_without_a_claim_on_the_world() -> None:
     state.update(layout, 0.05 * rng.normal(size=layout.size))
     moved = relinearized(prior, state)
     assert not state.offset(layout).any()
-    now = unseen_directions(state.first, layout)
+    now = unobservable_directions(state.first, layout)
     assert np.abs(prior.R @ now).max() > 0.01
     np.testing.assert_allclose(moved.R @ now, 0.0, atol=1e-9)
     np.testing.assert_allclose(np.tril(moved.R, -1), 0.0)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from flight import rig
 from fov_camera import FOV
-from slam_graph.simulation.writers import write
 
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -39,7 +38,7 @@ def test_an_euroc_folder_of_images(tmp_path: Path) -> None:
     chain = tmp_path / "chain.yaml"
     write_kalibr(rig(1, FOV), chain)
     config = SimulationConfig(kind="images", duration_s=0.2, calibration=chain)
-    write(simulate(config), tmp_path / "recording")
+    simulate(config).save(tmp_path / "recording")
     assert open_dataset(tmp_path / "recording").rig.cameras[0].camera == FOV
 
 

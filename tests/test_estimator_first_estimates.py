@@ -17,7 +17,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.marginalization.observability import unseen_directions
+from slam_graph.backend.marginalization.observability import unobservable_directions
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of
@@ -33,7 +33,7 @@ def claimed_information(estimator: Estimator) -> FloatArray:
     """Information (4, 4) of the prior on the position and heading of the world."""
     assert estimator.window is not None
     prior = estimator.window.prior
-    rows = prior.R @ unseen_directions(estimator.window.state.first, prior.layout)
+    rows = prior.R @ unobservable_directions(estimator.window.state.first, prior.layout)
     return rows.T @ rows
 
 
@@ -88,5 +88,5 @@ def test_the_dynamics_do_not_see_these_directions() -> None:
     layout = Layout(dims_of(jacobian.keys()))
     A, b = jacobian.jacobian()
     assert np.linalg.norm(b) > 100.0
-    change = A @ unseen_directions(state.first, layout)
+    change = A @ unobservable_directions(state.first, layout)
     np.testing.assert_allclose(change, 0.0, atol=1e-9 * np.abs(A).max())

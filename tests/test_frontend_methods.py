@@ -29,9 +29,9 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.frontend_factory import build_frontend
 from slam_graph.frontend.frontend_protocol import Feedback
+from slam_graph.frontend.imu_motion import ImuMotion
 from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
-from slam_graph.frontend.motion import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
 from slam_graph.sensors.imu_buffer import (
     ImuBuffer,

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The window as a factor graph: its linearisation has the engine's normal equations."""
 
+import json
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, packets, rig, room
+from typer.testing import CliRunner
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import (
@@ -19,6 +21,7 @@ from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.solve.gauss_newton import linearized
 from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.cli.main import app
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.errors import EstimationError
 from slam_graph.sensors.camera import Camera
@@ -104,16 +107,16 @@ def test_so_it_has_with_other_cameras(camera: Camera) -> None:
     check(flown("okvis", camera))
 
 
-def test_it_is_saved_and_read_back(tmp_path: Path) -> None:
+def test_it_is_serialised_and_read_back() -> None:
     for name, calibration in (("okvis", None), ("msckf", EVERYTHING)):
         window = flown(name, calibration=calibration).factor_graph()
-        files = window.save(tmp_path / name)
+        texts = window.texts()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.deserialize(files[0].read_text())
-        values.deserialize(files[1].read_text())
+        graph.deserialize(texts["graph.txt"])
+        values.deserialize(texts["values.txt"])
         assert graph.size() == window.graph.size()
         assert graph.error(values) == pytest.approx(window.graph.error(window.values), rel=1e-9)
-        assert files[2].read_text().startswith("graph {")
+        assert texts["graph.dot"].startswith("graph {")
 
 
 @pytest.mark.parametrize("name", SMOOTHERS)
@@ -122,6 +125,21 @@ def test_smoothers_have_a_graph_too(name: str) -> None:
     window = estimator.factor_graph()
     assert window.graph.size() > 10
     assert window.linearize().size() == window.graph.size()
+
+
+def test_a_run_saves_the_graphs_that_are_asked_for(tmp_path: Path) -> None:
+    options = ["--duration", "8", "--save-graph", "6.5", "--save-graph", "99"]
+    out = CliRunner().invoke(
+        app,
+        ["run", "demo", *options, "--output", str(tmp_path), "--no-progress", "--no-final-ba"],
+    )
+    assert out.exit_code == 0, out.output
+    folder = next(tmp_path.glob("*/latest"))
+    (file,) = folder.glob("graph_*_graph.txt")
+    graph = gtsam.NonlinearFactorGraph()
+    graph.deserialize(file.read_text())
+    assert graph.size() > 10
+    assert json.loads((folder / "metrics.json").read_text())["warnings"]["graph_not_saved"] == 1
 
 
 def test_without_a_state_there_is_none() -> None:

@@ -27,6 +27,7 @@ __all__ = [
     "StepSettings",
     "TenfoldDamping",
     "TriangulationConfig",
+    "WindowGraph",
     "ZeroVelocityConfig",
     "imu_factor",
     "levenberg_marquardt",
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
         levenberg_marquardt,
     )
     from slam_graph.backend.solve.state import stacked_points, stacked_poses
+    from slam_graph.backend.window_graph import WindowGraph
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -90,5 +92,6 @@ else:
                 "levenberg_marquardt",
             ),
             "solve.state": ("stacked_points", "stacked_poses"),
+            "window_graph": ("WindowGraph",),
         },
     )

@@ -15,7 +15,7 @@ from slam_graph.settings import Settings, expert
 class AdaptiveNoiseConfig(Settings):
     """White noise of the IMU that is estimated from how the images correct its predictions."""
 
-    enabled: bool = True
+    enabled: bool = expert(True)
     """Raise the IMU's noise densities while the images correct its predictions by more than these
     allow. Switch it off to use the densities of the calibration as they are, for example for an IMU
     without vibration whose noise was measured."""
@@ -43,7 +43,7 @@ class NoiseConfig(Settings):
     a data sheet, or if images contradict the state and runs diverge: the IMU then counts less."""
     adaptive: AdaptiveNoiseConfig = AdaptiveNoiseConfig()
     """White noise of the IMU that is estimated from how the images correct its predictions."""
-    gravity: float = Field(9.81, gt=0)
+    gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""
     max_imu_gap_s: float = expert(0.03, gt=0)
@@ -58,7 +58,7 @@ class NoiseConfig(Settings):
 class TriangulationConfig(Settings):
     """Which triangulated features are accepted."""
 
-    min_depth_m: float = Field(0.1, gt=0)
+    min_depth_m: float = expert(0.1, gt=0)
     """Smallest accepted depth in any camera, in metres. Raise it to ignore parts of the vehicle
     that the cameras see."""
     max_depth_m: float = Field(75.0, gt=0)
@@ -75,7 +75,7 @@ class TriangulationConfig(Settings):
 class GatingConfig(Settings):
     """Outlier rejection inside the back end."""
 
-    confidence: float = Field(0.95, gt=0, lt=1)
+    confidence: float = expert(0.95, gt=0, lt=1)
     """Share of the correct features that the χ² gate (Mahalanobis distance) accepts. Lower it if
     moving objects disturb the estimate; more correct features are then lost as well."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
@@ -137,7 +137,7 @@ class InitializationConfig(Settings):
     """auto: the state that comes with the data, or else a start from standstill or in motion,
     whichever is possible first. static, motion: only that one. given: only the state that comes
     with the data. groundtruth: the true state, to compare algorithms without their starts."""
-    motion_window_s: float = Field(1.5, gt=0)
+    motion_window_s: float = expert(1.5, gt=0)
     """Length of the window from which a start in motion is computed, in seconds. Raise it for slow
     or even motion, which determines scale and gravity only after a while: the start comes later,
     but is more accurate."""

@@ -75,7 +75,7 @@ class SquareRootEngine:
         self, window: Window, constructed: ConstructedCost, minimum: Minimum, report: StepReport
     ) -> None:
         report.costs = minimum.costs
-        report.columns = minimum.posterior.layout.size + window.archive.size
+        report.columns = minimum.posterior.layout.size + window.lost_features.size
         report.innovations = constructed.innovations_under(minimum.posterior)
         report.rejected = self._construction.rejected
 

@@ -39,7 +39,7 @@ class StepReport:
     Attributes:
         timings: seconds that each module took.
         costs: the cost before the first Gauss-Newton step and after each; empty if not known.
-        columns: dimension of the state, with the features that are put aside; 0 without costs.
+        columns: dimension of the state, with the features that are stored; 0 without costs.
         innovations: how far the measurements were from what was predicted.
         rejected: ids (N,) of the features that the gate rejected, ascending.
     """

@@ -28,7 +28,7 @@ from pydantic_core import PydanticCustomError
 from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
 from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
 from slam_graph.plugins import Choice
-from slam_graph.settings import Settings
+from slam_graph.settings import Settings, expert
 
 STATE_FEATURE_FRAMES = 10
 """Features seen in fewer frames are worth more when they are used once, with all observations."""
@@ -38,12 +38,16 @@ class CostPolicy(Settings):
     """Module 1: which variables and residuals are in the cost."""
 
     past_poses: Annotated[str, Choice(POSE_SELECTIONS)] = "most_recent"
-    """Which past poses stay in the cost beside the current IMU state."""
+    """Which past poses stay in the cost beside the current IMU state. most_recent: the latest ones.
+    evenly_spaced: also some of the far past, which helps in slow flight. keyframes: chosen by what
+    they see, so that hovering does not fill the window with one view."""
     max_past_poses: int = Field(11, ge=1)
-    """N_max: how many past poses at most (of `keyframes`: how many keyframes)."""
+    """N_max: how many past poses at most (of `keyframes`: how many keyframes). More poses mean less
+    drift, and time that grows faster than their number."""
     recent_frames: int = Field(1, ge=1)
     """How many of the last frames keep their velocity and bias; 1 is the current one only. The IMU
-    factors between them are linearised anew in every step."""
+    factors between them are linearised anew in every step. Raise it with `keyframes`, which need
+    IMU states between the keyframes and the current frame."""
     features: Annotated[str, Choice(FEATURE_POLICIES)] = "once"
     """What becomes of a feature that is not held in the state. once: used when its track ends, or
     when a pose that saw it leaves, with all its observations, and marginalised at once. state: not
@@ -51,20 +55,26 @@ class CostPolicy(Settings):
     until a pose that saw it leaves; then it becomes part of the prior, and starts anew if it is
     still tracked."""
     keep_lost_features: bool = False
-    """Whether features of the state that are no longer tracked are kept for when they come back."""
+    """Whether features of the state that are no longer tracked are kept for when they come back:
+    for front ends and simulations that recognise features."""
     max_state_features: int | None = Field(40, ge=0)
-    """How many features are held in the state while they are tracked; null for no bound."""
-    state_feature_frames: int | None = Field(None, ge=2)
+    """How many features are held in the state while they are tracked; null for no bound, 0 for the
+    textbook MSCKF. Long-lived features in the state lower the drift and cost time."""
+    state_feature_frames: int | None = expert(None, ge=2)
     """How many frames must have seen a feature before it may be held in the state; null for 10, or
     for as many as the past poses allow if these are fewer."""
-    state_feature_depth_error: float = Field(0.1, gt=0)
-    """… and the standard deviation of its depth, relative to it, must be less than this."""
+    state_feature_depth_error: float = expert(0.1, gt=0)
+    """Features are held in the state only if the standard deviation of their depth, relative to it,
+    is less than this."""
     max_features_per_step: int = Field(60, ge=1)
-    """How many features outside the state are in the cost of one step (longest tracks first)."""
+    """How many features outside the state are in the cost of one step (longest tracks first). Lower
+    it to save time, raise it for accuracy where many tracks end at once."""
     keyframe_overlap: float = Field(0.6, ge=0, le=1)
-    """A frame becomes a keyframe when the last one saw less than this share of its features."""
-    keyframe_parallax_rad: float = Field(0.05, ge=0)
-    """… or when it sees these from elsewhere: under a median angle of more than this."""
+    """A frame becomes a keyframe when the last keyframe saw less than this share of its features.
+    Higher values make more keyframes, and a window that is shorter in time."""
+    keyframe_parallax_rad: float = expert(0.05, ge=0)
+    """A frame also becomes a keyframe when the median angle between its rays and those of the last
+    keyframe to the same features is larger than this."""
 
     moved: ClassVar[Mapping[str, str]] = {
         "gate": "follows from 'features' now: each feature is tested when it enters the cost, and "
@@ -132,19 +142,22 @@ class GaussNewtonPolicy(Settings):
     """Module 2: how the cost is minimised."""
 
     max_steps: int = Field(1, ge=1)
-    """Number of steps at most."""
-    tolerance: float = Field(1e-6, ge=0)
+    """Number of steps at most: 1 makes a filter, several an iterated one. More steps help where the
+    start or the features are far from linear, and cost time."""
+    tolerance: float = expert(1e-6, ge=0)
     """Steps end when no tangent moves by more (with damping: when the cost falls by less, relative
     to its value)."""
     damping: Literal["none", "levenberg_marquardt"] = "none"
-    """Plain Gauss-Newton, or Levenberg-Marquardt."""
+    """Plain Gauss-Newton, or Levenberg-Marquardt, which repeats a step that raises the cost with
+    damping: use it with several steps."""
 
 
 class MarginalizationPolicy(Settings):
     """Module 3: what the variables that leave the cost leave behind."""
 
     first_estimates: bool = True
-    """First-estimates Jacobians for the variables of the prior."""
+    """First-estimates Jacobians for the variables of the prior. Without them the estimator becomes
+    too sure of heading and position; turn them off to see that."""
 
     moved: ClassVar[Mapping[str, str]] = {
         "absorb": "follows from the cost's 'features' and 'recent_frames' now; remove the line",
@@ -155,25 +168,25 @@ class SmootherPolicy(Settings):
     """How GTSAM's own smoothers are used, where one of them is the engine."""
 
     lag_s: float = Field(4.0, gt=0)
-    """How long states stay in a fixed lag; `isam2` keeps all, and starts features in it."""
-    spacing_s: float = Field(0.09, ge=0)
+    """How long states stay in a fixed lag (`isam2` keeps all). Longer: more accurate, slower."""
+    spacing_s: float = expert(0.09, ge=0)
     """Least time between two states in the graph; frames between them are predicted by the IMU."""
-    factorization: Literal["cholesky", "qr"] = "cholesky"
+    factorization: Literal["cholesky", "qr"] = expert("cholesky")
     """How variables are eliminated: fast, or with the square root of the condition number."""
-    relinearize_threshold: float = Field(0.01, gt=0)
+    relinearize_threshold: float = expert(0.01, gt=0)
     """Variables of which the tangent moved by more are linearised anew (iSAM2)."""
-    relinearize_skip: int = Field(1, ge=1)
+    relinearize_skip: int = expert(1, ge=1)
     """How many updates from one such check to the next (iSAM2)."""
-    max_iterations: int = Field(5, ge=1)
+    max_iterations: int = expert(5, ge=1)
     """Levenberg-Marquardt steps at most in one update (`fixed_lag_batch`)."""
-    max_features: int = Field(40, ge=1)
-    """How many features are tracked in the graph at once."""
-    robust_loss: Literal["none", "huber", "cauchy"] = "cauchy"
+    max_features: int = expert(40, ge=1)
+    """How many features are tracked in the graph at once: more are more accurate and slower."""
+    robust_loss: Literal["none", "huber", "cauchy"] = expert("cauchy")
     """Loss on reprojection residuals, instead of that of `backend.gating`: an outlier that is in
     the graph stays there, so its weight must be able to vanish."""
-    min_feature_frames: int = Field(5, ge=2)
+    min_feature_frames: int = expert(5, ge=2)
     """How many states must have seen a feature before it may become a variable."""
-    min_parallax_rad: float = Field(0.02, ge=0)
+    min_parallax_rad: float = expert(0.02, ge=0)
     """Smallest angle between two rays to such a feature."""
 
 

@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
-from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.geometry import NavState
@@ -23,7 +23,7 @@ def _no_ids() -> IntArray:
     return np.zeros(0, np.int64)
 
 
-def _no_landmarks() -> tuple[IntArray, FloatArray]:
+def _no_points() -> tuple[IntArray, FloatArray]:
     return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
@@ -41,11 +41,11 @@ class Window:
         moving: those of the past frames whose velocity and bias are in the state too, ascending.
         keyframes: those of the past frames that are keyframes.
         factors: GTSAM's factors that are not part of the prior yet.
-        features: ids (N,) of the features in the state, ascending.
-        archive: the features that were in the state and are known although they are not seen.
-        landmarks: ids (N,) and world positions (N, 3) of the features that are in the cost without
-            being in the state.
-        used: the same of all features that the last step estimated outside the state.
+        state_features: ids (N,) of the features in the state, ascending.
+        lost_features: the features that were in the state and are not tracked any more.
+        kept_points: ids (N,) and world positions (N, 3) of the features outside the state that stay
+            in the cost.
+        last_points: the same of all features that the last step estimated outside the state.
         calibration: keys of the parameters of the rig that are in the state.
     """
 
@@ -58,10 +58,10 @@ class Window:
     moving: list[int] = field(default_factory=list)
     keyframes: set[int] = field(default_factory=set)
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
-    features: IntArray = field(default_factory=_no_ids)
-    archive: FeatureArchive = field(default_factory=FeatureArchive)
-    landmarks: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
-    used: tuple[IntArray, FloatArray] = field(default_factory=_no_landmarks)
+    state_features: IntArray = field(default_factory=_no_ids)
+    lost_features: LandmarkStore = field(default_factory=LandmarkStore)
+    kept_points: tuple[IntArray, FloatArray] = field(default_factory=_no_points)
+    last_points: tuple[IntArray, FloatArray] = field(default_factory=_no_points)
     calibration: tuple[int, ...] = ()
 
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
@@ -89,17 +89,17 @@ class Window:
 
     def points(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of all features that the last step estimated."""
-        in_state = stacked_points(self.state.estimate, self.features.tolist())
-        ids, points = self.used
-        other = ~is_in(ids, self.features)
+        in_state = stacked_points(self.state.estimate, self.state_features.tolist())
+        ids, points = self.last_points
+        other = ~is_in(ids, self.state_features)
         return (
-            np.concatenate([self.features, ids[other]]),
+            np.concatenate([self.state_features, ids[other]]),
             np.concatenate([in_state, points[other]]),
         )
 
     def recall_features(self) -> None:
-        """Make variables again of the features that the current frame sees and the archive has."""
-        again = self.archive.due(self.tracks.seen)
+        """Make variables again of the features that the current frame sees and the store has."""
+        again = self.lost_features.due(self.tracks.seen)
         if len(again):
-            self.prior = self.archive.recall(again, self.prior, self.state)
-            self.features = np.union1d(self.features, again)
+            self.prior = self.lost_features.recall(again, self.prior, self.state)
+            self.state_features = np.union1d(self.state_features, again)

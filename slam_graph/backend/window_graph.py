@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -86,17 +85,15 @@ class WindowGraph:
         length = np.linalg.norm(factor.unwhitenedError(values)) / sigma
         return float(loss.weights(np.array([length]))[0])
 
-    def save(self, folder: Path | str) -> list[Path]:
-        """Write `graph.txt` and `values.txt`, GTSAM's own serialisation, and `graph.dot`.
+    def texts(self) -> dict[str, str]:
+        """Graph and values in GTSAM's own serialisation, and a drawing of the graph for Graphviz.
 
         Factors that are computed in Python (of calibration variables, and of camera models that
-        GTSAM does not have) cannot be written; their linearisation stands for them.
+        GTSAM does not have) cannot be serialised; their linearisation stands for them.
 
         Returns:
-            the files.
+            contents by name: `graph.txt`, `values.txt`, `graph.dot`.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
         graph = gtsam.NonlinearFactorGraph()
         for number in range(self.graph.size()):
             factor = self.graph.at(number)
@@ -104,14 +101,11 @@ class WindowGraph:
                 linear = gtsam.JacobianFactor(factor.linearize(self.values))
                 factor = gtsam.LinearContainerFactor(linear, self.values)
             graph.push_back(factor)
-        texts = {
+        return {
             "graph.txt": graph.serialize(),
             "values.txt": self.values.serialize(),
             "graph.dot": self.graph.dot(self.values),
         }
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        return [folder / name for name in texts]
 
 
 def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
@@ -132,14 +126,14 @@ def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
         losses.append(None)
     loss = cost.robust
     projections = _Projections(cost.rig, cost.state, sigma_px, loss)
-    if cost.tracked is not None:
-        projections.add(graph, cost.tracked)
-    if cost.fresh is not None:
-        for j, point in zip(cost.fresh.obs.ids.tolist(), cost.fresh.points, strict=True):
+    if cost.landmarks is not None:
+        projections.add(graph, cost.landmarks)
+    if cost.tracks is not None:
+        for j, point in zip(cost.tracks.obs.ids.tolist(), cost.tracks.points, strict=True):
             if not values.exists(L(j)):
                 values.insert(L(j), point)
                 first.insert(L(j), point)
-        projections.add(graph, cost.fresh.obs)
+        projections.add(graph, cost.tracks.obs)
     robust = None if loss.name == "none" else loss
     losses += [robust] * (graph.size() - len(losses))
     return WindowGraph(graph, values, first, tuple(losses))

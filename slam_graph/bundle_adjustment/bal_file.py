@@ -58,7 +58,7 @@ def read_bal(path: Path | str) -> BalProblem:
     """Read a problem.
 
     Args:
-        path: of a text file, or of one compressed by bzip2 whose name ends with `.bz2`.
+        path: of a text file, plain or compressed by bzip2.
 
     Raises:
         DataError: naming file and line, if the file cannot be read or unpacked, is cut short or too

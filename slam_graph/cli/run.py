@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as SequenceOf
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,6 +82,16 @@ def run(
             show_default=False,
         ),
     ] = None,
+    save_graph: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--save-graph",
+            metavar="STAMP",
+            help="Save the factor graph of the back end at this time, repeatable: seconds after "
+            "the first frame, or a stamp in ns. Files for GTSAM and Graphviz.",
+            show_default=False,
+        ),
+    ] = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -110,7 +121,9 @@ def run(
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
-        result, folder, files = execute(sequence, settings, output, rerun, progress, log)
+        result, folder, files = execute(
+            sequence, settings, output, rerun, progress, log, graph_times=save_graph or ()
+        )
     report(result, folder, files, as_json)
 
 
@@ -135,6 +148,7 @@ def execute(
     progress: bool,
     log: list[str],
     known_map: SlamMap | None = None,
+    graph_times: SequenceOf[float] = (),
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
     from slam_graph.pipeline import run as run_pipeline
@@ -145,7 +159,12 @@ def execute(
         viewer = _viewer(rerun, folder, sequence.info().name)
         with _progress(sequence, settings, progress) as bar:
             result = run_pipeline(
-                sequence, settings, viewer=viewer, progress=bar, known_map=known_map
+                sequence,
+                settings,
+                viewer=viewer,
+                progress=bar,
+                known_map=known_map,
+                graph_times=graph_times,
             )
         files = result.save(folder)
         if rerun == "save":

@@ -97,14 +97,14 @@ class FrontendConfig(Settings):
     """Number of features aimed at in the first camera; the other cameras look for these same ones.
     More make the estimate less dependent on single ones, and cost time in front and back end."""
 
-    grid: tuple[PositiveCount, PositiveCount] = (8, 6)
+    grid: tuple[PositiveCount, PositiveCount] = expert((8, 6))
     """Columns and rows of the grid over which features are spread evenly. Fit it to the shape of
     the image; with fewer cells features crowd where the texture is strongest."""
 
-    min_distance_px: PositivePixels = 12.0
+    min_distance_px: PositivePixels = expert(12.0)
     """Least distance of a new feature from every other one. Scale it with the resolution."""
 
-    prediction: Literal["none", "flow", "gyroscope", "state"] = "gyroscope"
+    prediction: Literal["none", "flow", "gyroscope", "state"] = expert("gyroscope")
     """Where the search for a feature begins. none: where it was; flow: moved on as in the last
     frame; gyroscope: the same with the rotation that the gyroscope measured; state: where the
     state and the map of the back end place it. Use `flow` if gyroscope or extrinsics are poor."""
@@ -118,7 +118,7 @@ class FrontendConfig(Settings):
     """Largest epipolar distance of an inlier between two frames; null is 1 px for `klt` and 1.5 px
     for descriptors. Raise it for a poor calibration, if many features are `rejected_ransac`."""
 
-    equalization: Literal["none", "histogram", "clahe"] = "none"
+    equalization: Literal["none", "histogram", "clahe"] = expert("none")
     """Contrast equalization of every image: none, of the whole histogram, or adaptive (CLAHE). Try
     `clahe` where images are dark or of low contrast and few features are found."""
 

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
+from slam_graph.frontend.imu_motion import ImuMotion
 from slam_graph.frontend.keypoints import Pixels, Tracks
-from slam_graph.frontend.motion import ImuMotion
 from slam_graph.sensors import RigCamera
 
 NEAREST_DEPTH_M = 0.1

@@ -7,8 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import Field
-
 from slam_graph.settings import Settings, expert
 
 
@@ -29,10 +27,10 @@ class KeyframeConfig(Settings):
         triangulation="TRIANGULATION",
     )
 
-    distance_m: float = Field(0.5, gt=0)
+    distance_m: float = expert(0.5, gt=0)
     """Distance from the last keyframe at which a frame becomes one. Less where flights stay within
     a metre or two, or maps are to be merged; more for large scenes, to save time and memory."""
-    angle_rad: float = Field(0.35, gt=0)
+    angle_rad: float = expert(0.35, gt=0)
     """Rotation from the last keyframe at which a frame becomes one; change it with distance_m."""
     min_common_features: float = expert(0.5, ge=0, le=1)
     """A frame that sees less than this part of the last keyframe's features becomes one."""

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as SequenceOf
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.maps import SlamMap
 from slam_graph.pipeline.estimation import Estimation
+from slam_graph.pipeline.graphs import GraphKeeping
 from slam_graph.pipeline.localization import Localization
 from slam_graph.pipeline.loops import Keyframes, LoopClosing
 from slam_graph.pipeline.map import MapBuilding
@@ -41,6 +43,7 @@ def run(
     recorder: Recorder | None = None,
     known_map: SlamMap | None = None,
     *,
+    graph_times: SequenceOf[float] = (),
     overrides: Iterable[str] | Mapping[str, Any] = (),
     **options: Any,
 ) -> RunResult:
@@ -59,6 +62,8 @@ def run(
         progress: reports how far the run is.
         recorder: records the front end's output, for a replay.
         known_map: a map to locate every frame in, beside the estimate in the run's own world.
+        graph_times: when to keep the factor graph of the back end, in seconds after the first frame
+            or stamps in ns; `RunResult.graphs` has them.
         overrides: changes of the settings, as for `load_config`.
         options: top-level settings by name, as for `load_config`: `algorithm`, `duration_s`, …
 
@@ -73,6 +78,7 @@ def run(
     estimation = Estimation(sequence, result)
     watchers = (viewer or NullViewer(), progress or NullProgress(), recorder or NullRecorder())
     stages = _stages(sequence, result, watchers, known_map)
+    stages += [GraphKeeping(result, estimation.estimator, graph_times, sequence.diagnostics)]
 
     with ExitStack() as resources:
         with (

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend import WindowGraph
 from slam_graph.config import RunConfig, dump_yaml
 from slam_graph.datasets import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
@@ -96,6 +97,7 @@ class RunResult:
         loops: loop closures, if loops were to be closed.
         slam_map: the map, if one was to be built.
         localization: poses in a known map, if there was one.
+        graphs: factor graphs of the back end by the stamps (ns) of their frames, if asked for.
         warnings: counted faults and rejections.
     """
 
@@ -109,6 +111,7 @@ class RunResult:
     loops: LoopClosures | None = None
     slam_map: SlamMap | None = None
     localization: LocalizationLog | None = None
+    graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
     def __repr__(self) -> str:
@@ -273,6 +276,9 @@ class RunResult:
         if calibrated is not None:
             write_kalibr(calibrated.rig, files.path("calibration_estimated.yaml"))
             files.text("calibration.csv", self.logs.calibration.csv_lines())
+        for stamp_ns, graph in self.graphs.items():
+            for name, text in graph.texts().items():
+                files.text(f"graph_{stamp_ns}_{name}", [text])
         self._draw(files)
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for
             save_map(self.slam_map, files.path(MAP_NAME), force=True)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +91,8 @@ def _part(truth: Trajectory, start_ns: int, end_ns: int, path: Path) -> Trajecto
     if min(rows.stop, len(truth)) - rows.start < 2:
         raise DataError(f"{path}: the trajectory ends before start_s")
     columns: dict[str, Any] = {
-        name: values[rows]
-        for name in Trajectory.__dataclass_fields__
-        if (values := getattr(truth, name)) is not None
+        field.name: values[rows]
+        for field in fields(Trajectory)
+        if (values := getattr(truth, field.name)) is not None
     }
     return Trajectory(**columns)

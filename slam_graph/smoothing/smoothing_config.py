@@ -7,8 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import Field
-
 from slam_graph.settings import Settings, expert
 
 
@@ -26,10 +24,10 @@ class FinalBaConfig(Settings):
     enabled: bool = True
     """Whether a run ends with it and writes trajectory_smoothed.tum. Turn it off to save time where
     only the causal trajectory matters."""
-    keyframe_spacing_s: float = Field(0.2, gt=0)
+    keyframe_spacing_s: float = expert(0.2, gt=0)
     """Longest time between two keyframes. Shorter follows fast motion better and takes longer in
     proportion; longer is for slow platforms."""
-    robust_width: float = Field(2.45, gt=0)
+    robust_width: float = expert(2.45, gt=0)
     """Whitened residual beyond which the robust loss grows more slowly than the square (2.45: the
     95 % circle). Less where many observations are outliers."""
     robust_loss: Literal["none", "huber", "cauchy"] = expert("huber")

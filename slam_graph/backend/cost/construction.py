@@ -12,18 +12,17 @@ in the `ConstructedCost`; `marginalize_step` carries it out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.cost import Cost, Linearization, NewFeatures
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES, WaitingTracks
+from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
+from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
+from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
 from slam_graph.backend.cost.feature_tracks import (
-    FeatureTracks,
     Observations,
     Outcome,
     Removals,
@@ -33,7 +32,6 @@ from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM
@@ -43,10 +41,6 @@ from slam_graph.errors import EstimationError
 
 MAX_FAILURES = 3
 """Features that are outliers in this many consecutive frames are treated as dynamic."""
-RETRY_FRAMES = 4
-"""Candidates for the state beyond those with the longest tracks are tried one frame in so many."""
-MIN_FRAMES = 2
-"""A feature must be seen in this many frames to be used."""
 
 
 @dataclass(eq=False)
@@ -59,7 +53,7 @@ class ConstructedCost:
         poses: which past poses stay.
         moving: the past frames whose velocity and bias stay too.
         features: ids of the features that stay in the state, ascending.
-        leaving: (J,) those of the cost's new features that become part of the prior.
+        leaving: (J,) those of the cost's tracks that become part of the prior.
         keep_lost_features: whether features that leave the state are kept for when they are seen
             again.
         removals: observations that go without being used.
@@ -94,8 +88,8 @@ class ConstructedCost:
 
     def without_features(self, window: Window) -> ConstructedCost:
         """The same step on prior and dynamics alone; the observations go on waiting."""
-        cost = replace(self.cost, state=window.state.copy(), tracked=None, fresh=None)
-        known = is_in(self.features, window.features)
+        cost = replace(self.cost, state=window.state.copy(), landmarks=None, tracks=None)
+        known = is_in(self.features, window.state_features)
         none = np.zeros(0, np.bool_)
         return replace(
             self,
@@ -107,28 +101,6 @@ class ConstructedCost:
             predicted=None,
             innovations=Innovations(),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidates:
-    """Features outside the state that may be in the cost, ascending ids.
-
-    Attributes:
-        used: (J,) those that the feature policy asks for.
-        lasting: (K,) long-lived ones that may become variables of the state: more than there is
-            room for, because only their positions tell which are worth it. A dynamic object may
-            have the longest tracks, and must not stand in the way of others.
-        lengths: (K,) number of frames that see each lasting one.
-    """
-
-    used: IntArray
-    lasting: IntArray
-    lengths: IntArray
-
-    def entering(self, worthy: IntArray, room: int) -> IntArray:
-        """New variables: the longest tracks of the lasting ones that are worthy (ascending ids)."""
-        rows = is_in(self.lasting, worthy)
-        return _longest(self.lasting[rows], self.lengths[rows], room)
 
 
 class CostConstruction:
@@ -151,6 +123,7 @@ class CostConstruction:
         self.diagnostics = diagnostics
         self.rejected = np.zeros(0, np.int64)
         self._features = FEATURE_POLICIES[policy.features]
+        self._selection = FeatureSelection(policy, rig, config, diagnostics)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.robust_loss)
         self._failures: dict[int, int] = {}
@@ -169,18 +142,22 @@ class CostConstruction:
         removals = Removals()
         if still:
             poses = PoseSelection(window.past[:-1], keyframes=frozenset(window.keyframes))
-            removals.add_features(Outcome.STANDSTILL, window.features)
-            return self._constructed(window, cost, poses, window.features, removals)
+            removals.add_features(Outcome.STANDSTILL, window.state_features)
+            return self._constructed(window, cost, poses, window.state_features, removals)
         poses = self._selected_poses(window)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
-        in_state = np.intersect1d(window.features, window.tracks.ids_waiting(), True)
-        cost.tracked = window.tracks.observations(in_state)
-        cost.fresh = self._new_features(window, poses, len(in_state), removals)
+        in_state = np.intersect1d(window.state_features, window.tracks.ids_waiting(), True)
+        cost.landmarks = window.tracks.observations(in_state)
+        cost.tracks = self._selection.new_features(
+            window, poses, len(in_state), self._dynamic, removals
+        )
         gate, linear = self._gated(window, cost, predicted, removals)
         if not self._features.relinearized:
             # a pose that no waiting observation refers to has nothing more to give
-            used = np.ones(len(cost.fresh.points) if cost.fresh is not None else 0, np.bool_)
-            gone = np.unique(np.concatenate([removals.ids(), window.features, cost.ids_of(used)]))
+            used = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)
+            gone = np.unique(
+                np.concatenate([removals.ids(), window.state_features, cost.ids_of(used)])
+            )
             useful = window.tracks.frames(without=gone)
             poses = replace(poses, kept=[i for i in poses.kept if i in useful])
         features = self._in_state(window, cost)
@@ -210,7 +187,7 @@ class CostConstruction:
         count = self.policy.recent_frames - 1
         recent = set(window.past[-count:]) if count else set()
         moving = [i for i in window.moving if i in recent and i in poses.kept]
-        keep_lost = self.policy.keep_lost_features and window.archive.open
+        keep_lost = self.policy.keep_lost_features and window.lost_features.open
         none = np.zeros(0, np.bool_)
         return ConstructedCost(cost, None, poses, moving, features, none, keep_lost, removals)
 
@@ -223,11 +200,11 @@ class CostConstruction:
         not become a variable of the state yet.
         """
         cost = constructed.cost
-        if not self._features.relinearized or cost.fresh is None:
+        if not self._features.relinearized or cost.tracks is None:
             return
-        obs = cost.fresh.obs
+        obs = cost.tracks.obs
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
-        fits = cost.squared_errors(obs, cost.fresh.points) < limit
+        fits = cost.squared_errors(obs, cost.tracks.points) < limit
         self.rejected = np.union1d(self.rejected, obs.ids[obs.feature[~fits]])
         self._count_failures(window, obs, fits)
         constructed.removals.add_observations(Outcome.OUTLIER, obs.rows(~fits))
@@ -237,19 +214,19 @@ class CostConstruction:
         constructed.innovations = replace(
             before, tested=before.tested + len(fits), rejected=before.rejected + rejected
         )
-        cost.fresh = replace(cost.fresh, obs=obs.rows(fits))
-        alone = cost.fresh.obs.counts < 2
+        cost.tracks = replace(cost.tracks, obs=obs.rows(fits))
+        alone = cost.tracks.obs.counts < 2
         constructed.removals.add_features(Outcome.OUTLIER, obs.ids[constructed.leaving & alone])
-        spoiled = cost.fresh.in_state & (np.bincount(obs.feature[~fits], None, len(obs.ids)) > 0)
+        spoiled = cost.tracks.in_state & (np.bincount(obs.feature[~fits], None, len(obs.ids)) > 0)
         if spoiled.any():
-            self._postpone(constructed, cost.fresh, spoiled)
+            self._postpone(constructed, cost.tracks, spoiled)
 
     def _postpone(
-        self, constructed: ConstructedCost, fresh: NewFeatures, spoiled: BoolArray
+        self, constructed: ConstructedCost, tracks: TrackFeatures, spoiled: BoolArray
     ) -> None:
         """Leave features (J,) that were to enter the state outside of it."""
-        cost, ids = constructed.cost, fresh.obs.ids[spoiled]
-        cost.fresh = replace(fresh, in_state=fresh.in_state & ~spoiled)
+        cost, ids = constructed.cost, tracks.obs.ids[spoiled]
+        cost.tracks = replace(tracks, in_state=tracks.in_state & ~spoiled)
         cost.state.remove(L(int(j)) for j in ids)
         constructed.features = constructed.features[~is_in(constructed.features, ids)]
         constructed.leaving = constructed.leaving & ~spoiled
@@ -273,84 +250,6 @@ class CostConstruction:
         ids = [j for j, n in self._failures.items() if n >= MAX_FAILURES]
         return np.array(sorted(ids), np.int64)
 
-    # --- features --------------------------------------------------------------------------------
-
-    def _new_features(
-        self,
-        window: Window,
-        poses: PoseSelection,
-        in_state: int,
-        removals: Removals,
-    ) -> NewFeatures | None:
-        """Triangulated features that are in the cost with all of their observations.
-
-        Args:
-            window: with all waiting observations.
-            poses: which past poses stay.
-            in_state: number of features of the state that the current frame sees.
-            removals: gets the observations that go without being in the cost.
-        """
-        bound = self.policy.max_state_features
-        room = len(window.tracks.seen) if bound is None else bound - in_state
-        choice = self._candidates(window, poses, room, removals)
-        ids = np.union1d(choice.used, choice.lasting)
-        if len(ids) == 0:
-            return None
-        obs = window.tracks.observations(ids)
-        lasting = is_in(ids, choice.lasting)
-        points, good = self._points(window, obs, lasting)
-        entering = is_in(ids, choice.entering(ids[good], room))
-        # a lasting one that is not good may yet become so
-        used = is_in(ids, choice.used) & ~entering & (~lasting | good)
-        lost = used & ~good
-        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(lost))
-        if not self._features.relinearized:
-            removals.add_features(Outcome.NOT_TRIANGULATED, ids[lost])
-        return NewFeatures(obs, points, entering).subset(good & (entering | used))
-
-    def _candidates(
-        self, window: Window, poses: PoseSelection, room: int, removals: Removals
-    ) -> _Candidates:
-        """The features that may be in the cost, where `room` more may be held in the state."""
-        tracks, policy = window.tracks, self.policy
-        ids, lengths = tracks.lengths()
-        removals.add_features(Outcome.DYNAMIC, self._dynamic)
-        outside = ~is_in(ids, window.features) & ~is_in(ids, self._dynamic)
-        ids, lengths = ids[outside], lengths[outside]
-        live = is_in(ids, tracks.seen)
-        lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
-        lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
-            (ids + window.frame) % RETRY_FRAMES == 0
-        )
-        leaving = is_in(ids, _seen_by_leaving(tracks, window.past, poses))
-        due = self._features.due(WaitingTracks(ids, lengths, live, leaving))
-        due = due & (lengths >= MIN_FRAMES)
-        if self._features.drops_ended:
-            removals.add_features(Outcome.ENDED, ids[~live & ~due])
-        used = _longest(ids[due], lengths[due], policy.max_features_per_step)
-        return _Candidates(used, ids[lasting], lengths[lasting])
-
-    def _points(
-        self, window: Window, obs: Observations, lasting: BoolArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """Positions (J, 3) of features, those of the last step where there are, and their worth."""
-        known_ids, known_points = window.landmarks
-        good = is_in(obs.ids, known_ids)
-        points = np.zeros((len(obs.ids), 3))
-        points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
-        here = window.state.estimate.atPose3(X(window.frame)).translation()
-        # steps may have sent a feature with little parallax to infinity
-        good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
-        if not good.all():
-            new, rig = ~good, self.rig.at(window.state)
-            poses = rig.poses(window.state.estimate, obs.frames)
-            observed = rig.renormalized(obs.subset(new))
-            result = triangulate(observed, rig, *poses, self.config.triangulation)
-            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
-            known = noise * result.depth_error < self.policy.state_feature_depth_error
-            points[new], good[new] = result.points, result.good & (known | ~lasting[new])
-        return points, good
-
     # --- the gate --------------------------------------------------------------------------------
 
     def _gated(
@@ -367,16 +266,19 @@ class CostConstruction:
         """
         linear = cost.linearize()
         gate = cost.gate(linear, predicted)
-        if self._features.relinearized and cost.fresh is not None:
-            entered = is_in(cost.fresh.obs.ids, window.landmarks[0])
-            passed = gate.fresh | entered
-            dof = np.append(2 * cost.fresh.obs.counts[passed] - POINT_DIM, 2 * np.sum(gate.tracked))
+        if self._features.relinearized and cost.tracks is not None:
+            entered = is_in(cost.tracks.obs.ids, window.kept_points[0])
+            passed = gate.tracks | entered
+            dof = np.append(
+                2 * cost.tracks.obs.counts[passed] - POINT_DIM,
+                2 * np.sum(gate.landmarks),
+            )
             innovations = replace(
                 Innovations.untested(dof),
-                tested=int(np.sum(~entered)) + len(gate.tracked),
-                rejected=int(np.sum(~passed) + np.sum(~gate.tracked)),
+                tested=int(np.sum(~entered)) + len(gate.landmarks),
+                rejected=int(np.sum(~passed) + np.sum(~gate.landmarks)),
             )
-            gate = replace(gate, fresh=passed, innovations=innovations)
+            gate = replace(gate, tracks=passed, innovations=innovations)
         return gate, self._leave_out(cost, linear, gate, removals)
 
     def _leave_out(
@@ -384,52 +286,40 @@ class CostConstruction:
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
         self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
-        if linear.tracked is not None and cost.tracked is not None:
-            bad = cost.tracked.rows(~gate.tracked)
+        if linear.landmarks is not None and cost.landmarks is not None:
+            bad = cost.landmarks.rows(~gate.landmarks)
             self.rejected = np.union1d(self.rejected, bad.ids[bad.feature])
             removals.add_observations(Outcome.GATED, bad)
-            cost.tracked = cost.tracked.rows(gate.tracked)
-        if linear.fresh is not None and cost.fresh is not None:
-            bad_ids = cost.fresh.obs.ids[~gate.fresh]
+            cost.landmarks = cost.landmarks.rows(gate.landmarks)
+        if linear.tracks is not None and cost.tracks is not None:
+            bad_ids = cost.tracks.obs.ids[~gate.tracks]
             self.rejected = np.union1d(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
-            cost.fresh = cost.fresh.subset(gate.fresh)
-            for row in np.flatnonzero(cost.fresh.in_state):
-                cost.state.insert_point(int(cost.fresh.obs.ids[row]), cost.fresh.points[row])
-        return linear.subset(gate.tracked, gate.fresh)
+            cost.tracks = cost.tracks.subset(gate.tracks)
+            for row in np.flatnonzero(cost.tracks.in_state):
+                cost.state.insert_point(int(cost.tracks.obs.ids[row]), cost.tracks.points[row])
+        return linear.subset(gate.landmarks, gate.tracks)
 
     # --- what stays ------------------------------------------------------------------------------
 
     def _in_state(self, window: Window, cost: Cost) -> IntArray:
         """The features that stay in the state: those that are tracked, old and new, or all."""
         ids = np.zeros(0, np.int64)
-        if cost.tracked is not None:
-            ids = np.unique(cost.tracked.ids[cost.tracked.feature])
+        if cost.landmarks is not None:
+            ids = np.unique(cost.landmarks.ids[cost.landmarks.feature])
         if self.policy.keep_lost_features:
-            ids = window.features
-            if window.archive.open:
+            ids = window.state_features
+            if window.lost_features.open:
                 ids = ids[is_in(ids, window.tracks.seen)]
-        if cost.fresh is not None:
-            ids = np.union1d(ids, cost.fresh.obs.ids[cost.fresh.in_state])
+        if cost.tracks is not None:
+            ids = np.union1d(ids, cost.tracks.obs.ids[cost.tracks.in_state])
         return ids
 
     def _leaving(self, window: Window, cost: Cost, poses: PoseSelection) -> BoolArray:
         """Which new features (J,) become part of the prior: all, or those that lose a pose."""
-        if cost.fresh is None:
+        if cost.tracks is None:
             return np.zeros(0, np.bool_)
         if not self._features.relinearized:
-            return np.ones(len(cost.fresh.points), np.bool_)
-        seen = _seen_by_leaving(window.tracks, window.past, poses)
-        return cost.fresh.in_state | is_in(cost.fresh.obs.ids, seen)
-
-
-def _seen_by_leaving(tracks: FeatureTracks, past: Sequence[int], poses: PoseSelection) -> IntArray:
-    """The features, ascending, that poses saw which leave and do not drop their observations."""
-    leaving = [i for i in past if i not in poses.kept and i not in poses.dropped]
-    return tracks.ids_in_any(leaving)
-
-
-def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:
-    """The `count` features with the longest tracks, ascending ids."""
-    order = np.argsort(-lengths, kind="stable")[:count]
-    return np.sort(ids[order])
+            return np.ones(len(cost.tracks.points), np.bool_)
+        seen = seen_by_leaving(window.tracks, window.past, poses)
+        return cost.tracks.in_state | is_in(cost.tracks.obs.ids, seen)

@@ -3,9 +3,8 @@
 """The cost: residuals as a function of the variables, their linearisation and their gate.
 
 The cost is the sum of the marginal prior, factors of GTSAM (IMU, zero velocity), single
-observations of features that are in the state, and whole tracks of features that enter it now. A
-new feature either becomes a variable of the state or is used once, that is, marginalised as soon as
-it is linearised.
+observations of features that are in the state, and whole tracks of others. One of these either
+becomes a variable of the state or is marginalised as soon as it is linearised.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.schur import CondensedFeatures, condense_features
+from slam_graph.backend.cost.schur import SummedFeatures, sum_features
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NewFeatures:
+class TrackFeatures:
     """Features that enter the cost in this step with all of their observations.
 
     Attributes:
@@ -49,9 +48,9 @@ class NewFeatures:
     points: FloatArray
     in_state: BoolArray
 
-    def subset(self, keep: BoolArray) -> NewFeatures:
+    def subset(self, keep: BoolArray) -> TrackFeatures:
         """The features where `keep` (J,) holds."""
-        return NewFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
+        return TrackFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,18 +58,18 @@ class Linearization:
     """The cost, linear in an increment of the tangents.
 
     Attributes:
-        tracked: observations of the features of the state.
-        fresh: new features: their rows apart, as the gate needs them, or summed up.
+        landmarks: observations of the features of the state.
+        tracks: features outside the state: their rows apart, as the gate needs them, or summed up.
     """
 
-    tracked: WhitenedObservations | None
-    fresh: ReducedFeatures | CondensedFeatures | None
+    landmarks: WhitenedObservations | None
+    tracks: ReducedFeatures | SummedFeatures | None
 
-    def subset(self, tracked: BoolArray, fresh: BoolArray) -> Linearization:
-        """The tracked observations (N,), and of new features (J,) that are apart those, kept."""
+    def subset(self, landmarks: BoolArray, tracks: BoolArray) -> Linearization:
+        """Some of the landmark observations (N,) and, unless summed up, of the tracks (J,)."""
         return Linearization(
-            self.tracked.subset(tracked) if self.tracked is not None else None,
-            self.fresh.subset(fresh) if isinstance(self.fresh, ReducedFeatures) else self.fresh,
+            self.landmarks.subset(landmarks) if self.landmarks is not None else None,
+            self.tracks.subset(tracks) if isinstance(self.tracks, ReducedFeatures) else self.tracks,
         )
 
 
@@ -85,8 +84,8 @@ class Cost:
         prior: what was marginalised before, over the offsets from the linearisation points; its
             variables must be frozen.
         factors: GTSAM's factors between the variables.
-        tracked: observations of features that are in the state already.
-        fresh: features that enter now.
+        landmarks: observations of features that are variables of the state.
+        tracks: features outside the state, with whole tracks.
         loss: on reprojection residuals; None for that of the settings.
     """
 
@@ -95,8 +94,8 @@ class Cost:
     config: BackendConfig
     prior: SquareRootInformation
     factors: Sequence[gtsam.NonlinearFactor] = field(default_factory=list)
-    tracked: Observations | None = None
-    fresh: NewFeatures | None = None
+    landmarks: Observations | None = None
+    tracks: TrackFeatures | None = None
     loss: RobustLoss | None = None
 
     @property
@@ -107,12 +106,12 @@ class Cost:
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
-        if self.tracked is not None:
-            keys += self.rig.keys_of(self.tracked)
-            keys += [L(j) for j in np.unique(self.tracked.ids[self.tracked.feature]).tolist()]
-        if self.fresh is not None:
-            keys += self.rig.keys_of(self.fresh.obs)
-            keys += [L(j) for j in self.fresh.obs.ids[self.fresh.in_state].tolist()]
+        if self.landmarks is not None:
+            keys += self.rig.keys_of(self.landmarks)
+            keys += [L(j) for j in np.unique(self.landmarks.ids[self.landmarks.feature]).tolist()]
+        if self.tracks is not None:
+            keys += self.rig.keys_of(self.tracks.obs)
+            keys += [L(j) for j in self.tracks.obs.ids[self.tracks.in_state].tolist()]
         return self.prior.layout.extended(
             dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
         )
@@ -123,21 +122,21 @@ class Cost:
         layout = self.layout()
         return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
 
-    def part(self, factors: Sequence[gtsam.NonlinearFactor], fresh: BoolArray) -> Cost:
+    def part(self, factors: Sequence[gtsam.NonlinearFactor], tracks: BoolArray) -> Cost:
         """The prior and the features of the state, with some of the factors and new features (J,).
 
         Observations of features of the state are never linearised again, so no part is without
         them. New features that fewer than two observations are left of are left out.
         """
         features = None
-        if self.fresh is not None:
-            features = self.fresh.subset(fresh & (self.fresh.obs.counts > 1))
+        if self.tracks is not None:
+            features = self.tracks.subset(tracks & (self.tracks.obs.counts > 1))
             features = replace(features, obs=features.obs.without_idle_frames())
-        return replace(self, factors=factors, fresh=features)
+        return replace(self, factors=factors, tracks=features)
 
-    def ids_of(self, fresh: BoolArray) -> IntArray:
+    def ids_of(self, tracks: BoolArray) -> IntArray:
         """Ids, ascending, of some of the new features (J,)."""
-        return self.fresh.obs.ids[fresh] if self.fresh is not None else np.zeros(0, np.int64)
+        return self.tracks.obs.ids[tracks] if self.tracks is not None else np.zeros(0, np.int64)
 
     def value(self) -> float:
         """The cost at the current estimates: half the squared residuals, under the robust loss."""
@@ -145,10 +144,10 @@ class Cost:
         total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
         total += 0.5 * self.prior.residual
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
-        if self.tracked is not None and len(self.tracked):
-            total += self._loss(self.tracked, None)
-        if self.fresh is not None and len(self.fresh.obs):
-            total += self._loss(self.fresh.obs, self.fresh.points)
+        if self.landmarks is not None and len(self.landmarks):
+            total += self._loss(self.landmarks, None)
+        if self.tracks is not None and len(self.tracks.obs):
+            total += self._loss(self.tracks.obs, self.tracks.points)
         return total
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
@@ -177,14 +176,14 @@ class Cost:
                 needs them.
         """
         self.state.relinearize()
-        tracked = fresh = None
-        if self.tracked is not None and len(self.tracked):
-            tracked = self._whitened(self.tracked, None)
-        if self.fresh is not None and len(self.fresh.obs):
-            whitened = self._whitened(self.fresh.obs, self.fresh.points)
-            reduce = condense_features if summed else reduce_features
-            fresh = reduce(self.fresh.obs, whitened)
-        return Linearization(tracked, fresh)
+        landmarks = tracks = None
+        if self.landmarks is not None and len(self.landmarks):
+            landmarks = self._whitened(self.landmarks, None)
+        if self.tracks is not None and len(self.tracks.obs):
+            whitened = self._whitened(self.tracks.obs, self.tracks.points)
+            reduce = sum_features if summed else reduce_features
+            tracks = reduce(self.tracks.obs, whitened)
+        return Linearization(landmarks, tracks)
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
         rig = self.rig.at(self.state)
@@ -222,33 +221,33 @@ class Cost:
     def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of all observations."""
         parts = [np.zeros((0, layout.size + 1))]
-        if linear.tracked is not None and self.tracked is not None:
-            columns = self._tracked_columns(self.tracked, layout)
-            parts.append(_tracked_rows(linear.tracked, columns, layout))
-        if linear.fresh is not None and self.fresh is not None:
-            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
-            parts.append(_null_space_rows(linear.fresh, columns, layout))
-            parts.append(_new_variable_rows(self.fresh, linear.fresh, columns, layout))
+        if linear.landmarks is not None and self.landmarks is not None:
+            columns = self._state_columns(self.landmarks, layout)
+            parts.append(_state_rows(linear.landmarks, columns, layout))
+        if linear.tracks is not None and self.tracks is not None:
+            columns = layout.indices(self.rig.keys_of(self.tracks.obs))
+            parts.append(_null_space_rows(linear.tracks, columns, layout))
+            parts.append(_new_variable_rows(self.tracks, linear.tracks, columns, layout))
         return np.concatenate(parts)
 
     # --- moving --------------------------------------------------------------------------------
 
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the estimates by an increment (n,), and the new features with them."""
-        if self.fresh is not None and linear.fresh is not None:
-            columns = layout.indices(self.rig.keys_of(self.fresh.obs))
-            step = linear.fresh.point_increments(delta[columns])
-            self.fresh = replace(self.fresh, points=self.fresh.points + step)
+        if self.tracks is not None and linear.tracks is not None:
+            columns = layout.indices(self.rig.keys_of(self.tracks.obs))
+            step = linear.tracks.point_increments(delta[columns])
+            self.tracks = replace(self.tracks, points=self.tracks.points + step)
         self.state.update(layout, delta)
 
-    def snapshot(self) -> tuple[State, NewFeatures | None]:
+    def snapshot(self) -> tuple[State, TrackFeatures | None]:
         """What `apply` changes, to be given back to `restore`."""
-        return self.state.copy(), self.fresh
+        return self.state.copy(), self.tracks
 
-    def restore(self, before: tuple[State, NewFeatures | None]) -> None:
+    def restore(self, before: tuple[State, TrackFeatures | None]) -> None:
         """Undo what was applied since a snapshot."""
         self.state.assign(before[0])
-        self.fresh = before[1]
+        self.tracks = before[1]
 
     # --- gating --------------------------------------------------------------------------------
 
@@ -261,33 +260,33 @@ class Cost:
             linear: of this cost.
             predicted: what is known of the variables before these measurements.
         """
-        tracked = np.zeros(0, np.bool_)
-        fresh = np.zeros(0, np.bool_)
+        landmarks = np.zeros(0, np.bool_)
+        tracks = np.zeros(0, np.bool_)
         innovations, confidence = Innovations(), self.config.gating.confidence
-        if linear.tracked is not None and self.tracked is not None:
-            keys = self.rig.keys_of(self.tracked)
-            keys += [L(int(j)) for j in np.unique(self.tracked.ids[self.tracked.feature])]
-            columns = self._tracked_columns(self.tracked, Layout(dims_of(keys)))
+        if linear.landmarks is not None and self.landmarks is not None:
+            keys = self.rig.keys_of(self.landmarks)
+            keys += [L(int(j)) for j in np.unique(self.landmarks.ids[self.landmarks.feature])]
+            columns = self._state_columns(self.landmarks, Layout(dims_of(keys)))
             P = predicted.covariance_blocks(keys, columns)
-            distance = squared_mahalanobis(linear.tracked.r, linear.tracked.H, P)
+            distance = squared_mahalanobis(linear.landmarks.r, linear.landmarks.H, P)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
-            near = linear.tracked.depths < self.config.triangulation.min_depth_m
-            tracked = (distance < largest) & ~near
-            innovations += Innovations.of(distance, dof, largest, tracked)
-        if isinstance(linear.fresh, CondensedFeatures) and self.fresh is not None:
-            fresh = np.ones(len(self.fresh.points), np.bool_)
-            innovations += Innovations.untested(2 * self.fresh.obs.counts - POINT_DIM)
-        elif isinstance(linear.fresh, ReducedFeatures) and self.fresh is not None:
-            P = predicted.covariance_of(self.rig.keys_of(self.fresh.obs))
-            distance = squared_mahalanobis(linear.fresh.r_2, linear.fresh.N, P)
-            largest = threshold(linear.fresh.dof, confidence)
-            fresh = distance < largest
-            innovations += Innovations.of(distance, linear.fresh.dof, largest, fresh)
-        return Gate(tracked, fresh, innovations)
+            near = linear.landmarks.depths < self.config.triangulation.min_depth_m
+            landmarks = (distance < largest) & ~near
+            innovations += Innovations.of(distance, dof, largest, landmarks)
+        if isinstance(linear.tracks, SummedFeatures) and self.tracks is not None:
+            tracks = np.ones(len(self.tracks.points), np.bool_)
+            innovations += Innovations.untested(2 * self.tracks.obs.counts - POINT_DIM)
+        elif isinstance(linear.tracks, ReducedFeatures) and self.tracks is not None:
+            P = predicted.covariance_of(self.rig.keys_of(self.tracks.obs))
+            distance = squared_mahalanobis(linear.tracks.r_2, linear.tracks.N, P)
+            largest = threshold(linear.tracks.dof, confidence)
+            tracks = distance < largest
+            innovations += Innovations.of(distance, linear.tracks.dof, largest, tracks)
+        return Gate(landmarks, tracks, innovations)
 
-    def _tracked_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
+    def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
         poses = np.array([layout.columns[X(i)].start for i in obs.frames])
         keys = [L(j) for j in obs.ids.tolist()]
@@ -303,7 +302,7 @@ class Cost:
         )
 
 
-def _tracked_rows(
+def _state_rows(
     linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
     """The rows of observations of features of the state."""
@@ -314,7 +313,7 @@ def _tracked_rows(
 
 
 def _null_space_rows(
-    linear: ReducedFeatures | CondensedFeatures, columns: NDArray[np.intp], layout: Layout
+    linear: ReducedFeatures | SummedFeatures, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
     """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
     compact = linear.null_space_rows()
@@ -327,16 +326,16 @@ def _null_space_rows(
 
 
 def _new_variable_rows(
-    fresh: NewFeatures,
-    linear: ReducedFeatures | CondensedFeatures,
+    tracks: TrackFeatures,
+    linear: ReducedFeatures | SummedFeatures,
     columns: NDArray[np.intp],
     layout: Layout,
 ) -> FloatArray:
     """The three rows that determine each feature that stays in the state."""
-    features = np.flatnonzero(fresh.in_state)
+    features = np.flatnonzero(tracks.in_state)
     Ab = np.zeros((len(features), POINT_DIM, layout.size + 1))
     for row, j in enumerate(features):
-        Ab[row][:, layout.columns[L(int(fresh.obs.ids[j]))]] = linear.R_f[j]
+        Ab[row][:, layout.columns[L(int(tracks.obs.ids[j]))]] = linear.R_f[j]
     Ab[:, :, columns] = linear.T[features]
     Ab[:, :, -1] = linear.r_1[features]
     return Ab.reshape(-1, layout.size + 1)

@@ -81,13 +81,13 @@ class Gate:
     """What the gate of one step lets through.
 
     Attributes:
-        tracked: (N,) observations of features of the state that pass.
-        fresh: (J,) new features that pass.
+        landmarks: (N,) observations of features of the state that pass.
+        tracks: (J,) new features that pass.
         innovations: their distances.
     """
 
-    tracked: BoolArray
-    fresh: BoolArray
+    landmarks: BoolArray
+    tracks: BoolArray
     innovations: Innovations
 
 

@@ -32,7 +32,7 @@ REGULARISATION = 1e-15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CondensedFeatures:
+class SummedFeatures:
     """J features over the poses of F frames and C columns of the calibration, summed up.
 
     Attributes:
@@ -58,7 +58,7 @@ class CondensedFeatures:
         return np.asarray(increments, dtype=np.float64)
 
 
-def condense_features(obs: Observations, linear: WhitenedObservations) -> CondensedFeatures:
+def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatures:
     """Eliminate the position of each feature and add up what they all say of the poses.
 
     Args:
@@ -70,7 +70,7 @@ def condense_features(obs: Observations, linear: WhitenedObservations) -> Conden
     T = _along(Q, by_view)
     stacked = T.reshape(-1, T.shape[2])
     information = _view_information(by_view) - stacked.T @ stacked
-    return CondensedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
+    return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
 
 
 def information_root(information: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import PriorConfig
-from slam_graph.backend.cost.cost import Cost, NewFeatures
+from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
 from slam_graph.backend.cost.imu_factor import imu_factor
@@ -115,7 +115,7 @@ class DynamicRefinement:
             frames.stamps_ns[-1],
             cost.state,
             prior,
-            features=features,
+            state_features=features,
             calibration=calibration,
         )
         covariance = prior.covariance_of(imu_state_keys(last))
@@ -167,18 +167,18 @@ class DynamicRefinement:
 
     def _keep_features(self, cost: Cost, frames: StartFrames) -> IntArray:
         """Make variables of the features that the last frame still sees."""
-        assert cost.fresh is not None
-        fresh, room = cost.fresh, self._context.algorithm.cost.max_state_features
+        assert cost.tracks is not None
+        tracks, room = cost.tracks, self._context.algorithm.cost.max_state_features
         seen = sorted_unique(np.sort(np.concatenate([c.ids for c in frames.frames[-1].cameras])))
-        live = is_in(fresh.obs.ids, seen)
-        order = np.argsort(-np.where(live, fresh.obs.counts, 0), kind="stable")[:room]
+        live = is_in(tracks.obs.ids, seen)
+        order = np.argsort(-np.where(live, tracks.obs.counts, 0), kind="stable")[:room]
         chosen = np.zeros(len(live), np.bool_)
         chosen[order] = True
         chosen &= live
         for j in np.flatnonzero(chosen):
-            cost.state.insert_point(int(fresh.obs.ids[j]), fresh.points[j])
-        cost.fresh = replace(fresh, in_state=chosen)
-        return fresh.obs.ids[chosen]
+            cost.state.insert_point(int(tracks.obs.ids[j]), tracks.points[j])
+        cost.tracks = replace(tracks, in_state=chosen)
+        return tracks.obs.ids[chosen]
 
 
 def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: BoolArray) -> None:
@@ -188,7 +188,7 @@ def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: Bo
     chosen = np.zeros(len(good), np.bool_)
     chosen[order] = good[order]
     nothing = np.zeros(len(good), np.bool_)
-    cost.fresh = NewFeatures(obs, result.points, nothing).subset(chosen)
+    cost.tracks = TrackFeatures(obs, result.points, nothing).subset(chosen)
 
 
 def _doubt(normalized_cost: float, scale_sigma: float, covariance: FloatArray) -> str | None:
@@ -234,10 +234,10 @@ def _lasting(frames: StartFrames) -> Observations:
 
 def _normalized_cost(cost: Cost) -> float:
     """Mean squared residual of the features after their positions are eliminated, σ²."""
-    fresh = cost.linearize().fresh
-    if not isinstance(fresh, ReducedFeatures):
+    tracks = cost.linearize().tracks
+    if not isinstance(tracks, ReducedFeatures):
         return float("inf")
-    return float(np.sum(fresh.r_2**2)) / max(int(np.sum(fresh.dof)), 1)
+    return float(np.sum(tracks.r_2**2)) / max(int(np.sum(tracks.dof)), 1)
 
 
 def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
@@ -246,8 +246,8 @@ def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
     A distance to a feature is scale times shape, so no distance has a smaller relative error than
     the scale. Absolute errors are no measure: if the scale is estimated too small, so are they.
     """
-    fresh, features = cost.linearize().fresh, cost.fresh
-    if not isinstance(fresh, ReducedFeatures) or features is None or not len(features.points):
+    tracks, features = cost.linearize().tracks, cost.tracks
+    if not isinstance(tracks, ReducedFeatures) or features is None or not len(features.points):
         return float("inf")
     keys = cost.rig.keys_of(features.obs)
     last = X(features.obs.frames[-1])
@@ -256,8 +256,8 @@ def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
     distances = np.linalg.norm(away, axis=1)
     toward = away / distances[:, None]
     # δf = R_f⁻¹ (r₁ - T δx), and the body moves by R δp
-    by_r_1 = np.linalg.solve(fresh.R_f.transpose(0, 2, 1), toward[:, :, None])[:, :, 0]
-    by_state = -np.einsum("ji,jin->jn", by_r_1, fresh.T)
+    by_r_1 = np.linalg.solve(tracks.R_f.transpose(0, 2, 1), toward[:, :, None])[:, :, 0]
+    by_state = -np.einsum("ji,jin->jn", by_r_1, tracks.T)
     position = Layout(dims_of(keys)).columns[last].start + np.arange(3, 6)
     by_state[:, position] -= toward @ pose.rotation().matrix()
     variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)

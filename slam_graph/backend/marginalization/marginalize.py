@@ -19,7 +19,7 @@ from typing import Literal
 
 from slam_graph.backend.cost.construction import ConstructedCost
 from slam_graph.backend.cost.feature_tracks import Outcome
-from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.marginalization.observability import relinearized
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.gauss_newton import Minimum, linearized
@@ -54,10 +54,10 @@ def marginalize_step(
     points: LinearizationPoints = "current"
     if algorithm.marginalization.first_estimates:
         points = "corrected" if minimum.repeated else "first"
-    archive = window.archive if constructed.keep_lost_features else None
+    store = window.lost_features if constructed.keep_lost_features else None
     window.state = constructed.cost.state.copy()
-    window.prior = marginalize(posterior, window.state, keep, points, archive)
-    window.factors, window.features = factors, constructed.features
+    window.prior = marginalize(posterior, window.state, keep, points, store)
+    window.factors, window.state_features = factors, constructed.features
     window.past, window.moving = list(kept), list(constructed.moving)
     window.keyframes = set(constructed.poses.keyframes)
     _keep_points(window, constructed)
@@ -66,19 +66,19 @@ def marginalize_step(
 
 def _keep_points(window: Window, constructed: ConstructedCost) -> None:
     """Remember where the features are that the step estimated outside the state."""
-    fresh = constructed.cost.fresh
-    if fresh is None:
+    tracks = constructed.cost.tracks
+    if tracks is None:
         return
     again = ~constructed.leaving
-    window.used = fresh.obs.ids, fresh.points
-    window.landmarks = fresh.obs.ids[again], fresh.points[again]
+    window.last_points = tracks.obs.ids, tracks.points
+    window.kept_points = tracks.obs.ids[again], tracks.points[again]
 
 
 def _settle_observations(window: Window, constructed: ConstructedCost) -> None:
     """Take away the observations that no longer wait."""
     cost, removals = constructed.cost, constructed.removals
-    if cost.tracked is not None:
-        removals.add_features(Outcome.USED, cost.tracked.ids)
+    if cost.landmarks is not None:
+        removals.add_features(Outcome.USED, cost.landmarks.ids)
     removals.add_features(Outcome.USED, cost.ids_of(constructed.leaving))
     removals.apply(window.tracks)
     window.tracks.keep_frames([*constructed.poses.kept, window.frame])
@@ -89,7 +89,7 @@ def marginalize(
     state: State,
     keep: Sequence[int],
     points: LinearizationPoints,
-    archive: FeatureArchive | None = None,
+    store: LandmarkStore | None = None,
 ) -> SquareRootInformation:
     """Eliminate all variables but `keep` and make the rest the prior of the next step.
 
@@ -102,18 +102,18 @@ def marginalize(
         points: where the variables that stay are linearised from now on: where the prior was made
             (first-estimates Jacobians), at their estimates, or there without the prior gaining
             information about what no measurement sees.
-        archive: gets what the variables that leave are, given those that stay.
+        store: gets the conditional of the variables that leave, given those that stay.
 
     Returns:
         The prior as a function of the offsets of the estimates from their linearisation points.
     """
     staying = set(keep)
     conditional, prior = posterior.divided([key for key in keep if key in posterior.layout])
-    if archive is not None:
-        archive.put(conditional, state)
+    if store is not None:
+        store.put(conditional, state)
     state.remove([key for key in state.variables() if key not in staying])
-    if points != "first" and archive is not None:
-        archive.follow(state)
+    if points != "first" and store is not None:
+        store.follow(state)
     if points == "current":
         state.rebase()
     elif points == "corrected":

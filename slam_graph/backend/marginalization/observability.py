@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What no camera and no IMU sees: the origin of the world and its heading.
+"""The unobservable directions: global position and heading.
 
-Along these four directions a prior must not gain information. First-estimates Jacobians see to it
-(state.py). Where linearisation points have to move all the same, `relinearized` does: the smallest
-change of the prior after which it says as much of these directions at the new points as it did at
-the old ones (the idea of observability constraints, Huang, Mourikis & Roumeliotis 2010; Hesch et
-al. 2014).
+Neither cameras nor an IMU measure them, so a prior must not gain information along these four
+directions. First-estimates Jacobians prevent that (`state.py`). Where linearisation points must
+move after all, `relinearized` changes the prior by the least that keeps its information along the
+directions as it was: at the new points the same as at the old ones (the idea of observability
+constraints, Huang, Mourikis & Roumeliotis 2010; Hesch et al. 2014).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from slam_graph.backend.solve.state import State
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def unseen_directions(values: gtsam.Values, layout: Layout) -> FloatArray:
+def unobservable_directions(values: gtsam.Values, layout: Layout) -> FloatArray:
     """Tangents (n, 4) of a shift (m) of the world along x, y, z, and of a turn (rad) about z."""
     directions = np.zeros((layout.size, 4))
     for key, columns in layout.columns.items():
@@ -41,15 +41,15 @@ def unseen_directions(values: gtsam.Values, layout: Layout) -> FloatArray:
 
 
 def relinearized(prior: SquareRootInformation, state: State) -> SquareRootInformation:
-    """Move all linearisation points to the estimates without telling where the world is.
+    """Move all linearisation points to the estimates without gaining unobservable information.
 
     Args:
         prior: over an increment of the current estimates.
         state: its linearisation points move.
     """
-    before = unseen_directions(state.first, prior.layout)
+    before = unobservable_directions(state.first, prior.layout)
     state.rebase()
-    after = unseen_directions(state.first, prior.layout)
+    after = unobservable_directions(state.first, prior.layout)
     Rd = prior.Rd.copy()
     correction = np.linalg.solve(after.T @ after, after.T)
     Rd[:-1, :-1] += prior.R @ (before - after) @ correction

@@ -22,7 +22,7 @@ from slam_graph.arrays import FloatArray
 BLOCK_SIZE = 32
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
 ROWS_AT_ONCE = 48
-"""Height of the blocks from which variables are eliminated that stand behind them."""
+"""Block height for eliminating leading variables."""
 
 
 class Layout:
@@ -228,8 +228,8 @@ class SquareRootInformation:
     def divided(self, keep: Sequence[int]) -> tuple[Conditional, SquareRootInformation]:
         """The conditional of all variables but `keep` given these, and the marginal over `keep`.
 
-        What changes its order goes through one QR. The rows of variables that stand before it are
-        worked on in blocks, with the rows that determine the eliminated variables carried upwards.
+        Variables whose order changes go through one QR. The rows of the variables before them are
+        processed in blocks from the bottom up, together with the rows of the eliminated variables.
         That costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
         """
         staying = set(keep)

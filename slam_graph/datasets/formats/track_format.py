@@ -22,6 +22,7 @@ A recording is replayed bit for bit.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def frame_record(cameras: int) -> np.dtype[np.void]:
 
 def save_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory; arrays that it does not have are left out."""
-    _save(path, {name: getattr(trajectory, name) for name in Trajectory.__dataclass_fields__})
+    _save(path, {name: getattr(trajectory, name) for name in _names(Trajectory)})
 
 
 def load_trajectory(path: Path) -> Trajectory:
@@ -68,7 +69,7 @@ def load_trajectory(path: Path) -> Trajectory:
 
 def save_state(path: Path, state: NavState) -> None:
     """Write a state."""
-    fields = {name: getattr(state, name) for name in NavState.__dataclass_fields__}
+    fields = {name: getattr(state, name) for name in _names(NavState)}
     _save(path, fields | {"world_T_body": state.world_T_body.matrix()})
 
 
@@ -100,3 +101,8 @@ def _load(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     if missing:
         raise DataError(f"{path}: no array '{missing[0]}' in this file; record it again")
     return arrays
+
+
+def _names(kind: type[NavState] | type[Trajectory]) -> list[str]:
+    """The fields of a dataclass, without its class variables."""
+    return [field.name for field in dataclasses.fields(kind)]

@@ -7,8 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from slam_graph.datasets import Format, ReaderOptions, RecordedSequence
-from slam_graph.datasets.memory_sequence import dataset_from_arrays
+from slam_graph.datasets import Format, ReaderOptions, RecordedSequence, dataset_from_arrays
 from slam_graph.sensors import Camera, Rig, RigCamera
 
 

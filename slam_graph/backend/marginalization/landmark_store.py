@@ -1,19 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The features that an EKF keeps when it no longer sees them, at no cost until it sees them again.
+"""Landmarks that an EKF keeps while they are not tracked, at no cost until they are seen again.
 
-When variables e are eliminated from a Gaussian over (e, s), it falls into p(e | s) p(s). Filters go
-on with p(s). The rows of p(e | s) are all that is ever known of a feature in e as long as it is not
-measured again: no later measurement of s changes them. So they are put aside as they are, and the
-filter goes on with what it tracks. This is the joint Gaussian of all features, exactly, in the form
-of a Bayes net (Kaess et al. 2008) and not as one dense matrix, whose update is O(n²) in the number
-n of all features.
+When variables e are eliminated, a Gaussian over (e, s) factors into p(e | s) p(s). Filters continue
+with p(s). As long as a feature in e is not measured again, p(e | s) does not change: no measurement
+of s affects it. So these conditionals are stored, and the filter continues with what it tracks.
+This is the joint Gaussian of all features, exactly, in the form of a Bayes net (Kaess et al. 2008)
+and not as one dense matrix, whose update is O(n²) in the number n of all features.
 
-When a feature is seen again, its conditional is multiplied with those that were put aside after it,
-and what they eliminated is eliminated from the product. That pays as long as features that are lost
-stay lost, as those of a tracker do. Where identities come back again and again, everything is
-recalled once and the archive is closed: from then on the filter holds on to all features in one
-dense matrix.
+When a feature is seen again, its conditional is multiplied with those stored after it, and the
+variables that these eliminated are eliminated from the product. That pays as long as lost features
+stay lost, as those of a tracker do. Where identities return all the time, everything is recalled
+once and the store is closed: from then on the filter keeps all features in one dense matrix.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from slam_graph.backend.solve.square_root import (
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
 
 MAX_EXCHANGES = 300
-"""So many conditionals are worked over for recalled features before the archive is closed."""
+"""Work limit: after this many conditionals were reordered to recall features, the store closes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +43,7 @@ class _Place:
     first: FloatArray
 
 
-class FeatureArchive:
+class LandmarkStore:
     """Conditionals of eliminated variables, in the order of elimination.
 
     They are over the offsets of all variables from the first linearisation point that each had.
@@ -62,16 +60,16 @@ class FeatureArchive:
         self._moved: dict[int, FloatArray] = {}  # how far linearisation points are from the first
 
     def __len__(self) -> int:
-        """How many features are put aside."""
+        """How many features are stored."""
         return len(self._places)
 
     @property
     def size(self) -> int:
-        """Dimension of what is put aside."""
+        """Dimension of the stored features."""
         return POINT_DIM * len(self._places)
 
     def put(self, conditional: Conditional, state: State) -> None:
-        """Put eliminated variables aside.
+        """Store the conditional of eliminated variables.
 
         Args:
             conditional: of all variables that a step eliminated, over an increment of their
@@ -87,7 +85,7 @@ class FeatureArchive:
         self._conditionals.append(conditional.shifted(-offset - self._bases(conditional)))
 
     def follow(self, state: State) -> None:
-        """Take note that the linearisation points of all variables move to their estimates now."""
+        """Note that the linearisation points of all variables move to their estimates now."""
         for key, offset in state.offsets.items():
             if offset.any():
                 self._moved[key] = self._moved.get(key, 0.0) + offset
@@ -99,7 +97,7 @@ class FeatureArchive:
         return np.concatenate([np.zeros(0), *parts])
 
     def due(self, seen: IntArray) -> IntArray:
-        """Which features must become variables again: of those seen; all if the archive closes."""
+        """Which features must become variables again: of those seen; all if the store closes."""
         again = [j for j in seen.tolist() if j in self._places]
         if again and self._exchanges > MAX_EXCHANGES:
             again = list(self._places)
@@ -111,7 +109,7 @@ class FeatureArchive:
         """Make features variables of the state again.
 
         Args:
-            features: ids of features that are put aside.
+            features: ids of stored features.
             prior: over the offsets of the variables in the state.
             state: gets the features.
 

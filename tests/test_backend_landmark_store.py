@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.backend.marginalization.delayed_features import FeatureArchive
+from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
@@ -22,7 +22,7 @@ class Filter:
 
     def __init__(self, archive: bool, points: LinearizationPoints) -> None:
         self.state = State()
-        self.archive = FeatureArchive()
+        self.archive = LandmarkStore()
         self.put_aside, self.points = archive, points
         self.prior = SquareRootInformation.empty()
         self.tracked: set[int] = set()
