@@ -36,7 +36,7 @@ from slam_graph.errors import EstimationError
 GAUGE_DIM = 7
 """Unobservable directions: translation, rotation and scale of the world."""
 
-RowArray = NDArray[np.int32]
+_RowArray = NDArray[np.int32]
 
 _MAX_CAMERAS = 1_800
 """The dense reduced system of more cameras needs over 2 GB, and 6 GB to be solved."""
@@ -55,10 +55,10 @@ class _CommonPoints:
         starts: (M + 1,) first pair of each of these cameras, and K.
     """
 
-    first: RowArray
-    second: RowArray
-    others: RowArray
-    starts: RowArray
+    first: _RowArray
+    second: _RowArray
+    others: _RowArray
+    starts: _RowArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,9 +39,9 @@ from slam_graph.errors import EstimationError
 
 INITIAL_DAMPING = 1e-4
 """Of the first step, relative to the diagonal of the information."""
-NEGLIGIBLE_COST = 1e-14
+_NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each observation is rounding: all pixels agree."""
-CONVERGENCE_DAMPING = 0.1
+_CONVERGENCE_DAMPING = 0.1
 """A small decrease is a sign of convergence only up to this damping: beyond it, steps are small
 because they are damped."""
 
@@ -91,7 +91,7 @@ def _minimize(
     problem, damping = _DampedBundle(cost, start), GainRatioDamping(INITIAL_DAMPING)
     if not np.isfinite(problem.value()):
         raise EstimationError(f"{cost.part.problem.name}: the cost at the start is not finite")
-    negligible = NEGLIGIBLE_COST * len(cost.part.problem.pixels)
+    negligible = _NEGLIGIBLE_COST * len(cost.part.problem.pixels)
 
     def converged(attempt: Attempt) -> bool:
         if attempt.accepted:
@@ -101,7 +101,8 @@ def _minimize(
         if value <= negligible:
             return True
         return (
-            attempt.damping <= CONVERGENCE_DAMPING and decrease <= policy.tolerance * attempt.before
+            attempt.damping <= _CONVERGENCE_DAMPING
+            and decrease <= policy.tolerance * attempt.before
         )
 
     steps = levenberg_marquardt(problem, StepSettings(policy.max_steps, converged), damping)

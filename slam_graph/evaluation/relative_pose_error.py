@@ -69,7 +69,7 @@ def rpe(
     require_known(relation, ERROR_UNITS, "relation")
     require_known(unit, STEP_UNITS, "unit of a step")
     truth, aligned, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
-    start, end = step_pairs(
+    start, end = _step_pairs(
         truth if pairs_from_reference else aligned, delta, unit, all_pairs, tolerance
     )
     if len(start) == 0:
@@ -83,7 +83,7 @@ def rpe(
     return ErrorSeries(stamps, values, Statistics.of(values), similarity, len(truth))
 
 
-def step_pairs(
+def _step_pairs(
     trajectory: Trajectory, delta: float, unit: DeltaUnit, all_pairs: bool, tolerance: float
 ) -> tuple[IntArray, IntArray]:
     """Indices (M,) of the first and the last pose of each step of length `delta`."""

@@ -22,12 +22,12 @@ from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesse
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import Task
 
-DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
+_DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 
 
 def compare(
     data: str | Path | Sequence[str | Path],
-    algorithms: str | Sequence[str | Path] = DEFAULT_ALGORITHMS,
+    algorithms: str | Sequence[str | Path] = _DEFAULT_ALGORITHMS,
     *,
     seeds: int | Sequence[int] = 1,
     output: str | Path = "results/comparison",

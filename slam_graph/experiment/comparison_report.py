@@ -44,7 +44,7 @@ COLUMNS = (
     "status",
 )
 
-EXPLANATION = (
+_EXPLANATION = (
     "All algorithms were given the same recorded feature tracks and IMU samples. ATE is the root "
     "mean square position error of the causal estimate: without alignment, after alignment of "
     "yaw and position, and after SE(3) alignment. Orientation is after alignment of yaw and "
@@ -56,7 +56,7 @@ EXPLANATION = (
     "peak memory is the maximum."
 )
 
-STYLE = (
+_STYLE = (
     "body{font-family:sans-serif;max-width:75em;margin:2em auto;padding:0 1em}"
     "table{border-collapse:collapse}"
     "td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}"
@@ -179,7 +179,7 @@ def _average(values: Iterable[float]) -> float | None:
 
 
 def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list[Figure]]) -> str:
-    lines = ["# Comparison of algorithms", "", EXPLANATION, ""]
+    lines = ["# Comparison of algorithms", "", _EXPLANATION, ""]
     for name, drawn in figures.items():
         lines += [f"## {name}", "", _markdown_line(COLUMNS)]
         lines += [_markdown_line(("---",) + ("---:",) * (len(COLUMNS) - 2) + ("---",))]
@@ -201,8 +201,8 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
     title = "Comparison of algorithms"
     parts = [
         "<!DOCTYPE html>",
-        f'<html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>',
-        f"<h1>{title}</h1><p>{escape(EXPLANATION)}</p>",
+        f'<html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>',
+        f"<h1>{title}</h1><p>{escape(_EXPLANATION)}</p>",
     ]
     for name, drawn in figures.items():
         parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", COLUMNS)]

@@ -24,7 +24,7 @@ from slam_graph.frontend.outliers import (
 from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.sensors import RigCamera
 
-MERGE_DISTANCE_PX = 3.0
+_MERGE_DISTANCE_PX = 3.0
 """Of two features closer than this the younger one is dropped: they track the same corner."""
 
 
@@ -90,7 +90,7 @@ class CameraTracker:
             after = after.select(inlier & in_map)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
-        alone = _apart(after.pixels, MERGE_DISTANCE_PX)
+        alone = _apart(after.pixels, _MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
         return self._with_residual_flow(before, after.select(alone))
 

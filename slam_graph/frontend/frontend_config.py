@@ -49,7 +49,7 @@ FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics, float], Fro
 """Front ends by name: callables that make one from rig, settings, seed, diagnostics and gravity in
 m/s²."""
 
-PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
+_PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
 """The detector that a descriptor was published with; for BRIEF, which has none, FAST."""
 
 TRACKED_RANSAC_PX, MATCHED_RANSAC_PX = 1.0, 1.5
@@ -164,7 +164,7 @@ class FrontendConfig(Settings):
         """The detector that `detector` and `method` choose."""
         if self.detector != "auto":
             return self.detector
-        return PUBLISHED_WITH.get(self.method, "shi_tomasi")
+        return _PUBLISHED_WITH.get(self.method, "shi_tomasi")
 
     @property
     def epipolar_px(self) -> float:

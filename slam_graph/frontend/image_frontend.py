@@ -31,7 +31,7 @@ from slam_graph.sensors import (
     Rig,
 )
 
-FEW_FEATURES = 15
+_FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""
 
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 3.0, (8, 8)
@@ -208,7 +208,7 @@ class ImageFrontend:
         after = tracker.follow(before, image, stamp_ns, self._feedback)
         if self._references[index] == index:
             self._stats.add("tracked", len(after))
-            if len(after) < FEW_FEATURES <= len(before):
+            if len(after) < _FEW_FEATURES <= len(before):
                 self._diagnostics.warn(
                     "few_features", f"{len(after)} of {len(before)} features could be followed"
                 )

@@ -67,7 +67,7 @@ def graduated_nonconvexity(
         squared = edge_chi2(plain, values)[uncertain]
         if control is None:
             control = bound / max(2.0 * squared.max(initial=0.0) - bound, 1e-3 * bound)
-        weights[uncertain] = truncated_weights(squared, bound, control)
+        weights[uncertain] = _truncated_weights(squared, bound, control)
         if np.isin(weights, (0.0, 1.0)).all():
             break
         control *= _CONTROL_FACTOR
@@ -82,7 +82,7 @@ def graduated_nonconvexity(
     return poses_of(values, graph.dimension), np.maximum(np.round(weights), least)
 
 
-def truncated_weights(squared: FloatArray, bound: float, control: float) -> FloatArray:
+def _truncated_weights(squared: FloatArray, bound: float, control: float) -> FloatArray:
     """Weights of truncated least squares at μ = control (Yang et al. 2020, equation 14).
 
     Args:

@@ -38,7 +38,7 @@ from slam_graph.simulation.textures import paint
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
-SETTINGS_FILE = "simulation.yaml"
+_SETTINGS_FILE = "simulation.yaml"
 
 Progress = Callable[[int], None]
 """Called with the time of every frame that has been written, ns."""
@@ -153,7 +153,7 @@ class SimulatedSequence(RecordedSequence):
         """
         self._write(Path(path), progress if progress is not None else _ignore)
         settings = self.config.model_dump(mode="json")
-        (Path(path) / SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+        (Path(path) / _SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
 
     @abstractmethod
     def _write(self, path: Path, progress: Progress) -> None:

@@ -153,7 +153,7 @@ class StartConfig(Settings):
     """Standard deviation of the gyroscope bias, rad/s."""
 
 
-REAL_START = StartConfig(
+_REAL_START = StartConfig(
     rotation_rad=0.01, position_m=0.01, velocity=0.05, accel_bias=0.05, gyro_bias=0.01
 )
 """Uncertainty of the ground truth of a real flight, used with `real_imu` unless `start` is set."""
@@ -203,7 +203,7 @@ class SimulationConfig(Settings):
         """The settings of the start state, with the default that fits the kind of IMU."""
         if self.start is not None:
             return self.start
-        return REAL_START if self.real_imu else StartConfig()
+        return _REAL_START if self.real_imu else StartConfig()
 
     @property
     def recorded(self) -> Path | None:

@@ -36,7 +36,7 @@ from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
 
-SILENT = "-8"
+_SILENT = "-8"
 """FFmpeg's level of logging; damage is found and counted without its messages."""
 
 
@@ -53,7 +53,7 @@ class _VideoReader:
     """
 
     def __init__(self, path: Path) -> None:
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", SILENT)
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _SILENT)
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
