@@ -26,9 +26,6 @@ from slam_graph.smoothing import FinalBaConfig
 __all__ = [
     "LimitsConfig",
     "RunConfig",
-    "algorithm_names",
-    "algorithm_tree",
-    "config_folder",
     "dump_yaml",
     "load_config",
 ]

@@ -25,7 +25,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from slam_graph.errors import ConfigError, closest
 
-__all__ = ["Choice", "Registry", "UnknownNameError"]
+__all__ = ["Choice", "Registry"]
 
 PartT = TypeVar("PartT")
 RegisteredT = TypeVar("RegisteredT")

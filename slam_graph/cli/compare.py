@@ -128,10 +128,9 @@ def _print_task(task: Task, failure: str | None, count: int, total: int) -> None
 
 def _echo(comparison: Comparison) -> None:
     """Print the table and the names of the files."""
-    from slam_graph.experiment import COLUMNS, cells
+    from slam_graph.experiment import text_table
 
-    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in comparison.rows)]
-    echo_table(_informative(table))
+    echo_table(_informative(text_table(comparison.rows)))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "COLUMNS",
     "Comparison",
     "FrontendReport",
     "Task",
-    "cells",
     "compare",
     "parse_frontends",
+    "text_table",
     "track",
     "track_and_estimate",
 ]
@@ -25,7 +24,7 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.experiment.comparison import compare
     from slam_graph.experiment.comparison_plan import Comparison
-    from slam_graph.experiment.comparison_report import COLUMNS, cells
+    from slam_graph.experiment.comparison_report import text_table
     from slam_graph.experiment.frontend_comparison import (
         FrontendReport,
         parse_frontends,
@@ -39,7 +38,7 @@ else:
         {
             "comparison": ("compare",),
             "comparison_plan": ("Comparison",),
-            "comparison_report": ("COLUMNS", "cells"),
+            "comparison_report": ("text_table",),
             "frontend_comparison": (
                 "FrontendReport",
                 "parse_frontends",

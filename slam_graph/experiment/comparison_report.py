@@ -28,7 +28,7 @@ from slam_graph.experiment.comparison_results import (
 from slam_graph.experiment.tasks import RunTask
 from slam_graph.results import finite, versions, write_text
 
-COLUMNS = (
+_COLUMNS = (
     "algorithm",
     *(f"ATE {mode} [m]" for mode in ALIGNMENTS),
     "orientation [deg]",
@@ -78,8 +78,13 @@ def write_report(comparison: Comparison) -> None:
     comparison.rows, comparison.files = rows, files
 
 
-def cells(row: Table) -> tuple[str, ...]:
-    """A row of the table as text, in the order of `COLUMNS`."""
+def text_table(rows: Iterable[Table]) -> list[tuple[str, ...]]:
+    """Rows of a comparison as text, the data before each, under a row of titles."""
+    return [("data", *_COLUMNS), *((str(row["data"]), *_cells(row)) for row in rows)]
+
+
+def _cells(row: Table) -> tuple[str, ...]:
+    """A row of the table as text, in the order of `_COLUMNS`."""
     status = ", ".join(f"{count} {name}" for name, count in row["status"].items())
     ends = f"{_number(row['ms_first_third'], 2)} → {_number(row['ms_last_third'], 2)}"
     return (
@@ -181,9 +186,9 @@ def _average(values: Iterable[float]) -> float | None:
 def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list[Figure]]) -> str:
     lines = ["# Comparison of algorithms", "", _EXPLANATION, ""]
     for name, drawn in figures.items():
-        lines += [f"## {name}", "", _markdown_line(COLUMNS)]
-        lines += [_markdown_line(("---",) + ("---:",) * (len(COLUMNS) - 2) + ("---",))]
-        lines += [_markdown_line(cells(row)) for row in rows if row["data"] == name]
+        lines += [f"## {name}", "", _markdown_line(_COLUMNS)]
+        lines += [_markdown_line(("---",) + ("---:",) * (len(_COLUMNS) - 2) + ("---",))]
+        lines += [_markdown_line(_cells(row)) for row in rows if row["data"] == name]
         lines.append("")
         for figure in drawn:
             lines += [f"![{figure.title}]({figure.file.relative_to(comparison.folder)})", ""]
@@ -205,8 +210,8 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
         f"<h1>{title}</h1><p>{escape(_EXPLANATION)}</p>",
     ]
     for name, drawn in figures.items():
-        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", COLUMNS)]
-        parts += [_html_line("td", cells(row)) for row in rows if row["data"] == name]
+        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", _COLUMNS)]
+        parts += [_html_line("td", _cells(row)) for row in rows if row["data"] == name]
         parts.append("</table>")
         for figure in drawn:
             data = base64.b64encode(figure.file.read_bytes()).decode("ascii")

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "ALIGNMENT_MODES",
     "DEFAULT_MAX_GAP_S",
     "AlignmentMode",
     "NavState",
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from slam_graph.geometry.interpolation import DEFAULT_MAX_GAP_S, interpolate
     from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory, tum_lines
     from slam_graph.geometry.trajectory_alignment import (
-        ALIGNMENT_MODES,
         AlignmentMode,
         Similarity,
         align,
@@ -47,7 +45,6 @@ else:
             "interpolation": ("DEFAULT_MAX_GAP_S", "interpolate"),
             "trajectory": ("NavState", "StateHistory", "Trajectory", "tum_lines"),
             "trajectory_alignment": (
-                "ALIGNMENT_MODES",
                 "AlignmentMode",
                 "Similarity",
                 "align",

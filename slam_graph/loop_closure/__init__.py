@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "SAME_PLACE",
     "Descriptors",
     "Keyframe",
     "KeyframeDescriber",
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure.loop_pose_graph import body_poses, loop_graph
     from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
     from slam_graph.loop_closure.place_recognition import (
-        SAME_PLACE,
         PlaceDatabase,
         Vocabulary,
         best_places,
@@ -71,12 +69,6 @@ else:
             ),
             "loop_pose_graph": ("body_poses", "loop_graph"),
             "loop_verification": ("Loop", "LoopVerifier"),
-            "place_recognition": (
-                "PlaceDatabase",
-                "SAME_PLACE",
-                "Vocabulary",
-                "best_places",
-                "majority",
-            ),
+            "place_recognition": ("PlaceDatabase", "Vocabulary", "best_places", "majority"),
         },
     )

@@ -26,7 +26,7 @@ from slam_graph.errors import DataError
 from slam_graph.loop_closure import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
 from slam_graph.pose_graph import Poses
-from slam_graph.sensors import IMU_KEY, Rig, chain_cameras, kalibr_table, parse_yaml, read_imu_noise
+from slam_graph.sensors import kalibr_table, parse_yaml, rig_from_table
 
 _MAX_COORDINATE_M = 1e8
 _MAX_NORMALIZED = 1e4
@@ -302,10 +302,8 @@ def _poses(arrays: dict[str, NDArray[Any]], prefix: str, path: Path) -> Poses:
 def _recording(entry: _Recording, path: Path) -> MapRecording:
     """A recording with its calibration."""
     where = path / HEADER
-    chain = parse_yaml(json.dumps(entry.calibration), where)
-    return MapRecording(
-        entry.name, entry.poses, Rig(chain_cameras(chain), read_imu_noise(chain.require(IMU_KEY)))
-    )
+    calibration = parse_yaml(json.dumps(entry.calibration), where)
+    return MapRecording(entry.name, entry.poses, rig_from_table(calibration))
 
 
 def _check_map(content: SlamMap, path: Path) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.loop_closure import (
-    SAME_PLACE,
     Descriptors,
     Keyframe,
     Loop,
@@ -93,7 +92,7 @@ class MapPlaces:
     def similar(self, descriptors: Descriptors, count: int) -> IntArray:
         """The keyframes most similar to a view with descriptors (N, B), best first."""
         scores = self._database.query(self.map.vocabulary.words_of(descriptors))
-        return best_places(scores, 0.0, count, SAME_PLACE)
+        return best_places(scores, 0.0, count)
 
     def nearest(self, world_T_body: gtsam.Pose3, count: int) -> IntArray:
         """The keyframes nearest to a pose, in position and orientation, best first."""
@@ -102,7 +101,7 @@ class MapPlaces:
         # |R - S|² = 8 for a half turn
         turned = np.linalg.norm(poses.rotations - world_T_body.rotation().matrix(), axis=(1, 2))
         near = 1.0 / (1.0 + away + turned * _HALF_TURN_M / np.sqrt(8.0))
-        return best_places(near, 0.0, count, SAME_PLACE)
+        return best_places(near, 0.0, count)
 
     def locate(self, view: Keyframe, number: int, gravity: bool) -> PlaceMatch | None:
         """Localize a view at a keyframe of the map; None if verification fails.

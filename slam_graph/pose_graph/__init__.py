@@ -23,23 +23,21 @@ __all__ = [
     "RotationInformation",
     "along_tree",
     "certify",
+    "chi2_of_edges",
     "chi2_table",
-    "edge_chi2",
-    "edge_factors",
     "g2o_lines",
     "marginal_covariances",
     "optimize_pose_graph",
     "read_pose_graph",
-    "values_of",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.pose_graph.certificate import Certificate, certify
     from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
-    from slam_graph.pose_graph.graph_cost import chi2_table
+    from slam_graph.pose_graph.graph_cost import chi2_of_edges, chi2_table
     from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
     from slam_graph.pose_graph.graph_initialization import along_tree
-    from slam_graph.pose_graph.gtsam_graph import ROTATION_FIRST, edge_chi2, edge_factors, values_of
+    from slam_graph.pose_graph.gtsam_graph import ROTATION_FIRST
     from slam_graph.pose_graph.optimize import marginal_covariances, optimize_pose_graph
     from slam_graph.pose_graph.pose_graph_policy import (
         PoseGraphCostPolicy,
@@ -52,10 +50,10 @@ else:
         {
             "certificate": ("Certificate", "certify"),
             "graph": ("PoseGraph", "Poses", "RotationInformation"),
-            "graph_cost": ("chi2_table",),
+            "graph_cost": ("chi2_of_edges", "chi2_table"),
             "graph_files": ("g2o_lines", "read_pose_graph"),
             "graph_initialization": ("along_tree",),
-            "gtsam_graph": ("ROTATION_FIRST", "edge_chi2", "edge_factors", "values_of"),
+            "gtsam_graph": ("ROTATION_FIRST",),
             "optimize": ("marginal_covariances", "optimize_pose_graph"),
             "pose_graph_policy": ("PoseGraphCostPolicy", "PoseGraphPolicy", "PoseGraphSolution"),
         },

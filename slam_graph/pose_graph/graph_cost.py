@@ -107,6 +107,11 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
     return weights
 
 
+def chi2_of_edges(graph: PoseGraph, poses: Poses) -> FloatArray:
+    """(M,) squared whitened residual of each edge, without a robust loss."""
+    return edge_chi2(edge_factors(graph, range(len(graph.edges))), values_of(poses))
+
+
 def chi2_table(
     graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
 ) -> dict[str, float]:
@@ -124,7 +129,7 @@ def chi2_table(
     if weights is not None:
         rows = np.flatnonzero(weights > 0)
         graph = graph.keep_edges(rows).weighted(weights[rows])
-    squared = edge_chi2(edge_factors(graph, range(len(graph.edges))), values_of(poses))
+    squared = chi2_of_edges(graph, poses)
     return {
         "gtsam_error": 0.5 * float(squared.sum()),
         "gtsam_chi2": float(squared.sum()),

@@ -21,11 +21,9 @@ from slam_graph.pose_graph import (
     PoseGraphSolution,
     Poses,
     along_tree,
+    chi2_of_edges,
     chi2_table,
-    edge_chi2,
-    edge_factors,
     g2o_lines,
-    values_of,
 )
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder, appearing
@@ -132,8 +130,7 @@ class PoseGraphResult:
     def _edge_lines(self) -> Iterator[str]:
         """Edges as CSV: ids, χ² in GTSAM's convention, weight."""
         graph, solution = self.solution.graph, self.solution
-        plain = edge_factors(graph, range(len(graph.edges)))
-        squared = edge_chi2(plain, values_of(solution.poses))
+        squared = chi2_of_edges(graph, solution.poses)
         yield "from,to,chi2,weight\n"
         rows = zip(
             graph.keys[graph.edges].tolist(),

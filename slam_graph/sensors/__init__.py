@@ -17,7 +17,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "CAMERA_MODELS",
-    "IMU_KEY",
     "STANDARD_GRAVITY",
     "CalibrationEstimate",
     "Camera",
@@ -33,7 +32,6 @@ __all__ = [
     "RigCamera",
     "YamlValue",
     "camera_entry",
-    "chain_cameras",
     "integrate_rotation",
     "kalibr_table",
     "parse_yaml",
@@ -47,6 +45,7 @@ __all__ = [
     "read_imu_noise",
     "read_kalibr",
     "read_yaml",
+    "rig_from_table",
     "write_kalibr",
 ]
 
@@ -71,10 +70,9 @@ if TYPE_CHECKING:
         preintegration_params,
     )
     from slam_graph.sensors.kalibr_calibration import (
-        IMU_KEY,
-        chain_cameras,
         kalibr_table,
         read_kalibr,
+        rig_from_table,
         write_kalibr,
     )
     from slam_graph.sensors.measurements import (
@@ -108,13 +106,7 @@ else:
                 "preintegrate",
                 "preintegration_params",
             ),
-            "kalibr_calibration": (
-                "IMU_KEY",
-                "chain_cameras",
-                "kalibr_table",
-                "read_kalibr",
-                "write_kalibr",
-            ),
+            "kalibr_calibration": ("kalibr_table", "read_kalibr", "rig_from_table", "write_kalibr"),
             "measurements": (
                 "CameraFrame",
                 "FeatureFrame",

@@ -8,7 +8,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "ConfigTree",
-    "KeyPath",
     "Settings",
     "expert",
     "override",
@@ -19,26 +18,12 @@ __all__ = [
 
 if TYPE_CHECKING:
     from slam_graph.settings.base import Settings, expert
-    from slam_graph.settings.tree import (
-        ConfigTree,
-        KeyPath,
-        override,
-        override_trees,
-        read_tree,
-        validate,
-    )
+    from slam_graph.settings.tree import ConfigTree, override, override_trees, read_tree, validate
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "base": ("Settings", "expert"),
-            "tree": (
-                "ConfigTree",
-                "KeyPath",
-                "override",
-                "override_trees",
-                "read_tree",
-                "validate",
-            ),
+            "tree": ("ConfigTree", "override", "override_trees", "read_tree", "validate"),
         },
     )
