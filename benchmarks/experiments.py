@@ -48,7 +48,7 @@ def compared(
     folder: Path,
     sources: Sequence[Source],
     configs: dict[str, RunConfig],
-    seeds: int = 1,
+    seeds: int | Sequence[int] = 1,
     workers: int | None = None,
 ) -> Comparison:
     """Do what has not been done yet, and tell of it on stderr.
@@ -57,7 +57,7 @@ def compared(
         folder: of tracks and results.
         sources: what to run on.
         configs: settings under each algorithm.
-        seeds: how many.
+        seeds: how many, or which.
         workers: processes at a time; as many as there are cores if not said.
     """
     return run_tasks(sources, configs, seeds, folder, LocalProcesses(workers), _tell)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
@@ -86,6 +87,15 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
             return part
 
         return registered
+
+    @contextmanager
+    def registered(self, name: str, part: PartT) -> Iterator[None]:
+        """Register a part for the length of a block, as tests and notebooks want it."""
+        self.register(name)(part)
+        try:
+            yield
+        finally:
+            del self._parts[name]
 
     def __getitem__(self, name: str) -> PartT:
         """The part with a name.

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import cost_over_time, monte_carlo, report, run, speed, speed_worker
+from benchmarks import (
+    cost_over_time,
+    monte_carlo,
+    policy_product,
+    report,
+    run,
+    speed,
+    speed_worker,
+)
 from benchmarks.metric import Bar, Direction, Metric, info
 from benchmarks.openvins_sim import Quality, best
 from benchmarks.registry import BENCHMARKS
@@ -315,6 +323,20 @@ def test_monte_carlo_accepts_a_right_or_careful_covariance(scale: float, met: bo
     assert len(judged) == len(dof)
     assert all(metric.meets_bar is met for metric in judged)
     assert not any(metric.meets_bar for metric in monte_carlo.consistency([]))
+
+
+@pytest.mark.parametrize(("scale", "met"), [(0.5, True), (1.0, True), (2.0, False)])
+def test_a_combination_of_policies_may_be_careful_but_not_too_sure(scale: float, met: bool) -> None:
+    rng = np.random.default_rng(3)
+    runs = [{"nees_pose": scale * rng.chisquare(6, 80)} for _ in policy_product.SEEDS]
+    assert policy_product.pose_nees(runs).meets_bar is met
+    assert not policy_product.pose_nees([]).meets_bar
+
+
+def test_each_combination_of_policies_is_measured_under_its_own_name() -> None:
+    names = [algorithm.name for algorithm in policy_product.product()]
+    assert len(set(names)) == len(names)
+    assert {name.split("-")[0] for name in names} >= {"most_recent", "evenly_spaced", "keyframes"}
 
 
 def test_a_long_flight_is_measured_in_a_process_of_its_own() -> None:

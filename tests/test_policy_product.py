@@ -8,11 +8,9 @@ of all measurements so far, and as much where nothing is thrown away. The combin
 from the policies' own types and registries; two policies that are registered here are among them.
 """
 
-import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -20,9 +18,9 @@ import pytest
 from flight import rig, room
 from gtsam.symbol_shorthand import B, V, X
 from linear_flight import CONFIG, batch_problem, exact_recording
-from pydantic import ValidationError
 from scipy.linalg import eigvalsh, solve_triangular
 
+from benchmarks.policy_combinations import Options, combinations, values_of
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig, TriangulationConfig
 from slam_graph.backend.cost.feature_policies import (
@@ -50,7 +48,6 @@ LOOSE = BackendConfig(
 )
 
 
-@POSE_SELECTIONS.register("test_without_second_newest")
 def without_second_newest(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
     """Drops a pose out of the middle; what it saw is used."""
     past = window.past
@@ -61,41 +58,51 @@ def _seen_thrice(tracks: WaitingTracks) -> BoolArray:
     return (tracks.lengths >= 3) | tracks.leaving
 
 
-FEATURE_POLICIES.register("test_seen_thrice")(FeaturePolicy(_seen_thrice))
+FROM_OUTSIDE = ("second_newest_leaves", "seen_thrice")
+"""A pose selection and a feature policy that are not of the package."""
 
-CHOICES: dict[str, list[Any]] = {
-    "max_past_poses": [FEW, MANY],
-    "recent_frames": [1, 3],
-    "max_state_features": [0, 5, None],
-    "keep_lost_features": [False, True],
-    "max_features_per_step": [4, CostPolicy().max_features_per_step],
+
+@pytest.fixture(scope="module", autouse=True)
+def outside() -> Iterator[None]:
+    poses, features = FROM_OUTSIDE
+    with (
+        POSE_SELECTIONS.registered(poses, without_second_newest),
+        FEATURE_POLICIES.registered(features, FeaturePolicy(_seen_thrice)),
+    ):
+        yield
+
+
+CHOICES: tuple[Options, ...] = (
+    values_of("cost.max_past_poses", (FEW, MANY)),
+    values_of("cost.recent_frames", (1, 3)),
+    {
+        "held0": {"cost.max_state_features": 0},
+        "held5": {"cost.max_state_features": 5, "cost.state_feature_frames": 3},
+        "all held": {"cost.max_state_features": None, "cost.state_feature_frames": 3},
+    },
+    values_of("cost.keep_lost_features", (False, True)),
+    values_of("cost.max_features_per_step", (4, CostPolicy().max_features_per_step)),
+)
+ONE_STEP: Options = {"one step": {"gauss_newton.max_steps": 1}}
+STEPS: Options = {
+    **ONE_STEP,
+    "steps": {"gauss_newton.max_steps": 3},
+    "damped": {"gauss_newton.max_steps": 3, "gauss_newton.damping": "levenberg_marquardt"},
 }
-STEPS: list[dict[str, Any]] = [
-    {"max_steps": 1},
-    {"max_steps": 3},
-    {"max_steps": 3, "damping": "levenberg_marquardt"},
-]
 
 
-def combinations(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
+def accepted(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
     """All algorithms that are accepted with a selection of poses and a feature policy."""
-    for values in itertools.product(*CHOICES.values()):
-        cost = dict(zip(CHOICES, values, strict=True))
-        cost |= {"past_poses": past_poses, "features": features}
-        if cost["max_state_features"] != 0:
-            cost["state_feature_frames"] = 3
-        steps_and_points = itertools.product(STEPS, (True, False))
-        if "test" in past_poses + features:  # for policies from outside, one kind of step
-            steps_and_points = itertools.product(STEPS[:1], (True,))
-        for steps, first in steps_and_points:
-            table = {
-                "name": "product",
-                "cost": cost,
-                "gauss_newton": steps,
-                "marginalization": {"first_estimates": first},
-            }
-            with contextlib.suppress(ValidationError):
-                yield AlgorithmConfig.model_validate(table)
+    from_outside = (
+        past_poses in FROM_OUTSIDE or features in FROM_OUTSIDE
+    )  # for these, one kind of step
+    return combinations(
+        values_of("cost.past_poses", (past_poses,)),
+        values_of("cost.features", (features,)),
+        *CHOICES,
+        ONE_STEP if from_outside else STEPS,
+        values_of("marginalization.first_estimates", (True,) if from_outside else (True, False)),
+    )
 
 
 def throws_nothing_away(algorithm: AlgorithmConfig) -> bool:
@@ -149,14 +156,14 @@ def check_ledger(tracks: FeatureTracks) -> None:
     assert tracks.added == len(tracks) + sum(tracks.outcomes.values())
 
 
-@pytest.mark.parametrize("features", list(FEATURE_POLICIES))
-@pytest.mark.parametrize("past_poses", list(POSE_SELECTIONS))
+@pytest.mark.parametrize("features", [*FEATURE_POLICIES, FROM_OUTSIDE[1]])
+@pytest.mark.parametrize("past_poses", [*POSE_SELECTIONS, FROM_OUTSIDE[0]])
 def test_no_measurement_counts_twice(
     past_poses: str, features: str, batches: list[tuple[Rig, Batch]]
 ) -> None:
     faults: list[str] = []
     seen: Counter[str] = Counter()
-    for number, algorithm in enumerate(combinations(past_poses, features)):
+    for number, algorithm in enumerate(accepted(past_poses, features)):
         mounted, truth = batches[number % 2]
         estimator = Estimator(mounted, algorithm, LOOSE)
         estimator.start(truth.start)

@@ -28,7 +28,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 
-_CALIBRATION_KINDS = frozenset("ekdt")
+CALIBRATION_KINDS = frozenset("ekdt")
 """Symbols of the parameters of the rig, which are always linearised at their estimates."""
 
 
@@ -60,9 +60,9 @@ class WindowGraph:
         for key in self.values.keys():  # noqa: SIM118
             kind = chr(gtsam.Symbol(key).chr())
             if kind == "e":  # increments are added to the offset from the first estimate
-                first, now = points.atPose3(key), self.values.atPose3(key)
-                tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(now))
-            if kind in _CALIBRATION_KINDS:
+                first, pose = points.atPose3(key), self.values.atPose3(key)
+                tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(pose))
+            if kind in CALIBRATION_KINDS:
                 _copy_calibration(self.values, points, key)
         linear = gtsam.GaussianFactorGraph()
         for number, loss in enumerate(self.losses):
@@ -74,7 +74,8 @@ class WindowGraph:
                 jacobian.getA()[:] *= np.sqrt(here / there)
             if at is points:
                 _turn(jacobian, tangents)
-            jacobian.getb()[:] = gtsam.JacobianFactor(factor.linearize(self.values)).getb()
+            now = gtsam.JacobianFactor(factor.linearize(self.values))  # owns what getb() shows
+            jacobian.getb()[:] = now.getb()
             linear.add(jacobian)
         return linear
 

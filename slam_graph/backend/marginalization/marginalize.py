@@ -34,7 +34,7 @@ LinearizationPoints = Literal["first", "current", "corrected"]
 def marginalize_step(
     window: Window, constructed: ConstructedCost, minimum: Minimum, algorithm: AlgorithmConfig
 ) -> None:
-    """End a step: the only place where the window changes after the current frame was appended.
+    """End a step that has succeeded: the window gets the new state and prior, and loses the rest.
 
     Args:
         window: gets the new state and prior; loses what does not stay.

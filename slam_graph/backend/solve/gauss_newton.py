@@ -22,9 +22,9 @@ from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 
 INITIAL_DAMPING = 1e-4
-_MAX_DAMPING = 1e6
-_MAX_REPEATED_STEPS = 4
-"""How often a step is repeated at most where it is too large to be linear."""
+MAX_DAMPING = 1e6
+MAX_REPEATED_STEPS = 4
+"""Steps in all, at most, where the calibration moves too far for the first to be linear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ def minimize(
         cost: moved in place: its state, and its new features.
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
-        again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
+        again: asks for more steps than the policy has, up to `MAX_REPEATED_STEPS` in all.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
@@ -87,7 +87,7 @@ def _another(
     steps = len(minimum.costs) - 1
     if steps < policy.max_steps:
         return bool(np.max(np.abs(delta), initial=0.0) >= policy.tolerance)
-    return again is not None and steps < _MAX_REPEATED_STEPS and again(minimum.posterior, delta)
+    return again is not None and steps < MAX_REPEATED_STEPS and again(minimum.posterior, delta)
 
 
 def _step(
@@ -125,7 +125,7 @@ def _levenberg_marquardt(
         value = cost.value()
         if not value < costs[-1]:
             cost.restore(before)
-            if _promised(system) < policy.tolerance * costs[-1] or damping > _MAX_DAMPING:
+            if _promised(system) < policy.tolerance * costs[-1] or damping > MAX_DAMPING:
                 break
             damping = max(10.0 * damping, INITIAL_DAMPING)
             continue
