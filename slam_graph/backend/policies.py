@@ -91,6 +91,12 @@ class CostPolicy(Settings):
                 "features: state measures only features of the state, and max_state_features: 0 "
                 "allows none; raise it, or use features: once"
             )
+        if holds_none and (self.past_poses, self.features) == ("evenly_spaced", "every_step"):
+            raise ValueError(
+                "features: every_step makes a feature part of the prior when a pose that saw it "
+                "leaves, and past_poses: evenly_spaced drops its observations, so none would be; "
+                "use most_recent or keyframes, or max_state_features above 0"
+            )
         if holds_none:
             self._refuse(
                 ("keep_lost_features", "state_feature_frames", "state_feature_depth_error"),
