@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
 from benchmarks.metric import TIMING_TOLERANCE, Metric, info
 from benchmarks.suite import GROWING, PEERS, RECURSIVE, UNBOUNDED, Benchmark, Outcome
-from slam_graph.experiment.comparison import Comparison
 from slam_graph.experiment.comparison_figures import draw
+from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import Series, read_series
 from slam_graph.experiment.sources import find_sources
 

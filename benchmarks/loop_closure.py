@@ -14,11 +14,11 @@ import numpy as np
 from benchmarks.metric import EXACT, TIMING_TOLERANCE, Metric, info
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.config import load_config
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.loop_closure.close_loops import LoopClosures
+from slam_graph.loop_closure.loop_closing import LoopClosures
 from slam_graph.loop_closure.place_recognition import PlaceDatabase, Vocabulary
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate

@@ -17,7 +17,7 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.maps.map_merge import merge_maps
 from slam_graph.maps.map_model import SlamMap
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.localization_result import errors_in_map, map_alignment
 from slam_graph.results.run_result import RunResult
 from slam_graph.simulation.simulated_sequence import SimulatedSequence

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.speed_worker import peak_memory_mb
 from slam_graph.config import load_config
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.simulation.simulation_config import (
     FlightConfig,
     LandmarkConfig,

@@ -21,8 +21,8 @@ from benchmarks.experiments import compared, configs_of, folder_of, note_failure
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.suite import RECURSIVE, Benchmark, Outcome
 from slam_graph.evaluation.consistency import average_nees, mean_bounds
-from slam_graph.experiment.comparison import WITHOUT_FEJ, Comparison, with_variants
 from slam_graph.experiment.comparison_figures import NEES_DOF
+from slam_graph.experiment.comparison_plan import WITHOUT_FEJ, Comparison, with_variants
 from slam_graph.experiment.comparison_results import Series, read_series
 from slam_graph.experiment.sources import find_sources
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.suite import Benchmark, Outcome
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.pose_graph.certificate import certify
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_cost import chi2_table

@@ -15,7 +15,7 @@ from benchmarks.experiments import compared, configs_of, folder_of, note_failure
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import is_held_out
 from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
-from slam_graph.experiment.comparison import Comparison
+from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.sources import find_sources
 
 FLIGHTS = tuple(

@@ -15,12 +15,12 @@ from threadpoolctl import threadpool_limits
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.choices import PoseRelation
 from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
 from slam_graph.visualization.viewer import NullViewer
 

@@ -15,22 +15,17 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.errors import ConfigError
-from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.loop_closure.loop_config import LoopClosureConfig
-from slam_graph.maps.map_config import LocalizationConfig, MapConfig
-from slam_graph.settings.base import Settings, expert
-from slam_graph.settings.tree import ConfigTree, closest, override_trees, read_tree, validate
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend import AlgorithmConfig, BackendConfig
+from slam_graph.errors import ConfigError, closest
+from slam_graph.frontend import FrontendConfig
+from slam_graph.loop_closure import LoopClosureConfig
+from slam_graph.maps import LocalizationConfig, MapConfig
+from slam_graph.settings import ConfigTree, Settings, expert, override_trees, read_tree, validate
+from slam_graph.smoothing import FinalBaConfig
 
 __all__ = [
     "LimitsConfig",
     "RunConfig",
-    "algorithm_names",
-    "algorithm_tree",
-    "config_folder",
     "dump_yaml",
     "load_config",
 ]

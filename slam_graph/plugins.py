@@ -26,7 +26,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from slam_graph.errors import ConfigError, closest
 
-__all__ = ["Choice", "Registry", "UnknownNameError"]
+__all__ = ["Choice", "Registry"]
 
 PartT = TypeVar("PartT")
 RegisteredT = TypeVar("RegisteredT")
@@ -76,7 +76,10 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         """
 
         def registered(part: RegisteredT) -> RegisteredT:
-            if self._own().get(name, part) is not part:
+            built_in = getattr(part, "__module__", "").partition(".")[0] == __package__
+            # What comes with the package may be imported before the others of its kind.
+            known = self._parts if built_in else self._own()
+            if known.get(name, part) is not part:
                 raise ConfigError(
                     f"{self.kind} '{name}' is registered already; choose another name"
                 )

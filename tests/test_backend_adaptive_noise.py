@@ -8,7 +8,7 @@ import pytest
 from slam_graph.backend.cost.adaptive_noise import DensityScale
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 

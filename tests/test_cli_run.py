@@ -14,7 +14,7 @@ from limits import HANG_S
 
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.pipeline.run import run as run_pipeline
+from slam_graph.pipeline.run_recording import run as run_pipeline
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "run"]
 

@@ -20,7 +20,7 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.formats.euroc_writer import convert_to_euroc
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig

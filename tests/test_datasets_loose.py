@@ -27,9 +27,9 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.pipeline.run import run
+from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame
 
 WITHOUT_IMU = CHAIN.replace(CHAIN.splitlines()[1] + "\n", "")

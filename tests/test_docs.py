@@ -9,7 +9,7 @@ from typing import Any
 
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

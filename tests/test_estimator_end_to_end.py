@@ -14,10 +14,10 @@ import pytest
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.choices import PoseRelation
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import Trajectory, seconds_text, tum_lines

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.evaluation.relative_pose_error import rpe
 
 RELATIVE_TOLERANCE = 1e-9
 PEERS = ["openvins_stereo", "okvis2_slam_causal"]

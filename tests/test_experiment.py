@@ -20,7 +20,7 @@ from limits import HANG_S
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
 from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
@@ -28,7 +28,7 @@ from slam_graph.experiment.comparison_results import ALIGNMENTS
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import RecordTask, RunTask
-from slam_graph.pipeline.run import run as run_pipeline
+from slam_graph.pipeline.run_recording import run as run_pipeline
 from slam_graph.results.metrics import peak_memory_mb
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]

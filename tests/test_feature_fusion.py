@@ -17,7 +17,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import EstimationError
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import FeatureObservations
 from slam_graph.simulation.simulated_sequence import SimulatedSequence

@@ -16,10 +16,10 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import write_kalibr

@@ -26,8 +26,8 @@ from images import (
 )
 
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.build_frontend import build_frontend
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
+from slam_graph.frontend.frontend_factory import build_frontend
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.imu_motion import ImuMotion
 from slam_graph.frontend.keypoints import spread

@@ -16,7 +16,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.association import Association
 from slam_graph.frontend.lucas_kanade import CornerTracking
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
 from slam_graph.sensors.rig import Rig

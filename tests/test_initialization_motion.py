@@ -21,7 +21,7 @@ from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.frontend.build_frontend import build_frontend
+from slam_graph.frontend.frontend_factory import build_frontend
 from slam_graph.geometry.interpolation import interpolate
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params

@@ -12,7 +12,7 @@ import slam_graph
 PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
-    {"errors", "diagnostics", "version", "arrays"},
+    {"errors", "diagnostics", "version", "arrays", "lazy"},
     {"plugins"},
     {"settings", "geometry"},
     {"sensors"},

@@ -10,9 +10,9 @@ import pytest
 from loop_flights import CONFIG, tour, true_relative
 from scipy.spatial.transform import Rotation
 
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.loop_closure.close_loops import LoopClosures, close_loops, correct_by
+from slam_graph.loop_closure.loop_closing import LoopClosures, close_loops, correct_by
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.loop_closure.loop_pose_graph import level_graph, split_yaw

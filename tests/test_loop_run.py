@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import SavedRun, load_result
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.map_output import load_map, save_map
 from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate

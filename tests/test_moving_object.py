@@ -11,7 +11,7 @@ import pytest
 
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.kalibr_calibration import write_kalibr

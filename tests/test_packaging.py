@@ -67,7 +67,8 @@ def test_wheel_holds_nothing_else(wheel: Path) -> None:
 
 def test_installed_package_finds_its_configurations(installed: Path, tmp_path: Path) -> None:
     script = (
-        "from slam_graph.config import *; print(config_folder(), *algorithm_names(), sep='\\n')"
+        "from slam_graph.config import algorithm_names, config_folder; "
+        "print(config_folder(), *algorithm_names(), sep='\\n')"
     )
     folder, *names = run("-c", script, cwd=tmp_path, PYTHONPATH=str(installed)).splitlines()
     assert Path(folder) == installed / "slam_graph" / "configs"

@@ -19,7 +19,7 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.config import RunConfig
 from slam_graph.evaluation.consistency import mean_bounds, nees
 from slam_graph.experiment.sources import find_sources
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.settings.tree import ConfigTree, validate
 
 SAMPLE_SEED = "SLAM_GRAPH_SAMPLE_SEED"

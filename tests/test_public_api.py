@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public names: imported late, documented, and as easy to use as the documents say."""
 
-import ast
 import inspect
 import re
 import subprocess
@@ -30,22 +29,6 @@ def test_importing_the_package_imports_nothing_heavy() -> None:
     code = f"import sys, slam_graph; print([m for m in {HEAVY} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_type_checkers_see_the_names_that_are_imported_late() -> None:
-    tree = ast.parse(Path(sg.__file__).read_text(encoding="utf-8"))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    seen = {
-        alias.name: node.module
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert seen == sg._HOME
-    assert set(NAMES) == set(seen)
-    assert set(NAMES) <= set(dir(sg))
-    with pytest.raises(AttributeError, match="no attribute 'runs'"):
-        sg.runs  # noqa: B018
 
 
 def test_every_public_name_is_a_function_or_a_class_with_a_docstring() -> None:

@@ -25,9 +25,9 @@ from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import imu_state_keys
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.evaluation.ape import ape
+from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline.run import run
+from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.camera import Camera
 
 PLAIN = replace(RADTAN, distortion="none", coefficients=())

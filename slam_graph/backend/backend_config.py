@@ -9,19 +9,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from slam_graph.settings.base import Settings, expert
-
-__all__ = [
-    "AdaptiveNoiseConfig",
-    "BackendConfig",
-    "CalibrationConfig",
-    "GatingConfig",
-    "InitializationConfig",
-    "NoiseConfig",
-    "PriorConfig",
-    "TriangulationConfig",
-    "ZeroVelocityConfig",
-]
+from slam_graph.settings import Settings, expert
 
 
 class AdaptiveNoiseConfig(Settings):

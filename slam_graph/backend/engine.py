@@ -18,10 +18,8 @@ from slam_graph.backend.solve.gauss_newton import Minimum, minimize
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph, window_graph
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import FeatureFrame
-
-__all__ = ["SquareRootEngine"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
 
 
 class SquareRootEngine:

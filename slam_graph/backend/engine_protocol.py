@@ -28,12 +28,8 @@ from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.measurements import FeatureFrame
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["Engine", "EngineContext", "StepReport"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, ImuBuffer, Rig
 
 
 @dataclass(eq=False)

@@ -33,16 +33,12 @@ from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.calibration_estimate import CalibrationEstimate
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.geometry import NavState
+from slam_graph.sensors import CalibrationEstimate, FeatureFrame, FeatureObservations, ImuData, Rig
 
-__all__ = ["Estimator"]
-
-IMU_HISTORY_NS = 10_000_000_000
+_IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
-MAX_AHEAD_NS = 10_000_000_000
+_MAX_AHEAD_NS = 10_000_000_000
 """A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
 
@@ -128,12 +124,12 @@ class Estimator:
         imu, calibration = self._context.imu, self._context.calibration
         state = self.window.state if self.window is not None else None
         stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
-        if not self._latest_ns < stamp_ns <= imu.newest_ns() + MAX_AHEAD_NS:
+        if not self._latest_ns < stamp_ns <= imu.newest_ns() + _MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = stamp_ns
-        imu.forget_before(stamp_ns - IMU_HISTORY_NS)
+        imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
         frame = self._usable(frame)
         with self._threads.limit(limits=1, user_api="blas"):
             still = self._standstill.is_still(imu, stamp_ns, frame)

@@ -27,11 +27,7 @@ from slam_graph.backend.solve.state import (
     distortion_key,
     letter_and_index,
 )
-from slam_graph.sensors.calibration_estimate import CalibrationEstimate
-from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.rig import Rig, RigCamera
-
-__all__ = ["CalibrationVariables"]
+from slam_graph.sensors import CalibrationEstimate, ImuBuffer, Rig, RigCamera
 
 _MAX_EARLY_NS = 50_000_000
 """A frame may be taken this much too early where the IMU has no samples yet."""

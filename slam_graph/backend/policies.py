@@ -28,7 +28,7 @@ from pydantic_core import PydanticCustomError
 from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
 from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
 from slam_graph.plugins import Choice
-from slam_graph.settings.base import Settings, expert
+from slam_graph.settings import Settings, expert
 
 STATE_FEATURE_FRAMES = 10
 """Features seen in fewer frames are worth more when they are used once, with all observations."""

@@ -16,7 +16,7 @@ from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
-from slam_graph.geometry.trajectory import NavState
+from slam_graph.geometry import NavState
 
 
 def _no_ids() -> IntArray:

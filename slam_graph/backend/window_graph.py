@@ -28,8 +28,6 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 
-__all__ = ["WindowGraph", "window_graph"]
-
 CALIBRATION_KINDS = frozenset("ekdt")
 """Symbols of the parameters of the rig, which are always linearised at their estimates."""
 

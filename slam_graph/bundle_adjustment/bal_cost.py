@@ -26,8 +26,6 @@ from slam_graph.bundle_adjustment.bal_problem import (
     project,
 )
 
-__all__ = ["BalCost", "construct", "initial_estimates", "reprojection_errors", "retract"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BalCost:

@@ -20,8 +20,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem
 from slam_graph.errors import DataError
 
-__all__ = ["bal_lines", "is_bal", "read_bal"]
-
 _BZIP2_MAGIC = b"BZh"
 _HEADER = 3
 _OBSERVATION = 4

@@ -12,18 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend import RobustLoss
 from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
-from slam_graph.settings.base import Settings, expert
-
-__all__ = [
-    "BalCostPolicy",
-    "BalMinimum",
-    "BalPolicy",
-    "BalSolution",
-    "BalStepsPolicy",
-    "Intrinsics",
-]
+from slam_graph.settings import Settings, expert
 
 Intrinsics = Literal["per_camera", "shared", "fixed"]
 Robust = Literal["none", "huber", "cauchy"]

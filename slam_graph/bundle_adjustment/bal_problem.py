@@ -25,18 +25,6 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 
-__all__ = [
-    "CAMERA_DIM",
-    "POSE_DIM",
-    "BalEstimates",
-    "BalLinearization",
-    "BalPart",
-    "BalProblem",
-    "linearize",
-    "project",
-    "usable",
-]
-
 POSE_DIM = 6
 CAMERA_DIM = 9
 """Tangent of a camera: rotation, translation, f k1 k2."""

@@ -33,22 +33,10 @@ from slam_graph.bundle_adjustment.bal_cost import BalCost
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalPart
 from slam_graph.errors import EstimationError
 
-__all__ = [
-    "GAUGE_DIM",
-    "BalStep",
-    "NormalEquations",
-    "Structure",
-    "damped_step",
-    "gauge_directions",
-    "normal_equations",
-    "restore_gauge",
-    "structure",
-]
-
 GAUGE_DIM = 7
 """Unobservable directions: translation, rotation and scale of the world."""
 
-RowArray = NDArray[np.int32]
+_RowArray = NDArray[np.int32]
 
 _MAX_CAMERAS = 1_800
 """The dense reduced system of more cameras needs over 2 GB, and 6 GB to be solved."""
@@ -67,10 +55,10 @@ class _CommonPoints:
         starts: (M + 1,) first pair of each of these cameras, and K.
     """
 
-    first: RowArray
-    second: RowArray
-    others: RowArray
-    starts: RowArray
+    first: _RowArray
+    second: _RowArray
+    others: _RowArray
+    starts: _RowArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

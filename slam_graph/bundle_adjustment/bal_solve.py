@@ -10,12 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.backend.solve.damped_steps import (
-    Attempt,
-    GainRatioDamping,
-    StepSettings,
-    levenberg_marquardt,
-)
+from slam_graph.backend import Attempt, GainRatioDamping, StepSettings, levenberg_marquardt
 from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, initial_estimates, retract
 from slam_graph.bundle_adjustment.bal_policy import (
     BalMinimum,
@@ -42,13 +37,11 @@ from slam_graph.bundle_adjustment.bal_schur import (
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 
-__all__ = ["adjust_bundle"]
-
 INITIAL_DAMPING = 1e-4
 """Of the first step, relative to the diagonal of the information."""
-NEGLIGIBLE_COST = 1e-14
+_NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each observation is rounding: all pixels agree."""
-CONVERGENCE_DAMPING = 0.1
+_CONVERGENCE_DAMPING = 0.1
 """A small decrease is a sign of convergence only up to this damping: beyond it, steps are small
 because they are damped."""
 
@@ -98,7 +91,7 @@ def _minimize(
     problem, damping = _DampedBundle(cost, start), GainRatioDamping(INITIAL_DAMPING)
     if not np.isfinite(problem.value()):
         raise EstimationError(f"{cost.part.problem.name}: the cost at the start is not finite")
-    negligible = NEGLIGIBLE_COST * len(cost.part.problem.pixels)
+    negligible = _NEGLIGIBLE_COST * len(cost.part.problem.pixels)
 
     def converged(attempt: Attempt) -> bool:
         if attempt.accepted:
@@ -108,7 +101,8 @@ def _minimize(
         if value <= negligible:
             return True
         return (
-            attempt.damping <= CONVERGENCE_DAMPING and decrease <= policy.tolerance * attempt.before
+            attempt.damping <= _CONVERGENCE_DAMPING
+            and decrease <= policy.tolerance * attempt.before
         )
 
     steps = levenberg_marquardt(problem, StepSettings(policy.max_steps, converged), damping)

@@ -13,10 +13,7 @@ from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.experiment.comparison_plan import Comparison
-    from slam_graph.experiment.tasks import Task
-
-__all__ = ["compare"]
+    from slam_graph.experiment import Comparison, Task
 
 
 def compare(
@@ -81,7 +78,7 @@ def compare(
 
     Given the same OUTPUT again, only what has not been done yet is done.
     """
-    from slam_graph.experiment.comparison import compare as run_comparison
+    from slam_graph.experiment import compare as run_comparison
 
     try:
         comparison = run_comparison(
@@ -131,10 +128,9 @@ def _print_task(task: Task, failure: str | None, count: int, total: int) -> None
 
 def _echo(comparison: Comparison) -> None:
     """Print the table and the names of the files."""
-    from slam_graph.experiment.comparison_report import COLUMNS, cells
+    from slam_graph.experiment import text_table
 
-    table = [("data", *COLUMNS), *((str(row["data"]), *cells(row)) for row in comparison.rows)]
-    echo_table(_informative(table))
+    echo_table(_informative(text_table(comparison.rows)))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")

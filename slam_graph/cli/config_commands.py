@@ -12,8 +12,6 @@ import typer
 from slam_graph.cli.options import Algorithm, ConfigFile, Overrides
 from slam_graph.cli.printing import echo_json
 
-__all__ = ["app"]
-
 app = typer.Typer(
     help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode=None
 )

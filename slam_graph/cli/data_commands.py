@@ -24,9 +24,7 @@ from slam_graph.cli.options import (
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.datasets.sequence import Sequence
-
-__all__ = ["app"]
+    from slam_graph.datasets import Sequence
 
 app = typer.Typer(
     help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode=None
@@ -65,7 +63,7 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Read a recording and report faults in it; the exit code is 1 if it is unusable."""
-    from slam_graph.datasets.data_checks import check_sequence
+    from slam_graph.datasets import check_sequence
 
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
     findings = check_sequence(sequence, read_images=images)
@@ -94,7 +92,7 @@ def convert(
 ) -> None:
     """Write a recording of images as an EuRoC folder, whole or not at all."""
     from slam_graph.cli.progress import ProgressBar
-    from slam_graph.datasets.formats.euroc_writer import convert_to_euroc, refuse_existing
+    from slam_graph.datasets import convert_to_euroc, refuse_existing
 
     refuse_existing(output, force)
     sequence = open_recording(data, format_, calibration, groundtruth, sources)

@@ -12,14 +12,11 @@ import typer
 
 from slam_graph.cli.options import Json
 from slam_graph.cli.printing import echo_json, echo_table
-from slam_graph.evaluation.choices import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
+from slam_graph.evaluation import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
 
 if TYPE_CHECKING:
-    from slam_graph.evaluation.ape import ErrorSeries
-    from slam_graph.geometry.trajectory import Trajectory
-    from slam_graph.geometry.trajectory_alignment import AlignmentMode
-
-__all__ = ["ape", "rpe"]
+    from slam_graph.evaluation import ErrorSeries
+    from slam_graph.geometry import AlignmentMode, Trajectory
 
 _Align = Literal["none", "yaw", "se3", "sim3"]
 
@@ -65,7 +62,7 @@ def ape(
     as_json: Json = False,
 ) -> None:
     """Absolute pose error of ESTIMATE against REFERENCE."""
-    from slam_graph.evaluation.ape import ape as absolute_pose_error
+    from slam_graph.evaluation import ape as absolute_pose_error
 
     mode = _alignment(align_se3, correct_scale, align)
     truth, guess = _read(reference), _read(estimate)
@@ -101,7 +98,7 @@ def rpe(
     as_json: Json = False,
 ) -> None:
     """Relative pose error (drift) of ESTIMATE against REFERENCE."""
-    from slam_graph.evaluation.rpe import rpe as relative_pose_error
+    from slam_graph.evaluation import rpe as relative_pose_error
 
     mode = _alignment(align_se3, correct_scale, align)
     result = relative_pose_error(
@@ -143,7 +140,7 @@ def _pairing(t_max_diff: float | None) -> Pairing:
 
 def _read(path: Path) -> Trajectory:
     """Read a trajectory file."""
-    from slam_graph.datasets.groundtruth import read_groundtruth
+    from slam_graph.datasets import read_groundtruth
 
     return read_groundtruth(path)
 

@@ -31,11 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from slam_graph.config import RunConfig
-    from slam_graph.datasets.sequence import Sequence
-    from slam_graph.experiment.frontend_comparison import FrontendReport
-    from slam_graph.pipeline.tracking import TrackedPacket
-
-__all__ = ["app"]
+    from slam_graph.datasets import Sequence
+    from slam_graph.experiment import FrontendReport
+    from slam_graph.pipeline import TrackedPacket
 
 _EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
@@ -83,7 +81,7 @@ def run(
 ) -> None:
     """Track a recording, report how good the tracks are, and draw them."""
     from slam_graph.config import load_config
-    from slam_graph.experiment.frontend_comparison import track
+    from slam_graph.experiment import track
 
     settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
     sequence = open_recording(data, format_, calibration, groundtruth, sources, settings.cameras)
@@ -122,7 +120,7 @@ def compare(
 ) -> None:
     """Run several front ends on one recording, and print a table."""
     from slam_graph.config import load_config
-    from slam_graph.experiment.frontend_comparison import parse_frontends, track, track_and_estimate
+    from slam_graph.experiment import parse_frontends, track, track_and_estimate
 
     options = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
@@ -152,9 +150,9 @@ def _watch(
     stack: ExitStack,
 ) -> Callable[[TrackedPacket], None]:
     """A function that draws each frame, and records it if asked for."""
-    from slam_graph.datasets.formats.track_recorder import TrackRecorder
-    from slam_graph.sensors.measurements import CameraFrame
-    from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
+    from slam_graph.datasets import TrackRecorder
+    from slam_graph.sensors import CameraFrame
+    from slam_graph.visualization import TrackPainter, TrackVideo, save_picture
 
     painter = TrackPainter()
     film = None if video is None else stack.enter_context(TrackVideo(video))

@@ -31,8 +31,6 @@ from slam_graph.cli.options import (
 )
 from slam_graph.cli.run import execute, report
 
-__all__ = ["localize"]
-
 
 def localize(
     data: Data,
@@ -71,7 +69,7 @@ def localize(
     """
     from slam_graph.config import load_config
     from slam_graph.errors import EstimationError
-    from slam_graph.results.map_output import find_map, load_map
+    from slam_graph.results import find_map, load_map
 
     options: dict[str, Any] = {
         "algorithm": algorithm,

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["collected_log", "remove_if_empty"]
-
 
 class _ListHandler(logging.Handler):
     """Keeps formatted lines."""

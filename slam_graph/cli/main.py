@@ -31,8 +31,6 @@ from slam_graph.cli.options import INTERRUPTED
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
 
-__all__ = ["app", "main"]
-
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
 # where other work shares the cores. OpenBLAS reads this when NumPy is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -17,9 +17,7 @@ from slam_graph.cli.options import (
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.maps.map_model import MapRecording, SlamMap
-
-__all__ = ["app"]
+    from slam_graph.maps import MapRecording, SlamMap
 
 app = typer.Typer(help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -32,7 +30,7 @@ _Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.
 @app.command()
 def info(path: _MapPath, as_json: Json = False) -> None:
     """Show what a map holds."""
-    from slam_graph.results.map_output import find_map, load_map
+    from slam_graph.results import find_map, load_map
 
     file = find_map(path)
     table = _describe(load_map(file), file)
@@ -66,8 +64,7 @@ def export(
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
-    from slam_graph.results.map_output import export_ply, export_tum, load_map
-    from slam_graph.results.result_files import refuse_to_replace
+    from slam_graph.results import export_ply, export_tum, load_map, refuse_to_replace
 
     if ply is None and tum is None:
         raise ConfigError("nothing to write: give --ply FILE, --tum FILE, or both")
@@ -96,9 +93,8 @@ def merge(
     from dataclasses import asdict
 
     from slam_graph.config import load_config
-    from slam_graph.maps.map_merge import merge_maps
-    from slam_graph.results.map_output import load_map, save_map
-    from slam_graph.results.result_files import refuse_to_replace
+    from slam_graph.maps import merge_maps
+    from slam_graph.results import load_map, refuse_to_replace, save_map
 
     settings = load_config(config, set_ or ())
     refuse_to_replace(output, force)

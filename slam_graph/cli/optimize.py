@@ -21,8 +21,6 @@ from slam_graph.cli.options import (
 )
 from slam_graph.errors import ConfigError, DataError
 
-__all__ = ["optimize"]
-
 _Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
 _Initial = Literal["auto", "chordal", "lago", "odometry", "file"]
 _Format = Literal["auto", "pose_graph", "bal"]
@@ -85,8 +83,8 @@ def optimize(
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
-    from slam_graph.bundle_adjustment.bal_policy import BalPolicy
-    from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
+    from slam_graph.bundle_adjustment import BalPolicy
+    from slam_graph.pose_graph import PoseGraphPolicy
 
     if save is not None and save.exists() and not force:
         raise DataError(f"{save}: exists already; use --force to replace it")
@@ -117,7 +115,7 @@ def _seen_format(file: Path) -> _Format:
     Raises:
         DataError: if it is a map.
     """
-    from slam_graph.bundle_adjustment.bal_file import is_bal
+    from slam_graph.bundle_adjustment import is_bal
 
     if file.is_dir() or is_zipfile(file):
         raise DataError(

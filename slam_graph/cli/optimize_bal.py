@@ -15,20 +15,17 @@ from slam_graph.cli.optimize_common import timed, write_result
 from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
-    from slam_graph.bundle_adjustment.bal_policy import BalPolicy
-    from slam_graph.results.bundle_result import BalResult
-
-__all__ = ["optimize_bal"]
+    from slam_graph.bundle_adjustment import BalPolicy
+    from slam_graph.results import BalResult
 
 
 def optimize_bal(
     file: Path, policy: BalPolicy, save: Path | None, output: Path, as_json: bool
 ) -> None:
     """Estimate all cameras and points, write the results and print what was reached."""
-    from slam_graph.bundle_adjustment.bal_file import read_bal
-    from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
+    from slam_graph.bundle_adjustment import adjust_bundle, read_bal
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.results.bundle_result import BalResult
+    from slam_graph.results import BalResult
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}

@@ -14,8 +14,6 @@ from pydantic import BaseModel
 
 from slam_graph.cli.logs import remove_if_empty
 
-__all__ = ["read_policy", "timed", "write_result"]
-
 _Policy = TypeVar("_Policy", bound=BaseModel)
 
 
@@ -41,13 +39,13 @@ def read_policy(
         overrides: `key=value` each.
         options: values by table and name; None changes nothing.
     """
-    from slam_graph.settings.tree import ConfigTree, KeyPath, override, read_tree, validate
+    from slam_graph.settings import ConfigTree, override, read_tree, validate
 
     tree = ConfigTree() if file is None else read_tree(file)
     for (table, name), value in options.items():
         if value is not None:
             where = f"option {name}"
-            places: dict[KeyPath, str] = {(table,): where, (table, name): where}
+            places: dict[tuple[str | int, ...], str] = {(table,): where, (table, name): where}
             tree.merge(ConfigTree({table: {name: value}}, places))
     for text in overrides:
         tree.merge(override(text))
@@ -58,7 +56,7 @@ def write_result(
     result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
     """Write all files into a new folder, named after the problem."""
-    from slam_graph.results.result_files import create_run_folder, link_latest, write_text
+    from slam_graph.results import create_run_folder, link_latest, write_text
 
     folder = create_run_folder(output, name)
     try:

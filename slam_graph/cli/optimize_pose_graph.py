@@ -17,11 +17,8 @@ from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph.graph import PoseGraph, RotationInformation
-    from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
-    from slam_graph.results.pose_graph_result import PoseGraphResult
-
-__all__ = ["Wanted", "optimize_pose_graph_file"]
+    from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy, RotationInformation
+    from slam_graph.results import PoseGraphResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +45,8 @@ def optimize_pose_graph_file(
 ) -> None:
     """Estimate all poses, write the results and print what was reached."""
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
-    from slam_graph.results.result_files import write_text
+    from slam_graph.pose_graph import g2o_lines, read_pose_graph
+    from slam_graph.results import write_text
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}
@@ -74,9 +71,8 @@ def _solve(
     wanted: Wanted,
 ) -> PoseGraphResult:
     """Optimise, and find out what else is asked for."""
-    from slam_graph.pose_graph.certificate import certify
-    from slam_graph.pose_graph.optimize import marginal_covariances, optimize_pose_graph
-    from slam_graph.results.pose_graph_result import PoseGraphResult
+    from slam_graph.pose_graph import certify, marginal_covariances, optimize_pose_graph
+    from slam_graph.results import PoseGraphResult
 
     with timed(seconds, "optimize"):
         solution = optimize_pose_graph(graph, policy, diagnostics)

@@ -10,29 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 if TYPE_CHECKING:
-    from slam_graph.datasets.sequence import RecordedSequence
-
-__all__ = [
-    "INTERRUPTED",
-    "Algorithm",
-    "Calibration",
-    "Cameras",
-    "ConfigFile",
-    "Data",
-    "Duration",
-    "Format",
-    "Groundtruth",
-    "Json",
-    "Output",
-    "Overrides",
-    "Progress",
-    "Rerun",
-    "RerunMode",
-    "Seed",
-    "Sources",
-    "Start",
-    "open_recording",
-]
+    from slam_graph.datasets import RecordedSequence
 
 ConfigFile = Annotated[
     Path | None,
@@ -117,7 +95,7 @@ def open_recording(
     cameras: int | None = None,
 ) -> RecordedSequence:
     """Open the recording that the options name, with its first `cameras` cameras or all."""
-    from slam_graph.datasets.dataset_registry import open_dataset
+    from slam_graph.datasets import open_dataset
 
     return open_dataset(
         data,

@@ -10,8 +10,6 @@ from typing import Any
 
 import typer
 
-__all__ = ["echo_json", "echo_table", "number"]
-
 
 def echo_json(value: Any) -> None:
     """Print JSON on stdout."""

@@ -9,8 +9,6 @@ import time
 from types import TracebackType
 from typing import Self
 
-__all__ = ["ProgressBar"]
-
 _BAR_WIDTH = 28
 _TERMINAL_PERIOD_S = 0.1
 _LOG_PERIOD_S = 10.0

@@ -41,11 +41,9 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from slam_graph.config import RunConfig
-    from slam_graph.datasets.sequence import Sequence
-    from slam_graph.maps.map_model import SlamMap
-    from slam_graph.results.run_result import RunResult
-
-__all__ = ["execute", "report", "run"]
+    from slam_graph.datasets import Sequence
+    from slam_graph.maps import SlamMap
+    from slam_graph.results import RunResult
 
 
 def run(
@@ -169,8 +167,8 @@ def execute(
     graph_times: SequenceOf[int | float] = (),
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
-    from slam_graph.pipeline.run import run as run_pipeline
-    from slam_graph.results.result_files import create_run_folder, link_latest, write_text
+    from slam_graph.pipeline import run as run_pipeline
+    from slam_graph.results import create_run_folder, link_latest, write_text
 
     folder = create_run_folder(output, sequence.info().name)
     try:
@@ -200,7 +198,7 @@ def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:
     """The viewer that was asked for, or None."""
     if mode == "off":
         return None
-    from slam_graph.visualization.rerun_viewer import RerunViewer
+    from slam_graph.visualization import RerunViewer
 
     return RerunViewer(mode, folder / "recording.rrd" if mode == "save" else None, name)
 

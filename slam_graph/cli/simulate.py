@@ -16,9 +16,7 @@ from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
-    from slam_graph.simulation.simulated_sequence import SimulatedSequence
-
-__all__ = ["simulate"]
+    from slam_graph.simulation import SimulatedSequence
 
 Kind = Literal["tracks", "images"]
 
@@ -74,8 +72,8 @@ def simulate(
 
     OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
     """
-    from slam_graph.datasets.formats.euroc_writer import refuse_existing
-    from slam_graph.simulation.simulator import simulate as make
+    from slam_graph.datasets import refuse_existing
+    from slam_graph.simulation import simulate as make
 
     tracks = {
         "features": features,

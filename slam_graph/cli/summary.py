@@ -13,9 +13,7 @@ import typer
 from slam_graph.cli.printing import echo_table, number
 
 if TYPE_CHECKING:
-    from slam_graph.results.run_result import RunResult
-
-__all__ = ["echo_summary"]
+    from slam_graph.results import RunResult
 
 _Table = dict[str, Any]
 

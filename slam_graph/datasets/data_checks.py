@@ -19,33 +19,30 @@ from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.datasets.streams.image_sequence import GroupedSequence
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, ImuNoise, Rig
 
-__all__ = ["Finding", "check_sequence"]
-
-WINDOW_NS = 1_000_000_000
+_WINDOW_NS = 1_000_000_000
 """Length of the windows of which the calmest is used."""
 
-STILL_GYRO = 0.03
+_STILL_GYRO = 0.03
 """rad/s: largest standard deviation of the rates (any axis) of a window at rest."""
 
-STILL_ACCEL = 0.3
+_STILL_ACCEL = 0.3
 """m/s²: the same for the specific force."""
 
 GRAVITY = 9.81
-GRAVITY_TOLERANCE = 0.5
+_GRAVITY_TOLERANCE = 0.5
 """m/s²: biases are a few tenths; a larger difference is a sign of wrong units or scale."""
 
-RATE_TOLERANCE = 0.1
+_RATE_TOLERANCE = 0.1
 """Largest relative difference of the measured rate from the calibrated one."""
 
-NOISE_RATIO = 30.0
+_NOISE_RATIO = 30.0
 """Measured noise this many times the calibrated one gives a warning; the vibration of a hovering
 multicopter makes a factor of ten."""
 
-Found = tuple[Literal["info", "warning", "error"], str]
+_Found = tuple[Literal["info", "warning", "error"], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +73,13 @@ class _ImuSurvey:
         """Take the next samples."""
         self.samples += len(data)
         self._pending = ImuData.concatenate([self._pending, data])
-        while len(self._pending) and self._spanned() >= WINDOW_NS:
-            end = self._pending.stamps_ns[0] + WINDOW_NS
+        while len(self._pending) and self._spanned() >= _WINDOW_NS:
+            end = self._pending.stamps_ns[0] + _WINDOW_NS
             cut = int(np.searchsorted(self._pending.stamps_ns, end))
             self._survey(self._pending[:cut])
             self._pending = self._pending[cut:]
 
-    def findings(self, noise: ImuNoise) -> list[Found]:
+    def findings(self, noise: ImuNoise) -> list[_Found]:
         """What was found, compared with the calibration."""
         if self.samples == 0:
             return [("error", "no IMU samples")]
@@ -106,24 +103,24 @@ class _ImuSurvey:
         if self.calmest is None or _scatter(window) < _scatter(self.calmest):
             self.calmest = window
 
-    def _rate(self, noise: ImuNoise) -> list[Found]:
+    def _rate(self, noise: ImuNoise) -> list[_Found]:
         if not self._periods:
             return [("warning", f"only {self.samples} IMU samples")]
         rate_hz = 1e9 / float(np.median(self._periods))
-        found: list[Found] = [("info", f"{self.samples} samples at {rate_hz:.1f} Hz")]
-        if abs(rate_hz / noise.rate_hz - 1.0) > RATE_TOLERANCE:
+        found: list[_Found] = [("info", f"{self.samples} samples at {rate_hz:.1f} Hz")]
+        if abs(rate_hz / noise.rate_hz - 1.0) > _RATE_TOLERANCE:
             what = f"measured at {rate_hz:.1f} Hz, the calibration says {noise.rate_hz:.1f} Hz"
             found.append(("warning", what))
         return found
 
-    def _stillness(self, noise: ImuNoise) -> list[Found]:
+    def _stillness(self, noise: ImuNoise) -> list[_Found]:
         calm = self.calmest
-        if calm is None or calm.gyro_std > STILL_GYRO or calm.accel_std > STILL_ACCEL:
+        if calm is None or calm.gyro_std > _STILL_GYRO or calm.accel_std > _STILL_ACCEL:
             return [("info", "never still for a second: gravity and noise are not checked")]
-        found: list[Found] = [
+        found: list[_Found] = [
             ("info", f"still at {calm.start_ns}: specific force {calm.gravity:.3f} m/s²")
         ]
-        if abs(calm.gravity - GRAVITY) > GRAVITY_TOLERANCE:
+        if abs(calm.gravity - GRAVITY) > _GRAVITY_TOLERANCE:
             what = (
                 f"specific force {calm.gravity:.2f} m/s² at rest, expected {GRAVITY}; wrong unit?"
             )
@@ -136,7 +133,7 @@ class _ImuSurvey:
             found.append(
                 ("info", f"{name} noise at rest {std / root:.2g}, calibrated {density:.2g}")
             )
-            if std / root > NOISE_RATIO * density:
+            if std / root > _NOISE_RATIO * density:
                 what = (
                     f"{name} noise at rest is {std / root / density:.0f} times the calibrated one"
                 )
@@ -145,15 +142,15 @@ class _ImuSurvey:
 
 
 def _scatter(window: _Window) -> float:
-    return window.gyro_std / STILL_GYRO + window.accel_std / STILL_ACCEL
+    return window.gyro_std / _STILL_GYRO + window.accel_std / _STILL_ACCEL
 
 
 Severity = Literal["info", "warning", "error"]
 
-LONG_PAUSE_PERIODS = 3.0
+_LONG_PAUSE_PERIODS = 3.0
 """A pause between frames longer than this many median periods gives a warning."""
 
-FARTHEST_CAMERA_M = 5.0
+_FARTHEST_CAMERA_M = 5.0
 """A camera farther from the IMU than this is probably a mistake of units."""
 
 
@@ -255,7 +252,7 @@ def _check_frames(stamps: IntArray, name: str) -> list[Finding]:
     findings = [
         Finding("info", f"{len(stamps)} frames in {duration:.1f} s, {1e9 / period:.1f} Hz", name)
     ]
-    pauses = np.flatnonzero(steps > LONG_PAUSE_PERIODS * period)
+    pauses = np.flatnonzero(steps > _LONG_PAUSE_PERIODS * period)
     if len(pauses):
         longest = pauses[np.argmax(steps[pauses])]
         what = f"{len(pauses)} pauses between frames, the longest {steps[longest] * 1e-9:.2f} s"
@@ -291,7 +288,7 @@ def _check_calibration(rig: Rig) -> list[Finding]:
             what = f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} do not go together"
             findings.append(Finding("error", what, name))
         distance = float(np.linalg.norm(mounted.body_T_camera.translation()))
-        if distance > FARTHEST_CAMERA_M:
+        if distance > _FARTHEST_CAMERA_M:
             findings.append(
                 Finding("warning", f"{distance:.1f} m from the IMU; is it in metres?", name)
             )

@@ -25,8 +25,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.plugins import Registry
 
-__all__ = ["DATASETS", "DEMO", "Format", "open_dataset"]
-
 DEMO = "demo"
 """The name of the recording that comes with GTSAM."""
 

@@ -21,18 +21,16 @@ from slam_graph.datasets.streams.csv_rows import (
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.euroc_calibration import read_body_T_sensor
-
-__all__ = ["check_groundtruth", "find_groundtruth", "read_groundtruth", "resolve_groundtruth"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import read_body_T_sensor
 
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders of poses in EuRoC and similar recordings, in the order of preference."""
 
-EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
+_EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
 """Values after the time stamp of an EuRoC ground truth: p, q (w x y z), v, gyro and accel bias."""
 
-SMALLEST_QUATERNION = 0.5
+_SMALLEST_QUATERNION = 0.5
 """A quaternion shorter than this is a missing value, not a rounded unit quaternion."""
 
 
@@ -103,8 +101,8 @@ def _layout(rows: Rows) -> tuple[str | None, int]:
     line = rows.lines[0].strip().rstrip(",")
     if "," in line:
         values = line.count(",")
-        if values not in EUROC_COLUMNS:
-            known = ", ".join(f"{n} ({what})" for n, what in EUROC_COLUMNS.items())
+        if values not in _EUROC_COLUMNS:
+            known = ", ".join(f"{n} ({what})" for n, what in _EUROC_COLUMNS.items())
             raise DataError(
                 f"{rows.where(0)}: {values} values after the time stamp; ground truth has {known}"
             )
@@ -141,7 +139,7 @@ def _usable(
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
     whole = np.isfinite(values).all(axis=1)
-    whole &= np.linalg.norm(values[:, 3:7], axis=1) > SMALLEST_QUATERNION
+    whole &= np.linalg.norm(values[:, 3:7], axis=1) > _SMALLEST_QUATERNION
     for k in np.flatnonzero(~whole):
         diagnostics.warn("groundtruth_not_finite", f"{rows.where(int(k))}: row dropped")
     kept = []

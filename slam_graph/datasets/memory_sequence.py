@@ -24,11 +24,8 @@ from slam_graph.datasets.streams.images import Fault, Image
 from slam_graph.datasets.streams.imu_stream import ImuArrays
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["dataset_from_arrays"]
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
 
 def dataset_from_arrays(

@@ -25,21 +25,10 @@ from slam_graph.datasets.groundtruth import (
     resolve_groundtruth,
 )
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
-from slam_graph.sensors.rig import Rig
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
-__all__ = [
-    "Extent",
-    "FrameStream",
-    "ReaderOptions",
-    "RecordedSequence",
-    "Sequence",
-    "SequenceInfo",
-    "within",
-]
-
-HISTORY_NS = 1_000_000_000
+_HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""
 
 FrameStream = Generator[CameraFrame | FeatureFrame, None, None]
@@ -326,12 +315,12 @@ class RecordedSequence(ABC):
         """
         if not self.has_imu:
             return _packetize_alone(self.frames(start_ns, end_ns))
-        after_ns = None if start_ns is None else start_ns - HISTORY_NS
+        after_ns = None if start_ns is None else start_ns - _HISTORY_NS
         return _packetize(
             self.frames(start_ns, end_ns),
             self.imu_blocks(after_ns),
             self.diagnostics,
-            None if start_ns is None else HISTORY_NS,
+            None if start_ns is None else _HISTORY_NS,
             max(0, round(self.rig.cameras[0].time_offset_s * 1e9)),
         )
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Literal, get_args
 
-from slam_graph.errors import ConfigError
+from slam_graph.errors import ConfigError, closest
 
 PoseRelation = Literal["full", "trans_part", "rot_part", "angle_deg", "angle_rad"]
 """Which part of the difference of two poses is the error (see `ape`)."""
@@ -42,8 +42,5 @@ def require_known(word: str, known: Collection[str], what: str) -> None:
     Raises:
         ConfigError: naming the argument and the known word that is most like `word`.
     """
-    if word in known:
-        return
-    from slam_graph.settings.tree import closest  # imports pydantic: only when it is needed
-
-    raise ConfigError(f"unknown {what} '{word}'; {closest(str(word).lower(), known)}")
+    if word not in known:
+        raise ConfigError(f"unknown {what} '{word}'; {closest(str(word).lower(), known)}")

@@ -25,8 +25,7 @@ from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.truth_pairing import paired, select
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import Similarity
+from slam_graph.geometry import Similarity, Trajectory
 
 CONFIDENCE = 0.95
 

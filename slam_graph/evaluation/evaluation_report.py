@@ -13,21 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import ErrorSeries, ape
+from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
 from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
-from slam_graph.evaluation.rpe import rpe
+from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
-from slam_graph.geometry.trajectory_alignment import (
+from slam_graph.geometry import (
     AlignmentMode,
     Similarity,
+    StateHistory,
+    Trajectory,
     align_first_pose,
     align_yaw,
 )
 
-REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
+_REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
-RPE_DELTA_M = 1.0
+_RPE_DELTA_M = 1.0
 """Relative errors are taken over all pairs of poses about one metre of path apart."""
 
 Table = dict[str, Any]
@@ -43,7 +44,7 @@ def accuracy_report(reference: Trajectory, estimate: Trajectory) -> Table:
     """
     return {
         mode: _or_reason(partial(_errors_under, reference, estimate, mode))
-        for mode in REPORTED_ALIGNMENTS
+        for mode in _REPORTED_ALIGNMENTS
     }
 
 
@@ -142,7 +143,7 @@ def truth_from_estimate(
 def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:
     """The errors under one alignment, against the truth interpolated at the estimate's times."""
     options: Table = {"alignment": mode}
-    steps: Table = {**options, "delta": RPE_DELTA_M, "unit": "m", "all_pairs": True}
+    steps: Table = {**options, "delta": _RPE_DELTA_M, "unit": "m", "all_pairs": True}
     translation = ape(reference, estimate, "trans_part", **options)
     return {
         "poses": translation.poses,
@@ -153,7 +154,7 @@ def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMo
         },
         "rpe": _or_reason(
             lambda: {
-                "delta_m": RPE_DELTA_M,
+                "delta_m": _RPE_DELTA_M,
                 "translation_m": _statistics(rpe(reference, estimate, "trans_part", **steps)),
                 "rotation_deg": _statistics(rpe(reference, estimate, "angle_deg", **steps)),
             }

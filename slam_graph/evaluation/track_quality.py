@@ -11,17 +11,15 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.frontend import epipolar_distance, essential_matrix
+from slam_graph.geometry import Trajectory, interpolate
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
-GAP_FRAMES = 5
+_GAP_FRAMES = 5
 """Features are compared with themselves so many frames before: over one frame the true motion is
 as small as the noise of pixels, over many the error of the ground truth adds up."""
 
-OUTLIER_PX = 4.0
+_OUTLIER_PX = 4.0
 """Features further than this from their epipolar line count as wrong."""
 
 GRID = (8, 6)
@@ -69,7 +67,7 @@ class TrackQuality:
         self._coverage: list[float] = []
         self._epipolar_px: list[FloatArray] = []
         self._stereo_px: list[FloatArray] = []
-        self._recent: deque[tuple[FeatureFrame, gtsam.Pose3 | None]] = deque(maxlen=GAP_FRAMES)
+        self._recent: deque[tuple[FeatureFrame, gtsam.Pose3 | None]] = deque(maxlen=_GAP_FRAMES)
 
     def write(self, imu: ImuData, frame: FeatureFrame) -> None:
         """Take note of the next frame; the IMU is not looked at."""
@@ -77,7 +75,7 @@ class TrackQuality:
         self._lengths.update(ids.tolist())
         self._coverage.append(self._covered(frame.cameras[0]))
         pose = self._true_pose(frame.stamp_ns)
-        if len(self._recent) == GAP_FRAMES:
+        if len(self._recent) == _GAP_FRAMES:
             self._compare(*self._recent[0], frame, pose)
         self._recent.append((frame, pose))
         self._across(frame)
@@ -95,7 +93,7 @@ class TrackQuality:
             float(np.mean(lengths)),
             float(np.mean(self._coverage or [0.0])),
             float(np.median(error_px)) if len(error_px) else None,
-            float(np.mean(error_px > OUTLIER_PX)) if len(error_px) else None,
+            float(np.mean(error_px > _OUTLIER_PX)) if len(error_px) else None,
             float(np.median(stereo_px)) if len(stereo_px) else None,
         )
 

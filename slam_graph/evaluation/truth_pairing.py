@@ -20,10 +20,9 @@ import numpy as np
 from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.choices import PAIRINGS, Pairing, require_known
-from slam_graph.geometry.interpolation import DEFAULT_MAX_GAP_S, interpolate
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry import DEFAULT_MAX_GAP_S, Trajectory, interpolate
 
-DEFAULT_LIMITS_S: dict[Pairing, float] = {"interpolate": DEFAULT_MAX_GAP_S, "nearest": 0.01}
+_DEFAULT_LIMITS_S: dict[Pairing, float] = {"interpolate": DEFAULT_MAX_GAP_S, "nearest": 0.01}
 """How far apart two samples of the truth may be to interpolate between them; how far in time the
 nearest one may be."""
 
@@ -95,7 +94,7 @@ def paired(
         estimate: the trajectory to judge.
         pairing: how a true pose is found (see the head of this file).
         limit_s: the longest gap in the truth to interpolate in, or the largest difference to the
-            nearest stamp; None: `DEFAULT_LIMITS_S`.
+            nearest stamp; None: `_DEFAULT_LIMITS_S`.
 
     Returns:
         The M true poses, possibly none, and the (M,) rows of the estimate that they belong to.
@@ -104,7 +103,7 @@ def paired(
         ConfigError: if there is no such pairing.
     """
     require_known(pairing, PAIRINGS, "pairing")
-    limit_s = DEFAULT_LIMITS_S[pairing] if limit_s is None else limit_s
+    limit_s = _DEFAULT_LIMITS_S[pairing] if limit_s is None else limit_s
     if pairing == "nearest":
         in_reference, rows = associate(reference.stamps_ns, estimate.stamps_ns, limit_s)
         return select(reference, in_reference), rows

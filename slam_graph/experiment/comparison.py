@@ -11,7 +11,6 @@ from typing import Any
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.comparison_plan import (
-    WITHOUT_FEJ,
     Comparison,
     Progress,
     load_configs,
@@ -23,21 +22,12 @@ from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesse
 from slam_graph.experiment.sources import find_sources
 from slam_graph.experiment.tasks import Task
 
-__all__ = [
-    "DEFAULT_ALGORITHMS",
-    "WITHOUT_FEJ",
-    "Comparison",
-    "compare",
-    "load_configs",
-    "with_variants",
-]
-
-DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
+_DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 
 
 def compare(
     data: str | Path | Sequence[str | Path],
-    algorithms: str | Sequence[str | Path] = DEFAULT_ALGORITHMS,
+    algorithms: str | Sequence[str | Path] = _DEFAULT_ALGORITHMS,
     *,
     seeds: int | Sequence[int] = 1,
     output: str | Path = "results/comparison",

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.evaluation.consistency import mean_bounds
+from slam_graph.evaluation import mean_bounds
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
     ALIGNMENTS,
@@ -21,16 +21,14 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results.result_files import appearing
-from slam_graph.visualization.comparison_plots import Curve, Panel, plot_panels
+from slam_graph.results import appearing
+from slam_graph.visualization import Curve, Panel, plot_panels
 
-__all__ = ["NEES_DOF", "Figure", "draw"]
-
-BINS = 200
+_BINS = 200
 """Number of equal bins of time or distance in which series are averaged, also over the seeds."""
 
-TIME = ("time_s", "time [s]")
-DISTANCE = ("distance_m", "distance [m]")
+_TIME = ("time_s", "time [s]")
+_DISTANCE = ("distance_m", "distance [m]")
 PARTS = (("translation_m", "translation error [m]"), ("rotation_deg", "rotation error [deg]"))
 
 NEES_DOF = {"orientation": 3, "position": 3, "pose": 6}
@@ -61,18 +59,18 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         panels = [
             Panel(xlabel, ylabel, _curves(runs, x, f"{part}_{mode}"))
             for part, ylabel in PARTS
-            for x, xlabel in (TIME, DISTANCE)
+            for x, xlabel in (_TIME, _DISTANCE)
         ]
         file = folder / f"{data}_errors_{mode}.png"
         yield from _draw_panels(file, f"{data}: errors, alignment {mode}{mean}", panels)
     panels = _consistency_panels(runs, max(seeds, 1))
     yield from _draw_panels(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
-        Panel(TIME[1], "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
-        Panel(TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
-        Panel(TIME[1], "steps per frame", _curves(runs, "step_time_s", "steps")),
-        Panel(TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
-        Panel(TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
+        Panel(_TIME[1], "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(_TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
+        Panel(_TIME[1], "steps per frame", _curves(runs, "step_time_s", "steps")),
+        Panel(_TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
+        Panel(_TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
     ]
     yield from _draw_panels(
         folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels
@@ -83,7 +81,7 @@ def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel
     """NEES with the χ² bounds of a mean over the seeds, and NIS."""
     panels = [
         Panel(
-            TIME[1],
+            _TIME[1],
             f"NEES of the {part}",
             _curves(runs, "nees_time_s", f"nees_{part}"),
             mean_bounds(dof, seeds),
@@ -92,7 +90,7 @@ def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel
         for part, dof in NEES_DOF.items()
     ]
     label = "NIS / expected"
-    return [*panels, Panel(TIME[1], label, _curves(runs, "nis_time_s", "nis_ratio"))]
+    return [*panels, Panel(_TIME[1], label, _curves(runs, "nis_time_s", "nis_ratio"))]
 
 
 def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:
@@ -131,7 +129,7 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
     end = max((xs[-1] for pairs in known.values() for xs, _ in pairs if len(xs)), default=0.0)
     if end <= 0.0:
         return []
-    edges = np.linspace(0.0, end, BINS + 1)
+    edges = np.linspace(0.0, end, _BINS + 1)
     centres = (edges[:-1] + edges[1:]) / 2.0
     curves = []
     for name, pairs in known.items():

@@ -15,17 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.sources import Source
 from slam_graph.experiment.tasks import RecordTask, RunTask, Task
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
-
-__all__ = [
-    "WITHOUT_FEJ",
-    "Comparison",
-    "Progress",
-    "load_configs",
-    "plan",
-    "run_tasks",
-    "with_variants",
-]
+from slam_graph.smoothing import FinalBaConfig
 
 WITHOUT_FEJ = "_no_fej"
 """Suffix of the name of an algorithm without first-estimates Jacobians."""

@@ -26,12 +26,9 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results.metrics import finite, versions
-from slam_graph.results.result_files import write_text
+from slam_graph.results import finite, versions, write_text
 
-__all__ = ["COLUMNS", "cells", "write_report"]
-
-COLUMNS = (
+_COLUMNS = (
     "algorithm",
     *(f"ATE {mode} [m]" for mode in ALIGNMENTS),
     "orientation [deg]",
@@ -47,7 +44,7 @@ COLUMNS = (
     "status",
 )
 
-EXPLANATION = (
+_EXPLANATION = (
     "All algorithms were given the same recorded feature tracks and IMU samples. ATE is the root "
     "mean square position error of the causal estimate: without alignment, after alignment of "
     "yaw and position, and after SE(3) alignment. Orientation is after alignment of yaw and "
@@ -59,7 +56,7 @@ EXPLANATION = (
     "peak memory is the maximum."
 )
 
-STYLE = (
+_STYLE = (
     "body{font-family:sans-serif;max-width:75em;margin:2em auto;padding:0 1em}"
     "table{border-collapse:collapse}"
     "td,th{border:1px solid #bbb;padding:.25em .6em;text-align:right}"
@@ -81,8 +78,13 @@ def write_report(comparison: Comparison) -> None:
     comparison.rows, comparison.files = rows, files
 
 
-def cells(row: Table) -> tuple[str, ...]:
-    """A row of the table as text, in the order of `COLUMNS`."""
+def text_table(rows: Iterable[Table]) -> list[tuple[str, ...]]:
+    """Rows of a comparison as text, the data before each, under a row of titles."""
+    return [("data", *_COLUMNS), *((str(row["data"]), *_cells(row)) for row in rows)]
+
+
+def _cells(row: Table) -> tuple[str, ...]:
+    """A row of the table as text, in the order of `_COLUMNS`."""
     status = ", ".join(f"{count} {name}" for name, count in row["status"].items())
     ends = f"{_number(row['ms_first_third'], 2)} → {_number(row['ms_last_third'], 2)}"
     return (
@@ -182,11 +184,11 @@ def _average(values: Iterable[float]) -> float | None:
 
 
 def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list[Figure]]) -> str:
-    lines = ["# Comparison of algorithms", "", EXPLANATION, ""]
+    lines = ["# Comparison of algorithms", "", _EXPLANATION, ""]
     for name, drawn in figures.items():
-        lines += [f"## {name}", "", _markdown_line(COLUMNS)]
-        lines += [_markdown_line(("---",) + ("---:",) * (len(COLUMNS) - 2) + ("---",))]
-        lines += [_markdown_line(cells(row)) for row in rows if row["data"] == name]
+        lines += [f"## {name}", "", _markdown_line(_COLUMNS)]
+        lines += [_markdown_line(("---",) + ("---:",) * (len(_COLUMNS) - 2) + ("---",))]
+        lines += [_markdown_line(_cells(row)) for row in rows if row["data"] == name]
         lines.append("")
         for figure in drawn:
             lines += [f"![{figure.title}]({figure.file.relative_to(comparison.folder)})", ""]
@@ -204,12 +206,12 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
     title = "Comparison of algorithms"
     parts = [
         "<!DOCTYPE html>",
-        f'<html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>',
-        f"<h1>{title}</h1><p>{escape(EXPLANATION)}</p>",
+        f'<html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>',
+        f"<h1>{title}</h1><p>{escape(_EXPLANATION)}</p>",
     ]
     for name, drawn in figures.items():
-        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", COLUMNS)]
-        parts += [_html_line("td", cells(row)) for row in rows if row["data"] == name]
+        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", _COLUMNS)]
+        parts += [_html_line("td", _cells(row)) for row in rows if row["data"] == name]
         parts.append("</table>")
         for figure in drawn:
             data = base64.b64encode(figure.file.read_bytes()).decode("ascii")

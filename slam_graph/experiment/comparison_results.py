@@ -25,24 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.consistency import nees
-from slam_graph.evaluation.evaluation_report import truth_from_estimate
-from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import AlignmentMode
-from slam_graph.results.result_files import appearing, write_text
-from slam_graph.results.run_result import RunResult
-
-__all__ = [
-    "ALIGNMENTS",
-    "STAGE",
-    "Series",
-    "Table",
-    "read_result",
-    "read_series",
-    "write_result",
-]
+from slam_graph.evaluation import ape, nees, synchronize, truth_from_estimate
+from slam_graph.geometry import AlignmentMode, Trajectory
+from slam_graph.results import RunResult, appearing, write_text
 
 SCHEMA_VERSION = 2
 

@@ -16,15 +16,13 @@ from typing import Protocol
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.tasks import Task
 
-__all__ = ["DaskCluster", "Executor", "LocalProcesses"]
-
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment of a task: tasks run in parallel, so BLAS uses one thread in each."""
 
-STOP_TIMEOUT_S = 10.0
+_STOP_TIMEOUT_S = 10.0
 """Time for a task to end after SIGINT before it is killed."""
 
-CONNECT_TIMEOUT_S = 10.0
+_CONNECT_TIMEOUT_S = 10.0
 
 Outcome = tuple[Task, str | None]
 """A task that has ended, and why it failed or None."""
@@ -105,7 +103,7 @@ class DaskCluster:
         from distributed import Client, as_completed
 
         try:
-            client = Client(self.address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+            client = Client(self.address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise DataError(f"no Dask scheduler answers at '{self.address}'") from error
         with client:
@@ -149,7 +147,7 @@ def _stop(process: subprocess.Popen[str]) -> None:
     with suppress(ProcessLookupError):
         process.send_signal(signal.SIGINT)
     try:
-        process.wait(STOP_TIMEOUT_S)
+        process.wait(_STOP_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
 

@@ -14,15 +14,12 @@ from typing import Any
 import numpy as np
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
-from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
-from slam_graph.frontend.build_frontend import build_frontend
-from slam_graph.pipeline.run import run
-from slam_graph.pipeline.tracking import TrackedPacket, Tracking
-from slam_graph.results.run_logs import TimingLog
-
-__all__ = ["FrontendReport", "parse_frontends", "track", "track_and_estimate"]
+from slam_graph.evaluation import TrackQuality, TrackSummary
+from slam_graph.frontend import build_frontend
+from slam_graph.pipeline import TrackedPacket, Tracking, run
+from slam_graph.results import TimingLog
 
 
 @dataclass(frozen=True)

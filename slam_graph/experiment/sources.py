@@ -8,17 +8,12 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import Sequence, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.settings.base import Settings
-from slam_graph.settings.tree import ConfigTree, override, validate
-from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig, StartConfig
-from slam_graph.simulation.simulator import simulate
+from slam_graph.settings import ConfigTree, Settings, override, validate
+from slam_graph.simulation import TRAJECTORIES, SimulationConfig, StartConfig, simulate
 
-__all__ = ["Source", "find_sources"]
-
-PREFIX = "sim:"
+_PREFIX = "sim:"
 
 
 class Source(Settings):
@@ -73,8 +68,8 @@ def find_sources(
     truths = {name: str(path) for name, path in (groundtruths or {}).items()}
     sources: dict[str, Source] = {}
     for name in map(str, names):
-        if name.startswith(PREFIX):
-            source = _simulated(name.removeprefix(PREFIX), duration_s, changes)
+        if name.startswith(_PREFIX):
+            source = _simulated(name.removeprefix(_PREFIX), duration_s, changes)
         else:
             source = _recorded(name, truths.pop(name, None))
         if source.name in sources:
@@ -110,7 +105,8 @@ def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) 
         path = Path(trajectory).resolve()
         if not path.exists():
             raise DataError(
-                f"{PREFIX}{trajectory}: no such file or folder; {closest(trajectory, TRAJECTORIES)}"
+                f"{_PREFIX}{trajectory}: no such file or folder; "
+                f"{closest(trajectory, TRAJECTORIES)}"
             )
         tree.merge(ConfigTree({"trajectory": str(path), "real_imu": True}))
         name = path.name

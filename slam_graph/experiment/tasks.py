@@ -18,16 +18,13 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets.formats.track_recorder import TrackRecorder
-from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
+from slam_graph.datasets import TrackRecorder, TrackRecordingSequence
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.sources import Source
-from slam_graph.frontend.build_frontend import build_frontend
-from slam_graph.pipeline.run import run
-from slam_graph.settings.base import Settings
+from slam_graph.frontend import build_frontend
+from slam_graph.pipeline import run
+from slam_graph.settings import Settings
 from slam_graph.version import __version__
-
-__all__ = ["HASH_LENGTH", "RecordTask", "RunTask", "Task"]
 
 HASH_LENGTH = 12
 

@@ -1,3 +1,51 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
 """From images to feature tracks: extraction, data association, outlier rejection."""
+
+from typing import TYPE_CHECKING
+
+from slam_graph.lazy import lazy_exports
+
+__all__ = [
+    "DESCRIPTORS",
+    "DETECTORS",
+    "FRONTENDS",
+    "Descriptor",
+    "Detector",
+    "Feedback",
+    "Frontend",
+    "FrontendConfig",
+    "Image",
+    "Keypoints",
+    "Orb",
+    "build_frontend",
+    "epipolar_distance",
+    "essential_matrix",
+]
+
+if TYPE_CHECKING:
+    from slam_graph.frontend.descriptors import Descriptor, Orb
+    from slam_graph.frontend.detectors import Detector
+    from slam_graph.frontend.frontend_config import (
+        DESCRIPTORS,
+        DETECTORS,
+        FRONTENDS,
+        FrontendConfig,
+    )
+    from slam_graph.frontend.frontend_factory import build_frontend
+    from slam_graph.frontend.frontend_protocol import Feedback, Frontend
+    from slam_graph.frontend.keypoints import Image, Keypoints
+    from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
+else:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "descriptors": ("Descriptor", "Orb"),
+            "detectors": ("Detector",),
+            "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
+            "frontend_factory": ("build_frontend",),
+            "frontend_protocol": ("Feedback", "Frontend"),
+            "keypoints": ("Image", "Keypoints"),
+            "outliers": ("epipolar_distance", "essential_matrix"),
+        },
+    )

@@ -11,8 +11,6 @@ from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction
 
-__all__ = ["Association", "Associator", "Candidates", "inside"]
-
 
 @dataclass(frozen=True, eq=False)
 class Association:

@@ -22,11 +22,9 @@ from slam_graph.frontend.outliers import (
     map_inliers,
 )
 from slam_graph.frontend.prediction import PointPredictor
-from slam_graph.sensors.rig import RigCamera
+from slam_graph.sensors import RigCamera
 
-__all__ = ["CameraTracker"]
-
-MERGE_DISTANCE_PX = 3.0
+_MERGE_DISTANCE_PX = 3.0
 """Of two features closer than this the younger one is dropped: they track the same corner."""
 
 
@@ -92,7 +90,7 @@ class CameraTracker:
             after = after.select(inlier & in_map)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
-        alone = _apart(after.pixels, MERGE_DISTANCE_PX)
+        alone = _apart(after.pixels, _MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
         return self._with_residual_flow(before, after.select(alone))
 

@@ -18,8 +18,6 @@ from slam_graph.frontend.detectors import BRISK_OCTAVES, ORB_EDGE_PX, ORB_LEVELS
 from slam_graph.frontend.frontend_config import DESCRIPTORS
 from slam_graph.frontend.keypoints import Image, Keypoints
 
-__all__ = ["DESCRIPTORS", "Descriptor", "Orb", "Vectors"]
-
 Vectors = NDArray[Any]
 """(N, D) descriptors, uint8 or float32."""
 

@@ -19,30 +19,20 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
 
-__all__ = [
-    "BRISK_OCTAVES",
-    "DETECTORS",
-    "ORB_EDGE_PX",
-    "ORB_LEVELS",
-    "Detector",
-    "refine",
-    "require",
-]
+_INSTALL = "pip install 'slam-graph[descriptors]'"
 
-INSTALL = "pip install 'slam-graph[descriptors]'"
-
-CORNER_WINDOW_PX = 7
+_CORNER_WINDOW_PX = 7
 """Side of the window over which gradients are summed for the scores of Shi-Tomasi and Harris."""
 
-RELATIVE_SCORE = 0.05
+_RELATIVE_SCORE = 0.05
 """A corner of a cell has at least this share of the eigenvalue of the cell's best one: low, because
 `min_corner_score` already rules out noise, and weak corners keep the coverage even."""
 
-HARRIS_K = 0.04
+_HARRIS_K = 0.04
 """Weight of the trace in Harris' score det - k trace² (Harris and Stephens 1988)."""
 
-SUBPIXEL_RADIUS_PX = 3
-SUBPIXEL_LIMIT_PX = 1.5
+_SUBPIXEL_RADIUS_PX = 3
+_SUBPIXEL_LIMIT_PX = 1.5
 """A corner that refinement moves further than this has been drawn to another one."""
 
 ORB_LEVELS = 4
@@ -88,7 +78,7 @@ def require(module: str, purpose: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         library = module.split(".")[0]
-        raise ConfigError(f"{purpose}: needs {library}, install it: {INSTALL}") from error
+        raise ConfigError(f"{purpose}: needs {library}, install it: {_INSTALL}") from error
 
 
 class _GradientCorners:
@@ -104,7 +94,7 @@ class _GradientCorners:
         # Harris' score of a corner with two eigenvalues that are just large enough
         self._smallest = config.min_corner_score
         if harris:
-            self._smallest = (1.0 - 4.0 * HARRIS_K) * config.min_corner_score**2
+            self._smallest = (1.0 - 4.0 * _HARRIS_K) * config.min_corner_score**2
 
     def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest corners."""
@@ -112,19 +102,19 @@ class _GradientCorners:
             image,
             count,
             # the share is one of eigenvalues, of which Harris' score is the square
-            RELATIVE_SCORE ** (2 if self._harris else 1),
+            _RELATIVE_SCORE ** (2 if self._harris else 1),
             distance_px,
             allowed,
-            blockSize=CORNER_WINDOW_PX,
+            blockSize=_CORNER_WINDOW_PX,
             useHarrisDetector=self._harris,
-            k=HARRIS_K,
+            k=_HARRIS_K,
         )
         if corners is None:
             return Keypoints.concatenate([])
         found = Keypoints.of(
             np.asarray(corners, np.float32),
             np.ravel(scores).astype(np.float32),
-            float(CORNER_WINDOW_PX),
+            float(_CORNER_WINDOW_PX),
         )
         return found.select(found.scores >= self._smallest)
 
@@ -257,12 +247,12 @@ def refine(image: Image, pixels: Pixels) -> Pixels:
     """
     if len(pixels) == 0:
         return pixels
-    window = (SUBPIXEL_RADIUS_PX, SUBPIXEL_RADIUS_PX)
+    window = (_SUBPIXEL_RADIUS_PX, _SUBPIXEL_RADIUS_PX)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
     refined = np.asarray(cv2.cornerSubPix(image, pixels.copy(), window, (-1, -1), criteria))
     refined = refined.reshape(-1, 2)
     moved = np.linalg.norm(refined - pixels, axis=1)
-    return np.where((moved < SUBPIXEL_LIMIT_PX)[:, None], refined, pixels).astype(np.float32)
+    return np.where((moved < _SUBPIXEL_LIMIT_PX)[:, None], refined, pixels).astype(np.float32)
 
 
 def _strongest_first(keypoints: Keypoints) -> IntArray:

@@ -15,23 +15,21 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
-from slam_graph.sensors.camera import Camera
-
-__all__ = ["BORDER_PX", "FeatureExtractor", "camera_mask"]
+from slam_graph.sensors import Camera
 
 BORDER_PX = 5
 """Features are neither found nor kept within this distance of the edge of the image, where the
 windows of detectors and descriptors are cut."""
 
-REST_FRAMES = 3
+_REST_FRAMES = 3
 """Frames for which a cell is skipped that could not be filled: it hardly could be in the next."""
 
-REACH = 2.75
+_REACH = 2.75
 """Largest normalised coordinate of features of wide lenses: 70° off the axis. On the plane z = 1,
 where matches are tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at
 70°, by 33 at 80°."""
 
-MARGIN_PX = 4
+_MARGIN_PX = 4
 """Cells are cut out with this margin, so that scores at their edge see the pixels beyond."""
 
 
@@ -138,7 +136,7 @@ class FeatureExtractor:
             chosen = spread(best.pixels, surplus * quota, self._distance_px)
             pixels = best.pixels[chosen]
             if len(pixels) < quota:
-                self._rest[i] = REST_FRAMES
+                self._rest[i] = _REST_FRAMES
             self._occupy(free, pixels)
             found.append(pixels)
             quotas.append(quota)
@@ -237,8 +235,8 @@ class FeatureExtractor:
     def _in_cell(self, image: Image, free: Image, cell: _Cell, count: int) -> Keypoints:
         """The best keypoints of a cell, best first."""
         height, width = image.shape
-        left, top = max(0, cell.left - MARGIN_PX), max(0, cell.top - MARGIN_PX)
-        right, bottom = min(width, cell.right + MARGIN_PX), min(height, cell.bottom + MARGIN_PX)
+        left, top = max(0, cell.left - _MARGIN_PX), max(0, cell.top - _MARGIN_PX)
+        right, bottom = min(width, cell.right + _MARGIN_PX), min(height, cell.bottom + _MARGIN_PX)
         allowed = np.zeros((bottom - top, right - left), np.uint8)
         inner = np.s_[cell.top - top : cell.bottom - top, cell.left - left : cell.right - left]
         allowed[inner] = free[cell.top : cell.bottom, cell.left : cell.right]
@@ -274,7 +272,7 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
     mask = None if path is None else _read_mask(path, camera.width, camera.height)
     if not camera.model.sees_sideways:
         return mask
-    visible = np.where(camera.visible_mask(REACH), np.uint8(255), np.uint8(0))
+    visible = np.where(camera.visible_mask(_REACH), np.uint8(255), np.uint8(0))
     inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)
     return inside if mask is None else np.minimum(mask, inside)
 

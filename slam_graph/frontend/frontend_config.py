@@ -15,16 +15,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.plugins import Choice, Registry
-from slam_graph.settings.base import Settings, expert
+from slam_graph.settings import Settings, expert
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
     from slam_graph.frontend.descriptors import Descriptor
     from slam_graph.frontend.detectors import Detector
     from slam_graph.frontend.frontend_protocol import Frontend
-    from slam_graph.sensors.rig import Rig
-
-__all__ = ["DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"]
+    from slam_graph.sensors import Rig
 
 DETECTORS: Registry[Callable[[FrontendConfig], Detector]] = Registry(
     "slam_graph.detectors",
@@ -51,7 +49,7 @@ FRONTENDS: Registry[Callable[[Rig, FrontendConfig, int, Diagnostics, float], Fro
 """Front ends by name: callables that make one from rig, settings, seed, diagnostics and gravity in
 m/s²."""
 
-PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
+_PUBLISHED_WITH = {"sift": "dog", "surf": "surf", "orb": "orb", "brisk": "brisk", "brief": "fast"}
 """The detector that a descriptor was published with; for BRIEF, which has none, FAST."""
 
 TRACKED_RANSAC_PX, MATCHED_RANSAC_PX = 1.0, 1.5
@@ -166,7 +164,7 @@ class FrontendConfig(Settings):
         """The detector that `detector` and `method` choose."""
         if self.detector != "auto":
             return self.detector
-        return PUBLISHED_WITH.get(self.method, "shi_tomasi")
+        return _PUBLISHED_WITH.get(self.method, "shi_tomasi")
 
     @property
     def epipolar_px(self) -> float:

@@ -17,10 +17,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
-
-__all__ = ["Feedback", "FrameStats", "Frontend"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData
 
 
 class FrameStats(defaultdict[str, float]):

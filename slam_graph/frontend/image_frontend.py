@@ -21,14 +21,17 @@ from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.prediction import PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import (
+    STANDARD_GRAVITY,
+    Camera,
+    CameraFrame,
+    FeatureFrame,
+    FeatureObservations,
+    ImuData,
+    Rig,
+)
 
-__all__ = ["ImageFrontend"]
-
-FEW_FEATURES = 15
+_FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""
 
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 3.0, (8, 8)
@@ -205,7 +208,7 @@ class ImageFrontend:
         after = tracker.follow(before, image, stamp_ns, self._feedback)
         if self._references[index] == index:
             self._stats.add("tracked", len(after))
-            if len(after) < FEW_FEATURES <= len(before):
+            if len(after) < _FEW_FEATURES <= len(before):
                 self._diagnostics.warn(
                     "few_features", f"{len(after)} of {len(before)} features could be followed"
                 )

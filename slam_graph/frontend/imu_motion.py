@@ -7,18 +7,16 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import (
+from slam_graph.geometry import NavState
+from slam_graph.sensors import (
     ImuBuffer,
+    ImuData,
+    ImuNoise,
     integrate_rotation,
     predict,
     preintegrate,
     preintegration_params,
 )
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise
-
-__all__ = ["ImuMotion"]
 
 _HISTORY_NS = 2_000_000_000
 """How long samples are kept; frames and states of the back end are never that far behind."""

@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.sensors.measurements import FeatureObservations
-
-__all__ = ["Image", "Keypoints", "Pixels", "Tracks", "spread"]
+from slam_graph.sensors import FeatureObservations
 
 Image = NDArray[np.uint8]
 """(height, width), grey."""

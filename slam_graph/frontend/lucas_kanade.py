@@ -17,27 +17,25 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
 
-__all__ = ["CornerTracking", "LucasKanade"]
-
-ITERATIONS = 15
+_ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
 
-STEP_PX = 0.02
+_STEP_PX = 0.02
 """Iterations end when a step is smaller than this, which is well below the noise of a track."""
 
-MIN_EIGENVALUE = 1e-3
+_MIN_EIGENVALUE = 1e-3
 """Windows with less gradient than this are not tracked (OpenCV's `minEigThreshold`)."""
 
-GUIDED_LEVELS = 1
+_GUIDED_LEVELS = 1
 """Pyramid levels where the guess is good; more of them lead away from it."""
 
-BACKWARD_LEVELS = 0
+_BACKWARD_LEVELS = 0
 """Pyramid levels of the backward pass: it starts at the point where it should end."""
 
-SURPLUS = 2
+_SURPLUS = 2
 """Corners tried for each new feature that is wanted: not all can be tracked back."""
 
-VERIFICATION = 0.3
+_VERIFICATION = 0.3
 """Errors allowed to a new corner, as a share of those allowed to one that is tracked already. There
 are more corners than are needed, and one that barely passes is soon lost."""
 
@@ -62,7 +60,7 @@ class LucasKanade:
 
     def __init__(self, config: FrontendConfig) -> None:
         self._window_px = config.window_px
-        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, STEP_PX)
+        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
 
     def flow(
         self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
@@ -82,7 +80,7 @@ class LucasKanade:
         found &= inside(forward, target.shape, BORDER_PX)
         # The way back starts where it should end, so it needs no pyramid: what it tests is whether
         # the patch that was found is, seen from the other side, the patch that was looked for.
-        back, returned = self._lucas_kanade(target, source, forward, points, BACKWARD_LEVELS)
+        back, returned = self._lucas_kanade(target, source, forward, points, _BACKWARD_LEVELS)
         error_px = np.linalg.norm(back - points, axis=1)
         return Flow(forward, found & returned, error_px)
 
@@ -98,7 +96,7 @@ class LucasKanade:
             maxLevel=levels,
             criteria=self._criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=MIN_EIGENVALUE,
+            minEigThreshold=_MIN_EIGENVALUE,
         )
         return np.asarray(moved, np.float32), status[:, 0] == 1
 
@@ -121,7 +119,7 @@ class CornerTracking:
             return Association(points, good, {})
         # A good guess needs no pyramid, which can lead away from it; what is not found near it is
         # looked for again like the features without one.
-        guided = min(GUIDED_LEVELS, self._levels)
+        guided = min(_GUIDED_LEVELS, self._levels)
         for levels, tried in ((guided, guess.trusted), (self._levels, None)):
             rows = np.flatnonzero(~good if tried is None else tried)
             flow = self._lucas_kanade.flow(
@@ -140,14 +138,14 @@ class CornerTracking:
         assert after.image is not None
         if not verify or before.image is None:
             return Candidates(self._extractor.extract(after.image, after.pixels).points, None)
-        found = self._extractor.extract(after.image, after.pixels, SURPLUS)
+        found = self._extractor.extract(after.image, after.pixels, _SURPLUS)
         points = found.points
         here, there = after.common(before)
         guess = points + neighbour_flow(after.pixels[here], before.pixels[there], points)
-        flow = self._lucas_kanade.flow(after.image, before.image, points, guess, GUIDED_LEVELS)
-        limit_px = VERIFICATION * self._largest_px
+        flow = self._lucas_kanade.flow(after.image, before.image, points, guess, _GUIDED_LEVELS)
+        limit_px = _VERIFICATION * self._largest_px
         good = found.within_quotas(flow.found & (flow.error_px < limit_px))
-        return Candidates(points[good], flow.points[good], VERIFICATION)
+        return Candidates(points[good], flow.points[good], _VERIFICATION)
 
     def accept(self, ids: IntArray, chosen: BoolArray) -> None:
         """Nothing to remember: corners are found again by their image."""

@@ -18,30 +18,28 @@ from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks
 from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.sensors.camera import Camera
+from slam_graph.sensors import Camera
 
-__all__ = ["DescriptorMatching", "descriptor_distances", "match"]
-
-KEYPOINTS = 500
+_KEYPOINTS = 500
 """Keypoints described in each image: two to three times the default number of features, so that
 most features are among them."""
 
-KEYPOINT_DISTANCE_PX = 5.0
+_KEYPOINT_DISTANCE_PX = 5.0
 """Least distance of these keypoints: closer than features, so that each is found again."""
 
-SEARCH_RADIUS_PX = 20.0
+_SEARCH_RADIUS_PX = 20.0
 """A match lies within this distance of the prediction, which the gyroscope makes good to a few
 pixels."""
 
-RATIO = 0.85
+_RATIO = 0.85
 """Ratio test (Lowe 2004): the best match is closer than this share of the distance to the second
 best. Less strict than Lowe's 0.8, because the search window leaves few rivals."""
 
-MEMORY_FRAMES = 5
+_MEMORY_FRAMES = 5
 """Frames in which a feature without a match is still looked for; later the prediction of where it
 is has drifted."""
 
-SAME_PX = 3.0
+_SAME_PX = 3.0
 """Keypoints this close are the same corner at two scales, and do not rival one another."""
 
 
@@ -64,7 +62,7 @@ def match(
     guess: Pixels,
     pixels: Pixels,
     max_distance: float,
-    search_radius_px: float = SEARCH_RADIUS_PX,
+    search_radius_px: float = _SEARCH_RADIUS_PX,
     mutual: bool = True,
 ) -> IntArray:
     """Match descriptors within a search window, with the ratio test and the mutual check.
@@ -89,8 +87,8 @@ def match(
     rows = np.arange(n)
     best = np.argmin(distance, axis=1)
     shortest = distance[rows, best]
-    rivals = np.where(cdist(pixels, pixels)[best] < SAME_PX, np.inf, distance)
-    good = (shortest <= max_distance) & (shortest < RATIO * np.min(rivals, axis=1))
+    rivals = np.where(cdist(pixels, pixels)[best] < _SAME_PX, np.inf, distance)
+    good = (shortest <= max_distance) & (shortest < _RATIO * np.min(rivals, axis=1))
     if mutual:
         good &= np.argmin(distance, axis=0)[best] == rows
     # of several features that chose the same keypoint, the closest gets it
@@ -191,7 +189,7 @@ class DescriptorMatching:
         self._extractor = extractor
         self._epipolar_px = config.epipolar_px
         self._dense = FeatureExtractor(
-            config, camera.width, camera.height, mask, KEYPOINT_DISTANCE_PX
+            config, camera.width, camera.height, mask, _KEYPOINT_DISTANCE_PX
         )
         self._descriptor: Descriptor = DESCRIPTORS[config.method]()
         self._current = self._last = _Described.empty()
@@ -200,12 +198,12 @@ class DescriptorMatching:
         self._matched = np.zeros(0, np.int64)  # index of the keypoint of each feature, or -1
         self._proposed = np.zeros(0, np.int64)  # indices of the keypoints that were proposed
         self._lost: _Lost | None = None
-        self._history: deque[Tracks] = deque(maxlen=MEMORY_FRAMES + 1)
+        self._history: deque[Tracks] = deque(maxlen=_MEMORY_FRAMES + 1)
         self._images = 0
 
     def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
         """Find features in the next image."""
-        keypoints = self._dense.candidates(image, KEYPOINTS)
+        keypoints = self._dense.candidates(image, _KEYPOINTS)
         kept, vectors = self._descriptor.describe(image, keypoints)
         self._last = self._current
         self._current = _Described(keypoints.select(kept), vectors, np.ones(len(kept), np.bool_))
@@ -238,7 +236,7 @@ class DescriptorMatching:
         seen = found >= 0
         self._current.free[found[seen]] = False
         self._update(lost.ids[seen], found[seen])
-        young = self._images - lost.seen <= MEMORY_FRAMES
+        young = self._images - lost.seen <= _MEMORY_FRAMES
         size = (self._camera.height, self._camera.width)
         self._lost = lost.select(~seen & young & inside(lost.pixels, size, 0))
         self._history.append(after)

@@ -13,36 +13,24 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
 
-__all__ = [
-    "MIN_POINTS",
-    "coherent_groups",
-    "direction_inliers",
-    "eight_point",
-    "epipolar_distance",
-    "essential_matrix",
-    "fundamental_inliers",
-    "map_inliers",
-    "triangulated_depths",
-]
-
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
 
-GROUP_SHARE = 0.1
-GROUP_POINTS = 16
+_GROUP_SHARE = 0.1
+_GROUP_POINTS = 16
 """Matches that agree on another motion are an object, not errors, if they are this share of all
 and this many at least."""
 
 CONFIDENCE = 0.999
 """Probability with which RANSAC draws at least one sample without an outlier."""
 
-MAX_ITERATIONS = 1000
+_MAX_ITERATIONS = 1000
 """Most samples that RANSAC draws."""
 
-PNP_ITERATIONS = 100
+_PNP_ITERATIONS = 100
 """Most samples of PnP's RANSAC, which starts from a predicted pose."""
 
-DIRECTION_SAMPLES = 64
+_DIRECTION_SAMPLES = 64
 """Samples of two points: with half of the matches wrong, one sample in four is good."""
 
 
@@ -63,7 +51,7 @@ def coherent_groups(
     Returns:
         Rows of each group, ascending.
     """
-    needed = max(GROUP_POINTS, GROUP_SHARE * count)
+    needed = max(_GROUP_POINTS, _GROUP_SHARE * count)
     groups: list[IntArray] = []
     while len(rest) >= needed:
         group = rest[inliers(rest)]
@@ -128,7 +116,7 @@ def _sampled(
             cv2.RANSAC,
             CONFIDENCE,
             tolerance_px / focal_px,
-            MAX_ITERATIONS,
+            _MAX_ITERATIONS,
         )
     else:
         # OpenCV's solvers expect numbers of the size of pixels
@@ -138,7 +126,7 @@ def _sampled(
             cv2.USAC_MAGSAC if config.outliers == "magsac" else cv2.FM_RANSAC,
             tolerance_px,
             CONFIDENCE,
-            MAX_ITERATIONS,
+            _MAX_ITERATIONS,
         )
     if matrix is None or inliers is None:
         return None
@@ -180,7 +168,7 @@ def direction_inliers(
     ahead = np.maximum(turned[:, 2:], 1e-3)
     turned, seen = turned / ahead, np.column_stack([after, np.ones(n)])
     normals = np.cross(turned, seen)
-    first, second = rng.integers(0, n, (2, DIRECTION_SAMPLES))
+    first, second = rng.integers(0, n, (2, _DIRECTION_SAMPLES))
     directions = np.cross(normals[first], normals[second])
     length = np.linalg.norm(directions, axis=1)
     directions = directions[length > 0] / length[length > 0, None]
@@ -247,7 +235,7 @@ def map_inliers(
         rvec=np.array(gtsam.Rot3.Logmap(guess.rotation())).reshape(3, 1),
         tvec=np.array(guess.translation()).reshape(3, 1),
         useExtrinsicGuess=True,
-        iterationsCount=PNP_ITERATIONS,
+        iterationsCount=_PNP_ITERATIONS,
         reprojectionError=config.map_check_px / focal_px,
         confidence=CONFIDENCE,
     )

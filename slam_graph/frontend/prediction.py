@@ -15,17 +15,15 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.imu_motion import ImuMotion
 from slam_graph.frontend.keypoints import Pixels, Tracks
-from slam_graph.sensors.rig import RigCamera
+from slam_graph.sensors import RigCamera
 
-__all__ = ["PointPredictor", "Prediction", "neighbour_flow"]
-
-NEAREST_DEPTH_M = 0.1
+_NEAREST_DEPTH_M = 0.1
 """Points of the map nearer than this, or behind the camera, are not used for prediction."""
 
 MAX_TANGENT = 2.75
 """Largest normalised coordinate for which a camera model is evaluated: 70° off the axis."""
 
-NEIGHBOURS = 3
+_NEIGHBOURS = 3
 """The median motion of this many neighbours predicts that of a new feature."""
 
 
@@ -135,8 +133,8 @@ class PointPredictor:
         points = feedback.points[np.searchsorted(feedback.ids, ids[known])]
         camera_T_world: gtsam.Pose3 = (world_T_body * self._body_T_camera).inverse()
         seen = np.asarray(camera_T_world.transformFrom(points.T)).T
-        m[known] = seen[:, :2] / np.maximum(seen[:, 2:], NEAREST_DEPTH_M)
-        known[known] = seen[:, 2] > NEAREST_DEPTH_M
+        m[known] = seen[:, :2] / np.maximum(seen[:, 2:], _NEAREST_DEPTH_M)
+        known[known] = seen[:, 2] > _NEAREST_DEPTH_M
         return known, m
 
 
@@ -148,7 +146,7 @@ def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
         end: (N, 2) the same features in another.
         at: (M, 2) pixels in the first one.
     """
-    if len(start) < NEIGHBOURS:
+    if len(start) < _NEIGHBOURS:
         return np.zeros_like(at)
-    _, nearest = cKDTree(start).query(at, k=NEIGHBOURS)
+    _, nearest = cKDTree(start).query(at, k=_NEIGHBOURS)
     return np.asarray(np.median((end - start)[nearest], axis=1), np.float32)

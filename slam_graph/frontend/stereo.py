@@ -25,30 +25,27 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors import Camera, Rig, RigCamera
 
-__all__ = ["StereoMatcher", "reference_cameras"]
-
-OVERLAP_GRID = 8
+_OVERLAP_GRID = 8
 """Rays through OVERLAP_GRID x OVERLAP_GRID pixels are followed into the other camera."""
 
-OVERLAP_DEPTHS_M = (1.0, 3.0, 10.0, 100.0)
+_OVERLAP_DEPTHS_M = (1.0, 3.0, 10.0, 100.0)
 """Distances at which it is computed what two cameras both see."""
 
-MIN_OVERLAP = 0.25
+_MIN_OVERLAP = 0.25
 """A camera that sees less than this share of another one's view has features of its own."""
 
 MAX_TANGENT = 3.0
 """Points with larger normalised coordinates, 72° off the axis, are outside of any camera."""
 
-HALVINGS = 2
+_HALVINGS = 2
 """The epipolar search runs on images of a quarter of the size."""
 
-PATCH_RADIUS = 3
+_PATCH_RADIUS = 3
 """Its patches have (2 PATCH_RADIUS + 1)² pixels of the reduced image."""
 
-SEARCH_STEP_PX = 1.0
+_SEARCH_STEP_PX = 1.0
 """Largest distance, in the reduced image, between neighbouring candidates at the image centre."""
 
 MIN_SCORE = 0.6
@@ -67,7 +64,7 @@ def reference_cameras(rig: Rig) -> tuple[int, ...]:
     for index, mounted in enumerate(rig.cameras):
         leaders = [i for i in sorted(set(references)) if references[i] == i]
         shares = [_overlap(rig.cameras[i], mounted) for i in leaders]
-        if shares and max(shares) >= MIN_OVERLAP:
+        if shares and max(shares) >= _MIN_OVERLAP:
             references.append(leaders[int(np.argmax(shares))])
         else:
             references.append(index)
@@ -78,8 +75,8 @@ def _overlap(reference: RigCamera, other: RigCamera) -> float:
     """The share of a camera's view that another one sees too, at the depth where it is largest."""
     camera = reference.camera
     u, v = np.meshgrid(
-        np.linspace(0, camera.width - 1, OVERLAP_GRID),
-        np.linspace(0, camera.height - 1, OVERLAP_GRID),
+        np.linspace(0, camera.width - 1, _OVERLAP_GRID),
+        np.linspace(0, camera.height - 1, _OVERLAP_GRID),
     )
     rays, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
     if not usable.any():
@@ -88,7 +85,7 @@ def _overlap(reference: RigCamera, other: RigCamera) -> float:
     ends = np.column_stack([rays, np.ones(len(rays))])
     other_T_reference = other.body_T_camera.between(reference.body_T_camera)
     shares = []
-    for depth_m in OVERLAP_DEPTHS_M:
+    for depth_m in _OVERLAP_DEPTHS_M:
         points = np.asarray(other_T_reference.transformFrom((depth_m * ends).T)).T
         shares.append(float(np.mean(_sees(other, points))))
     return max(shares)
@@ -124,9 +121,9 @@ class _EpipolarSearch:
         self._R = other_T_reference.rotation().matrix()
         self._t = other_T_reference.translation()
         disparity_px = camera.fx * float(np.linalg.norm(self._t)) / min_depth_m
-        count = int(disparity_px / (SEARCH_STEP_PX * 2**HALVINGS)) + 2
+        count = int(disparity_px / (_SEARCH_STEP_PX * 2**_HALVINGS)) + 2
         self._inverse_depths = np.linspace(0.0, 1.0 / min_depth_m, count)
-        steps = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
+        steps = np.arange(-_PATCH_RADIUS, _PATCH_RADIUS + 1)
         self._patch = np.stack(np.meshgrid(steps, steps, indexing="ij")).reshape(2, -1)
 
     def project(self, normalized: FloatArray, inverse_depth_per_m: FloatArray) -> FloatArray:
@@ -168,7 +165,7 @@ class _EpipolarSearch:
         candidate_patches = self._patches(other, targets.reshape(-1, 2)).reshape(n, candidates, -1)
         scores = np.einsum("np,ncp->nc", patches, candidate_patches)
         height, width = other.shape
-        scale = 2**HALVINGS
+        scale = 2**_HALVINGS
         outside = np.any((targets < 0) | (targets > (width * scale, height * scale)), axis=2)
         scores[outside] = -1.0
         best = np.argmax(scores, axis=1)
@@ -179,10 +176,10 @@ class _EpipolarSearch:
         """Patches (N, P) around full-size pixels (N, 2), of zero mean and unit norm."""
         height, width = image.shape
         # Pixel centres are at integers, so a reduced pixel u covers 4u - 1.5 … 4u + 1.5 of the full
-        scale = 2**HALVINGS
+        scale = 2**_HALVINGS
         centre = np.rint((pixels + 0.5) / scale - 0.5)
-        u = np.clip(centre[:, 0], PATCH_RADIUS, width - 1 - PATCH_RADIUS).astype(np.int64)
-        v = np.clip(centre[:, 1], PATCH_RADIUS, height - 1 - PATCH_RADIUS).astype(np.int64)
+        u = np.clip(centre[:, 0], _PATCH_RADIUS, width - 1 - _PATCH_RADIUS).astype(np.int64)
+        v = np.clip(centre[:, 1], _PATCH_RADIUS, height - 1 - _PATCH_RADIUS).astype(np.int64)
         offsets = self._patch[0] * width + self._patch[1]
         patches = image.ravel()[(v * width + u)[:, None] + offsets].astype(np.float32)
         patches -= patches.mean(axis=1, keepdims=True)
@@ -193,7 +190,7 @@ class _EpipolarSearch:
 
 def _reduce(image: Image) -> Image:
     """An image of a quarter of the size, each pixel the mean of 4 x 4."""
-    for _ in range(HALVINGS):
+    for _ in range(_HALVINGS):
         # Halving twice is several times faster in OpenCV than the same in one step
         size = (image.shape[1] // 2, image.shape[0] // 2)
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

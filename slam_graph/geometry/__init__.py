@@ -7,3 +7,50 @@
 - `interpolation`: `interpolate`.
 - `trajectory_alignment`: `align`, `Similarity`.
 """
+
+from typing import TYPE_CHECKING
+
+from slam_graph.lazy import lazy_exports
+
+__all__ = [
+    "DEFAULT_MAX_GAP_S",
+    "AlignmentMode",
+    "NavState",
+    "Similarity",
+    "StateHistory",
+    "Trajectory",
+    "align",
+    "align_first_pose",
+    "align_yaw",
+    "interpolate",
+    "tum_lines",
+    "umeyama",
+]
+
+if TYPE_CHECKING:
+    from slam_graph.geometry.interpolation import DEFAULT_MAX_GAP_S, interpolate
+    from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory, tum_lines
+    from slam_graph.geometry.trajectory_alignment import (
+        AlignmentMode,
+        Similarity,
+        align,
+        align_first_pose,
+        align_yaw,
+        umeyama,
+    )
+else:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "interpolation": ("DEFAULT_MAX_GAP_S", "interpolate"),
+            "trajectory": ("NavState", "StateHistory", "Trajectory", "tum_lines"),
+            "trajectory_alignment": (
+                "AlignmentMode",
+                "Similarity",
+                "align",
+                "align_first_pose",
+                "align_yaw",
+                "umeyama",
+            ),
+        },
+    )

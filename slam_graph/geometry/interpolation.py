@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry.trajectory import Trajectory
 
-__all__ = ["DEFAULT_MAX_GAP_S", "interpolate"]
-
 DEFAULT_MAX_GAP_S = 0.2
 """Four frames at 20 Hz; over a longer gap a straight line says little of the motion."""
 

@@ -18,8 +18,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 
-__all__ = ["NavState", "StateHistory", "Trajectory", "tum_lines"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavState:

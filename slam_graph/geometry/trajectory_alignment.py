@@ -19,16 +19,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry.trajectory import Trajectory
 
-__all__ = [
-    "ALIGNMENT_MODES",
-    "AlignmentMode",
-    "Similarity",
-    "align",
-    "align_first_pose",
-    "align_yaw",
-    "umeyama",
-]
-
 AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
 ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from slam_graph.settings.base import Settings, expert
-
-__all__ = ["KeyframeConfig", "LoopClosureConfig", "PlaceConfig", "VerificationConfig"]
+from slam_graph.settings import Settings, expert
 
 
 def _constants(file: str, **names: str) -> dict[str, str]:

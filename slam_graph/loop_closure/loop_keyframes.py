@@ -16,20 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.backend_config import TriangulationConfig
-from slam_graph.backend.cost.feature_tracks import FeatureTracks
-from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.triangulation import triangulate
-from slam_graph.frontend.descriptors import Orb
-from slam_graph.frontend.keypoints import Image, Keypoints
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.backend import FeatureTracks, RigProjection, TriangulationConfig, triangulate
+from slam_graph.frontend import Image, Keypoints, Orb
+from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.loop_closure.loop_config import KeyframeConfig
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["Descriptors", "Keyframe", "KeyframeDescriber", "KeyframeLog", "reposed"]
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
 
 POINT_FRAMES = 10
 """Number of recent frames from which the points of a keyframe are triangulated …"""

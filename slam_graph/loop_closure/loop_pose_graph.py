@@ -26,10 +26,7 @@ from scipy.stats import chi2
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.pose_graph.graph import PoseGraph, Poses
-from slam_graph.pose_graph.gtsam_graph import ROTATION_FIRST
-
-__all__ = ["body_poses", "drift_sigmas", "level_graph", "loop_graph", "split_yaw"]
+from slam_graph.pose_graph import ROTATION_FIRST, PoseGraph, Poses
 
 _MIN_LOOPS = 10
 """With fewer loop closures drift is not learned."""

@@ -17,9 +17,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray, skew
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
-from slam_graph.sensors.rig import RigCamera
-
-__all__ = ["Loop", "LoopVerifier"]
+from slam_graph.sensors import RigCamera
 
 RANSAC_ITERATIONS = 200
 """Largest number of samples."""

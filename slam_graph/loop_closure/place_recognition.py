@@ -21,16 +21,6 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.loop_closure.loop_config import PlaceConfig
 from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 
-__all__ = [
-    "SAME_PLACE",
-    "PlaceDatabase",
-    "PlaceRecognition",
-    "Vocabulary",
-    "WordVector",
-    "best_places",
-    "majority",
-]
-
 TRAINING_DESCRIPTORS = 30_000
 """Largest number of descriptors that a vocabulary is trained on, for its time (some seconds)."""
 TRAINING_ROUNDS = 6
@@ -157,7 +147,7 @@ class PlaceDatabase:
         return np.bincount(np.concatenate(shared), products, self._count).astype(np.float64)
 
 
-def best_places(scores: FloatArray, least: float, count: int, apart: int) -> IntArray:
+def best_places(scores: FloatArray, least: float, count: int, apart: int = SAME_PLACE) -> IntArray:
     """The most similar keyframes, best first, each the best of its neighbourhood.
 
     Args:
@@ -203,7 +193,7 @@ class PlaceRecognition:
         old = np.searchsorted(self._stamps_ns, keyframe.stamp_ns - config.min_gap_s * 1e9)
         # the preceding keyframe shows how similar views of one place are here
         least = MIN_SCORE_RATIO * scores[-1] if len(scores) else 0.0
-        similar = best_places(scores[:old], least, config.candidates, SAME_PLACE)
+        similar = best_places(scores[:old], least, config.candidates)
         consistent = [place for place in similar.tolist() if self._was_similar(place)]
         self._database.add(bag)
         self._stamps_ns.append(keyframe.stamp_ns)

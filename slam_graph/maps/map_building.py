@@ -17,10 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
-from slam_graph.loop_closure.loop_keyframes import Keyframe
-from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.loop_closure.place_recognition import Vocabulary
+from slam_graph.loop_closure import Keyframe, Loop, PlaceConfig, VerificationConfig, Vocabulary
 from slam_graph.maps.map_model import (
     NO_FEATURE,
     Links,
@@ -28,11 +25,9 @@ from slam_graph.maps.map_model import (
     SlamMap,
     majority_descriptors,
 )
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.sensors.rig import Rig
+from slam_graph.pose_graph import Poses
+from slam_graph.sensors import Rig
 from slam_graph.version import __version__
-
-__all__ = ["build_map", "links_of", "merged_groups", "train_vocabulary", "with_points"]
 
 
 def build_map(

@@ -7,9 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from slam_graph.settings.base import Settings, expert
-
-__all__ = ["LocalizationConfig", "MapConfig"]
+from slam_graph.settings import Settings, expert
 
 
 class MapConfig(Settings):

@@ -23,15 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.place_recognition import Vocabulary
+from slam_graph.loop_closure import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.sensors.calibration_yaml import parse_yaml
-from slam_graph.sensors.euroc_calibration import read_imu_noise
-from slam_graph.sensors.kalibr_calibration import IMU_KEY, chain_cameras, kalibr_table
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["ARRAYS", "arrays_of", "read_map", "write_map"]
+from slam_graph.pose_graph import Poses
+from slam_graph.sensors import kalibr_table, parse_yaml, rig_from_table
 
 _MAX_COORDINATE_M = 1e8
 _MAX_NORMALIZED = 1e4
@@ -307,10 +302,8 @@ def _poses(arrays: dict[str, NDArray[Any]], prefix: str, path: Path) -> Poses:
 def _recording(entry: _Recording, path: Path) -> MapRecording:
     """A recording with its calibration."""
     where = path / HEADER
-    chain = parse_yaml(json.dumps(entry.calibration), where)
-    return MapRecording(
-        entry.name, entry.poses, Rig(chain_cameras(chain), read_imu_noise(chain.require(IMU_KEY)))
-    )
+    calibration = parse_yaml(json.dumps(entry.calibration), where)
+    return MapRecording(entry.name, entry.poses, rig_from_table(calibration))
 
 
 def _check_map(content: SlamMap, path: Path) -> None:

@@ -17,12 +17,10 @@ from dataclasses import dataclass
 import gtsam
 
 from slam_graph.arrays import FloatArray
-from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure import Keyframe
 from slam_graph.maps.map_config import LocalizationConfig
 from slam_graph.maps.map_places import MapPlaces, PlaceMatch
 from slam_graph.maps.pose_filter import CONSISTENT_CHI2, MapPoseFilter
-
-__all__ = ["MapLocalizer"]
 
 MIN_CONSISTENT = 3
 """Number of consistent matches from which the filter starts."""

@@ -22,9 +22,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.loop_closure.loop_config import LoopClosureConfig
-from slam_graph.loop_closure.loop_pose_graph import body_poses, loop_graph
-from slam_graph.loop_closure.loop_verification import Loop
+from slam_graph.loop_closure import Loop, LoopClosureConfig, body_poses, loop_graph
 from slam_graph.maps.map_building import (
     links_of,
     merged_groups,
@@ -39,12 +37,8 @@ from slam_graph.maps.pose_filter import (
     MapPoseFilter,
     with_roll_and_pitch,
 )
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.pose_graph.optimize import optimize_pose_graph
-from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
+from slam_graph.pose_graph import PoseGraphCostPolicy, PoseGraphPolicy, Poses, optimize_pose_graph
 from slam_graph.version import __version__
-
-__all__ = ["MIN_LINKS", "MergeSummary", "MergedMaps", "merge_maps"]
 
 MIN_LINKS = 5
 """Least number of consistent matches between two maps."""

@@ -19,21 +19,10 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
-from slam_graph.loop_closure.place_recognition import Vocabulary, majority
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.sensors.rig import Rig
-
-__all__ = [
-    "NO_FEATURE",
-    "Links",
-    "MapRecording",
-    "PoseSource",
-    "SlamMap",
-    "in_body",
-    "majority_descriptors",
-]
+from slam_graph.geometry import Trajectory
+from slam_graph.loop_closure import Descriptors, Keyframe, Vocabulary, majority
+from slam_graph.pose_graph import Poses
+from slam_graph.sensors import Rig
 
 NO_FEATURE = -1
 """Feature index of an observation without a triangulated point."""

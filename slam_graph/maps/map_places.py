@@ -11,14 +11,17 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.loop_config import VerificationConfig
-from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
-from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
-from slam_graph.loop_closure.place_recognition import SAME_PLACE, PlaceDatabase, best_places
+from slam_graph.loop_closure import (
+    Descriptors,
+    Keyframe,
+    Loop,
+    LoopVerifier,
+    PlaceDatabase,
+    VerificationConfig,
+    best_places,
+)
 from slam_graph.maps.map_model import SlamMap, in_body
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["MapPlaces", "PlaceMatch"]
+from slam_graph.sensors import Rig
 
 _HALF_TURN_M = 4.0
 """Distance that a rotation by 180° counts as."""
@@ -89,7 +92,7 @@ class MapPlaces:
     def similar(self, descriptors: Descriptors, count: int) -> IntArray:
         """The keyframes most similar to a view with descriptors (N, B), best first."""
         scores = self._database.query(self.map.vocabulary.words_of(descriptors))
-        return best_places(scores, 0.0, count, SAME_PLACE)
+        return best_places(scores, 0.0, count)
 
     def nearest(self, world_T_body: gtsam.Pose3, count: int) -> IntArray:
         """The keyframes nearest to a pose, in position and orientation, best first."""
@@ -98,7 +101,7 @@ class MapPlaces:
         # |R - S|² = 8 for a half turn
         turned = np.linalg.norm(poses.rotations - world_T_body.rotation().matrix(), axis=(1, 2))
         near = 1.0 / (1.0 + away + turned * _HALF_TURN_M / np.sqrt(8.0))
-        return best_places(near, 0.0, count, SAME_PLACE)
+        return best_places(near, 0.0, count)
 
     def locate(self, view: Keyframe, number: int, gravity: bool) -> PlaceMatch | None:
         """Localize a view at a keyframe of the map; None if verification fails.

@@ -17,8 +17,6 @@ from scipy.stats import chi2
 from slam_graph.arrays import FloatArray
 from slam_graph.maps.map_config import LocalizationConfig
 
-__all__ = ["CONSISTENT_CHI2", "MapPoseFilter", "with_roll_and_pitch"]
-
 CONFIDENCE = 0.999
 """χ² quantile of consistent matches: so high because a rejected true match costs little."""
 CONSISTENT_CHI2 = float(chi2.ppf(CONFIDENCE, 6))

@@ -6,17 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.backend.estimator import Estimator
-from slam_graph.datasets.sequence import Sequence
-from slam_graph.geometry.trajectory import NavState
+from slam_graph.backend import Estimator
+from slam_graph.datasets import Sequence
+from slam_graph.geometry import NavState
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.start import KnownStart
 from slam_graph.pipeline.supervision import Agreement, DivergenceError, check_sane
 from slam_graph.pipeline.tracking import TrackedPacket
-from slam_graph.results.run_result import RunResult
-from slam_graph.sensors.measurements import FeatureFrame
-
-__all__ = ["Estimation"]
+from slam_graph.results import RunResult
+from slam_graph.sensors import FeatureFrame
 
 
 class Estimation:

@@ -7,12 +7,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeGuard
 
-from slam_graph.backend.estimator import Estimator
+from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.pipeline.stage import EstimatedFrame, Stage
-from slam_graph.results.run_result import RunResult
-
-__all__ = ["GraphKeeping"]
+from slam_graph.results import RunResult
 
 _FIRST_STAMP = 1_000_000_000
 """Whole numbers from here on are stamps in nanoseconds."""

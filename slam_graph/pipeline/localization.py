@@ -11,16 +11,11 @@ import cv2
 import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeDescriber
-from slam_graph.maps.map_localization import MapLocalizer
-from slam_graph.maps.map_model import SlamMap
-from slam_graph.maps.map_places import MapPlaces
+from slam_graph.geometry import NavState
+from slam_graph.loop_closure import Keyframe, KeyframeDescriber
+from slam_graph.maps import MapLocalizer, MapPlaces, SlamMap
 from slam_graph.pipeline.stage import EstimatedFrame, Stage
-from slam_graph.results.localization_result import LocalizationLog
-from slam_graph.results.run_result import RunResult
-
-__all__ = ["Localization"]
+from slam_graph.results import LocalizationLog, RunResult
 
 logger = logging.getLogger(__name__)
 

@@ -8,13 +8,10 @@ import logging
 import time
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.loop_closure.close_loops import close_loops
-from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog, reposed
+from slam_graph.loop_closure import Keyframe, KeyframeLog, close_loops, reposed
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
-from slam_graph.results.run_result import RunResult
-from slam_graph.sensors.measurements import FeatureFrame
-
-__all__ = ["NOT_RECOGNISABLE", "Keyframes", "LoopClosing"]
+from slam_graph.results import RunResult
+from slam_graph.sensors import FeatureFrame
 
 NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
 

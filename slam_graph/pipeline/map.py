@@ -7,16 +7,12 @@ from __future__ import annotations
 import logging
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.loop_closure.loop_keyframes import Keyframe, reposed
-from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.maps.map_building import build_map
-from slam_graph.maps.map_model import MapRecording, PoseSource, SlamMap
+from slam_graph.loop_closure import Keyframe, Loop, reposed
+from slam_graph.maps import MapRecording, PoseSource, SlamMap, build_map
 from slam_graph.pipeline.loops import NOT_RECOGNISABLE, Keyframes
 from slam_graph.pipeline.stage import COMPLETED, Stage, warn_on_failure
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.results.run_result import RunResult
-
-__all__ = ["MapBuilding"]
+from slam_graph.pose_graph import Poses
+from slam_graph.results import RunResult
 
 logger = logging.getLogger(__name__)
 

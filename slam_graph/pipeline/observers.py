@@ -9,11 +9,9 @@ from typing import Protocol
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
-from slam_graph.results.run_result import RunResult
-from slam_graph.sensors.measurements import FeatureFrame, ImuData
-from slam_graph.visualization.viewer import Viewer
-
-__all__ = ["NullProgress", "NullRecorder", "Observers", "Progress", "Recorder"]
+from slam_graph.results import RunResult
+from slam_graph.sensors import FeatureFrame, ImuData
+from slam_graph.visualization import Viewer
 
 
 class Progress(Protocol):

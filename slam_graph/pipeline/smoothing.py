@@ -13,11 +13,8 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
-from slam_graph.results.run_result import RunResult
-from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
-from slam_graph.smoothing.frame_log import FrameLog
-
-__all__ = ["Smoothing"]
+from slam_graph.results import RunResult
+from slam_graph.smoothing import FrameLog, UndeterminedError, adjust_recording
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""

@@ -20,11 +20,9 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
-from slam_graph.frontend.frontend_protocol import Feedback
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData, Packet
-
-__all__ = ["COMPLETED", "EstimatedFrame", "Stage", "warn_on_failure"]
+from slam_graph.frontend import Feedback
+from slam_graph.geometry import NavState
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet
 
 COMPLETED = ("ok", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.results.run_result import RunInput
-
-__all__ = ["KnownStart", "true_state"]
+from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.results import RunInput
 
 _LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame: the IMU reaches back that far."""

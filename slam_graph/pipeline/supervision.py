@@ -15,14 +15,11 @@ from types import FrameType
 
 import numpy as np
 
-from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.estimator import Estimator
+from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import LimitsConfig
 from slam_graph.errors import EstimationError, SlamGraphError
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.results.run_result import RunResult
-
-__all__ = ["Agreement", "DivergenceError", "check_sane", "interrupts_between_frames", "outcome"]
+from slam_graph.geometry import NavState
+from slam_graph.results import RunResult
 
 _LONGEST_GAP_S = 0.5
 """A gap between two frames whose features were tested counts as at most this much time."""

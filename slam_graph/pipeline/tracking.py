@@ -13,13 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
-from slam_graph.datasets.sequence import Sequence
-from slam_graph.frontend.frontend_protocol import Feedback, Frontend
-from slam_graph.results.run_logs import Stopwatch, milliseconds
-from slam_graph.results.run_result import RunInput
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, Packet
-
-__all__ = ["TrackedPacket", "Tracking", "packets_of"]
+from slam_graph.datasets import Sequence
+from slam_graph.frontend import Feedback, Frontend
+from slam_graph.results import RunInput, Stopwatch, milliseconds
+from slam_graph.sensors import CameraFrame, FeatureFrame, Packet
 
 
 @dataclass(frozen=True, eq=False)

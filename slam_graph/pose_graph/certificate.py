@@ -25,12 +25,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.solve.damped_steps import (
-    Attempt,
-    StepSettings,
-    TenfoldDamping,
-    levenberg_marquardt,
-)
+from slam_graph.backend import Attempt, StepSettings, TenfoldDamping, levenberg_marquardt
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.chordal import (
     chordal_cost,
@@ -40,8 +35,6 @@ from slam_graph.pose_graph.chordal import (
     whitened_rows,
 )
 from slam_graph.pose_graph.graph import PoseGraph, Poses
-
-__all__ = ["Certificate", "certify"]
 
 _RELATIVE_GAP = 1e-6
 """An optimum is global if no poses can have an F lower by more than this part of it, plus …"""

@@ -19,17 +19,6 @@ from scipy.sparse.linalg import SuperLU, splu
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
-__all__ = [
-    "chordal_cost",
-    "factorized",
-    "nearest_rotations",
-    "rotation_rows",
-    "stacked",
-    "translation_rows",
-    "unstacked",
-    "whitened_rows",
-]
-
 
 def translation_rows(graph: PoseGraph, τ: FloatArray) -> csr_matrix:
     """(M, n + dn) whitened rows b with X bᵀ = √τ (t_j - t_i - R_i t_ij)."""

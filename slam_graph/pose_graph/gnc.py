@@ -37,8 +37,6 @@ from slam_graph.pose_graph.gtsam_graph import (
 from slam_graph.pose_graph.loop_consistency import confirmed_loops
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
-__all__ = ["graduated_nonconvexity", "truncated_weights"]
-
 _CONTROL_FACTOR = 1.4
 """Growth of μ from one update of the weights to the next, as in the paper."""
 
@@ -69,7 +67,7 @@ def graduated_nonconvexity(
         squared = edge_chi2(plain, values)[uncertain]
         if control is None:
             control = bound / max(2.0 * squared.max(initial=0.0) - bound, 1e-3 * bound)
-        weights[uncertain] = truncated_weights(squared, bound, control)
+        weights[uncertain] = _truncated_weights(squared, bound, control)
         if np.isin(weights, (0.0, 1.0)).all():
             break
         control *= _CONTROL_FACTOR
@@ -84,7 +82,7 @@ def graduated_nonconvexity(
     return poses_of(values, graph.dimension), np.maximum(np.round(weights), least)
 
 
-def truncated_weights(squared: FloatArray, bound: float, control: float) -> FloatArray:
+def _truncated_weights(squared: FloatArray, bound: float, control: float) -> FloatArray:
     """Weights of truncated least squares at μ = control (Yang et al. 2020, equation 14).
 
     Args:

@@ -22,9 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.geometry.trajectory import Trajectory
-
-__all__ = ["PoseGraph", "Poses", "RotationInformation"]
+from slam_graph.geometry import Trajectory
 
 RotationInformation = Literal["angle", "quaternion"]
 

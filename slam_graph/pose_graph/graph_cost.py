@@ -30,15 +30,6 @@ from slam_graph.pose_graph.gtsam_graph import (
 )
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
-__all__ = [
-    "PoseGraphCost",
-    "chi2_table",
-    "construct",
-    "inlier_bound",
-    "loss_weights",
-    "uncertain_edges",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraphCost:
@@ -116,6 +107,11 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
     return weights
 
 
+def chi2_of_edges(graph: PoseGraph, poses: Poses) -> FloatArray:
+    """(M,) squared whitened residual of each edge, without a robust loss."""
+    return edge_chi2(edge_factors(graph, range(len(graph.edges))), values_of(poses))
+
+
 def chi2_table(
     graph: PoseGraph, poses: Poses, weights: FloatArray | None = None
 ) -> dict[str, float]:
@@ -133,7 +129,7 @@ def chi2_table(
     if weights is not None:
         rows = np.flatnonzero(weights > 0)
         graph = graph.keep_edges(rows).weighted(weights[rows])
-    squared = edge_chi2(edge_factors(graph, range(len(graph.edges))), values_of(poses))
+    squared = chi2_of_edges(graph, poses)
     return {
         "gtsam_error": 0.5 * float(squared.sum()),
         "gtsam_chi2": float(squared.sum()),

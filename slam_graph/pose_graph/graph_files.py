@@ -27,13 +27,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.csv_rows import Rows, parse
+from slam_graph.datasets import Rows, parse
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
-from slam_graph.settings.tree import closest
-
-__all__ = ["g2o_lines", "read_pose_graph"]
 
 
 @dataclass(frozen=True, slots=True)

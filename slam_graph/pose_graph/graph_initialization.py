@@ -24,8 +24,6 @@ from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 Initialization = Literal["chordal", "lago", "odometry", "file"]
 
-__all__ = ["Initialization", "along_tree", "initialize", "tree_edges"]
-
 _LOOP_CLOSURE_LENGTH = 1e6
 """Length of a loop closure in the spanning tree, where an edge of odometry has 1."""
 

@@ -26,8 +26,6 @@ from slam_graph.pose_graph.graph_cost import PoseGraphCost
 from slam_graph.pose_graph.gtsam_graph import factor_graph, gtsam_poses, poses_of, values_of
 from slam_graph.pose_graph.pose_graph_policy import Minimum, PoseGraphStepsPolicy
 
-__all__ = ["minimize"]
-
 _NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each edge is rounding: all edges agree."""
 

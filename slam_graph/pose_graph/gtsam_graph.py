@@ -13,18 +13,6 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
-__all__ = [
-    "ROTATION_FIRST",
-    "anchor_factors",
-    "edge_chi2",
-    "edge_factors",
-    "factor_graph",
-    "gtsam_poses",
-    "poses_of",
-    "robust_estimator",
-    "values_of",
-]
-
 _LOSSES: dict[str, Callable[[float], Any]] = {
     "huber": gtsam.noiseModel.mEstimator.Huber.Create,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,

@@ -21,8 +21,6 @@ from scipy.spatial import cKDTree
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
-__all__ = ["confirmed_loops"]
-
 _NEIGHBOURHOOD = 10
 """Two loop closures are compared if their ends are at most this many poses apart."""
 

@@ -35,8 +35,6 @@ from slam_graph.pose_graph.pose_graph_policy import (
     PoseGraphSolution,
 )
 
-__all__ = ["marginal_covariances", "optimize_pose_graph"]
-
 
 def optimize_pose_graph(
     graph: PoseGraph,

@@ -15,15 +15,7 @@ from pydantic import Field
 
 from slam_graph.arrays import FloatArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
-from slam_graph.settings.base import Settings, expert
-
-__all__ = [
-    "Minimum",
-    "PoseGraphCostPolicy",
-    "PoseGraphPolicy",
-    "PoseGraphSolution",
-    "PoseGraphStepsPolicy",
-]
+from slam_graph.settings import Settings, expert
 
 
 class PoseGraphCostPolicy(Settings):

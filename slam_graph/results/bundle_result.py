@@ -14,16 +14,17 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
-from slam_graph.bundle_adjustment.bal_file import bal_lines
-from slam_graph.bundle_adjustment.bal_policy import BalPolicy, BalSolution
-from slam_graph.bundle_adjustment.bal_problem import BalEstimates
+from slam_graph.bundle_adjustment import (
+    BalEstimates,
+    BalPolicy,
+    BalSolution,
+    bal_lines,
+    reprojection_errors,
+)
 from slam_graph.config import dump_yaml
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.point_map import write_ply
 from slam_graph.results.result_files import ResultFolder, appearing, write_text
-
-__all__ = ["BalResult"]
 
 
 @dataclass(eq=False, repr=False)
@@ -137,7 +138,7 @@ class BalResult:
             partial.write_bytes(bz2.compress("".join(self.lines()).encode("ascii")))
 
     def _draw(self, path: Path) -> None:
-        from slam_graph.visualization.result_plots import plot_bundle
+        from slam_graph.visualization import plot_bundle
 
         part = self.solution.part.problem
         title = f"{self.name}: {part.cameras} cameras, {part.points} points"

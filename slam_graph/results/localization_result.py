@@ -12,15 +12,9 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.evaluation_report import accuracy_report
-from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import Similarity, align_yaw, umeyama
-from slam_graph.maps.map_model import SlamMap
-from slam_graph.maps.pose_filter import MapPoseFilter
-
-__all__ = ["LocalizationLog", "errors_in_map", "map_alignment"]
+from slam_graph.evaluation import accuracy_report, ape, synchronize
+from slam_graph.geometry import Similarity, Trajectory, align_yaw, umeyama
+from slam_graph.maps import MapPoseFilter, SlamMap
 
 _POSE_WIDTH = 7
 _LEAST_SHARED = 3

@@ -7,13 +7,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import tum_lines
-from slam_graph.maps.map_file import read_map, write_map
-from slam_graph.maps.map_model import SlamMap
+from slam_graph.geometry import tum_lines
+from slam_graph.maps import SlamMap, read_map, write_map
 from slam_graph.results.point_map import write_ply
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
-
-__all__ = ["MAP_NAME", "export_ply", "export_tum", "find_map", "load_map", "save_map"]
 
 MAP_NAME = "map.slam"
 """Name of the map in the folder of a run."""

@@ -18,27 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation.evaluation_report import accuracy_report, consistency_report
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
-from slam_graph.loop_closure.close_loops import LoopClosures
+from slam_graph.evaluation import accuracy_report, consistency_report
+from slam_graph.geometry import StateHistory, Trajectory
+from slam_graph.loop_closure import LoopClosures
 from slam_graph.results.run_logs import RunLogs
-from slam_graph.smoothing.final_adjustment import FinalBa
+from slam_graph.smoothing import FinalBa
 from slam_graph.version import __version__
-
-__all__ = [
-    "SCHEMA_VERSION",
-    "Table",
-    "accuracy_table",
-    "consistency_table",
-    "coverage",
-    "extent_table",
-    "final_ba_table",
-    "finite",
-    "loop_closure_table",
-    "peak_memory_mb",
-    "timing_table",
-    "versions",
-]
 
 SCHEMA_VERSION = 2
 """Counts up whenever a key changes its name or meaning."""

@@ -12,8 +12,6 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.results.result_files import appearing
 
-__all__ = ["PointMap", "read_ply", "write_ply"]
-
 _POINT_COLOUR = (200, 200, 200)
 _CAMERA_COLOUR = (220, 30, 30)
 

@@ -14,18 +14,19 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.config import dump_yaml
-from slam_graph.geometry.trajectory import tum_lines
-from slam_graph.pose_graph.certificate import Certificate
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.pose_graph.graph_cost import chi2_table
-from slam_graph.pose_graph.graph_files import g2o_lines
-from slam_graph.pose_graph.graph_initialization import along_tree
-from slam_graph.pose_graph.gtsam_graph import edge_chi2, edge_factors, values_of
-from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy, PoseGraphSolution
+from slam_graph.geometry import tum_lines
+from slam_graph.pose_graph import (
+    Certificate,
+    PoseGraphPolicy,
+    PoseGraphSolution,
+    Poses,
+    along_tree,
+    chi2_of_edges,
+    chi2_table,
+    g2o_lines,
+)
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder, appearing
-
-__all__ = ["PoseGraphResult"]
 
 
 @dataclass(eq=False, repr=False)
@@ -129,8 +130,7 @@ class PoseGraphResult:
     def _edge_lines(self) -> Iterator[str]:
         """Edges as CSV: ids, χ² in GTSAM's convention, weight."""
         graph, solution = self.solution.graph, self.solution
-        plain = edge_factors(graph, range(len(graph.edges)))
-        squared = edge_chi2(plain, values_of(solution.poses))
+        squared = chi2_of_edges(graph, solution.poses)
         yield "from,to,chi2,weight\n"
         rows = zip(
             graph.keys[graph.edges].tolist(),
@@ -156,7 +156,7 @@ class PoseGraphResult:
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
     def _draw(self, path: Path) -> None:
-        from slam_graph.visualization.result_plots import plot_pose_graph
+        from slam_graph.visualization import plot_pose_graph
 
         graph, weights = self.solution.graph, self.solution.weights
         title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"

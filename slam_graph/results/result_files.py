@@ -14,16 +14,6 @@ from typing import Any
 
 from slam_graph.errors import DataError
 
-__all__ = [
-    "LATEST",
-    "ResultFolder",
-    "appearing",
-    "create_run_folder",
-    "link_latest",
-    "refuse_to_replace",
-    "write_text",
-]
-
 LATEST = "latest"
 """Name of the link to the newest results."""
 

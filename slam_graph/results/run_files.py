@@ -11,29 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets import read_groundtruth
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
-
-__all__ = [
-    "ACCEL_BIAS",
-    "CONFIG",
-    "GROUNDTRUTH",
-    "GYRO_BIAS",
-    "IN_MAP",
-    "LOOP_CLOSED",
-    "METRICS",
-    "POINTS",
-    "RIG",
-    "SIGMAS",
-    "SMOOTHED",
-    "STATES",
-    "TRAJECTORY",
-    "VELOCITY",
-    "read_states",
-    "read_tum",
-    "state_lines",
-]
+from slam_graph.geometry import NavState, StateHistory, Trajectory
 
 TRAJECTORY = "trajectory.tum"
 SMOOTHED = "trajectory_smoothed.tum"

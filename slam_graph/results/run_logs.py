@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.cost.gating import Innovations
-from slam_graph.sensors.calibration_estimate import CalibrationEstimate
-
-__all__ = ["RunLogs", "Stopwatch", "TimingLog", "milliseconds"]
+from slam_graph.backend import Innovations
+from slam_graph.sensors import CalibrationEstimate
 
 
 class StepLog:

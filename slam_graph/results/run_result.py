@@ -13,17 +13,14 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.window_graph import WindowGraph
+from slam_graph.backend import WindowGraph
 from slam_graph.config import RunConfig, dump_yaml
-from slam_graph.datasets.sequence import SequenceInfo
+from slam_graph.datasets import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.evaluation.ape import ape
-from slam_graph.evaluation.evaluation_report import innovation_report
-from slam_graph.evaluation.truth_pairing import select
-from slam_graph.geometry.trajectory import StateHistory, Trajectory, tum_lines
-from slam_graph.geometry.trajectory_alignment import AlignmentMode
-from slam_graph.loop_closure.close_loops import LoopClosures
-from slam_graph.maps.map_model import SlamMap
+from slam_graph.evaluation import ape, innovation_report, select
+from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory, tum_lines
+from slam_graph.loop_closure import LoopClosures
+from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
 from slam_graph.results import run_files as names
 from slam_graph.results.localization_result import LocalizationLog
@@ -31,11 +28,8 @@ from slam_graph.results.map_output import MAP_NAME, save_map
 from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import ResultFolder, appearing
 from slam_graph.results.run_logs import RunLogs
-from slam_graph.sensors.kalibr_calibration import write_kalibr
-from slam_graph.sensors.rig import Rig
-from slam_graph.smoothing.final_adjustment import FinalBa
-
-__all__ = ["Ending", "RunInput", "RunResult", "Status"]
+from slam_graph.sensors import Rig, write_kalibr
+from slam_graph.smoothing import FinalBa
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 
@@ -292,7 +286,7 @@ class RunResult:
 
     def _draw(self, files: ResultFolder) -> None:
         """Draw the trajectory beside the truth, where the two can be compared."""
-        from slam_graph.visualization.result_plots import plot_errors
+        from slam_graph.visualization import plot_errors
 
         truth, estimate = self.groundtruth, self.trajectory
         if truth is None:

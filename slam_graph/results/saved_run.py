@@ -15,16 +15,13 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig, load_config
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.maps.map_model import SlamMap
+from slam_graph.geometry import Trajectory
+from slam_graph.maps import SlamMap
 from slam_graph.results import run_files as names
 from slam_graph.results.map_output import MAP_NAME, load_map
 from slam_graph.results.point_map import read_ply
 from slam_graph.results.result_files import LATEST
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["SavedRun", "load_result"]
+from slam_graph.sensors import Rig, read_kalibr
 
 
 def load_result(folder: Path | str) -> SavedRun:

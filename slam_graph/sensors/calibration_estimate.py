@@ -13,8 +13,6 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.sensors.rig import Rig
 
-__all__ = ["CalibrationEstimate"]
-
 
 @dataclass(frozen=True, slots=True)
 class Parameter:

@@ -15,8 +15,6 @@ import yaml
 from slam_graph.errors import DataError
 from slam_graph.sensors.rig import pose_from_matrix
 
-__all__ = ["YamlValue", "parse_yaml", "read_yaml"]
-
 
 @dataclass(frozen=True, slots=True)
 class YamlValue:

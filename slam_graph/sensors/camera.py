@@ -19,8 +19,6 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera_model import MAX_TANGENT, CameraModel, camera_model
 
-__all__ = ["Camera"]
-
 _VISIBLE_TOLERANCE_PX = 1e-3
 """A pixel is visible if its normalised point is projected back to it within this distance."""
 

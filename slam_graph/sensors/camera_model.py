@@ -30,8 +30,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.plugins import Registry
 
-__all__ = ["CAMERA_MODELS", "CameraModel", "register_camera_model"]
-
 MAX_TANGENT = 6.0
 """Longest normalised point that is used: 80.5° off the axis. What a lens sees beyond has no place
 on the plane z = 1, or one too far out to calculate with."""

@@ -16,15 +16,6 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
-__all__ = [
-    "camera_entry",
-    "has_rolling_shutter",
-    "read_body_T_sensor",
-    "read_camera",
-    "read_euroc_rig",
-    "read_imu_noise",
-]
-
 
 def read_camera(entry: YamlValue) -> Camera:
     """Intrinsics from a mapping with the keys that EuRoC and Kalibr share.

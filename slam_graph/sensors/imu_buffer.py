@@ -13,18 +13,9 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.geometry.trajectory import NavState
+from slam_graph.geometry import NavState
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
-
-__all__ = [
-    "STANDARD_GRAVITY",
-    "ImuBuffer",
-    "integrate_rotation",
-    "predict",
-    "preintegrate",
-    "preintegration_params",
-]
 
 STANDARD_GRAVITY = 9.81
 """Magnitude of gravity in m/s² where the settings (`backend.noise.gravity`) are not at hand."""

@@ -28,9 +28,7 @@ from slam_graph.sensors.euroc_calibration import (
 )
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
-__all__ = ["IMU_KEY", "chain_cameras", "kalibr_table", "read_kalibr", "write_kalibr"]
-
-IMU_KEY = "imu0"
+_IMU_KEY = "imu0"
 
 
 def read_kalibr(
@@ -53,10 +51,19 @@ def read_kalibr(
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
     chain = read_yaml(path)
-    return Rig(chain_cameras(chain, needs_imu), _read_imu(chain, imu_path, fallback))
+    return Rig(_chain_cameras(chain, needs_imu), _read_imu(chain, imu_path, fallback))
 
 
-def chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
+def rig_from_table(table: YamlValue) -> Rig:
+    """The rig of a `kalibr_table`, which has the noise of the IMU among the cameras.
+
+    Raises:
+        DataError: if a key is missing, or a value makes no sense.
+    """
+    return Rig(_chain_cameras(table), read_imu_noise(table.require(_IMU_KEY)))
+
+
+def _chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
     """The cameras of a camera chain (see `read_kalibr`).
 
     Raises:
@@ -106,12 +113,12 @@ def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool
 
 def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise | None) -> ImuNoise:
     beside = chain.path.parent / "imu.yaml"
-    entry = chain.get(IMU_KEY) if imu_path is None else None
+    entry = chain.get(_IMU_KEY) if imu_path is None else None
     if entry is None and imu_path is None and beside.is_file():
         imu_path = beside
     if imu_path is not None:
         whole = read_yaml(imu_path)
-        entry = whole.get(IMU_KEY) or whole
+        entry = whole.get(_IMU_KEY) or whole
     if entry is not None:
         return read_imu_noise(entry)
     return fallback if fallback is not None else ImuNoise()
@@ -133,7 +140,7 @@ def kalibr_table(rig: Rig) -> dict[str, Any]:
     content: dict[str, Any] = {
         f"cam{index}": _camera_entry(mounted) for index, mounted in enumerate(rig.cameras)
     }
-    content[IMU_KEY] = {
+    content[_IMU_KEY] = {
         "gyroscope_noise_density": float(rig.imu.gyro_noise_density),
         "gyroscope_random_walk": float(rig.imu.gyro_random_walk),
         "accelerometer_noise_density": float(rig.imu.accel_noise_density),

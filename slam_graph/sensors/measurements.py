@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["CameraFrame", "FeatureFrame", "FeatureObservations", "ImuData", "Packet"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuData:

@@ -17,8 +17,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.sensors.camera_model import CameraModel, Coefficients, register_camera_model
 from slam_graph.sensors.pinhole_models import RadialTangential
 
-__all__ = ["DoubleSphere", "Unified"]
-
 _RADTAN = RadialTangential()
 
 

@@ -14,8 +14,6 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.sensors.camera_model import CameraModel, Coefficients, register_camera_model
 
-__all__ = ["RadialTangential"]
-
 _OPENCV_ITERATIONS = 20
 _OPENCV_EPSILON = 1e-9
 _STEPS_FROM_OPENCV = 3

@@ -16,8 +16,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 
-__all__ = ["ImuNoise", "Rig", "RigCamera", "pose_from_matrix"]
-
 _ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 

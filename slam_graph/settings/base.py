@@ -16,8 +16,6 @@ from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Settings", "expert"]
-
 expert = partial(Field, json_schema_extra={"expert": True})
 """A pydantic field of the second tier; it works like any other."""
 

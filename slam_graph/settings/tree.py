@@ -15,19 +15,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from slam_graph.errors import ConfigError
-from slam_graph.errors import closest as closest
+from slam_graph.errors import ConfigError, closest
 from slam_graph.settings.base import Settings
-
-__all__ = [
-    "ConfigTree",
-    "KeyPath",
-    "closest",
-    "override",
-    "override_trees",
-    "read_tree",
-    "validate",
-]
 
 KeyPath = tuple[str | int, ...]
 _ModelT = TypeVar("_ModelT", bound=BaseModel)

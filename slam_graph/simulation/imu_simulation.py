@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise
+from slam_graph.sensors import ImuData, ImuNoise
 from slam_graph.simulation.motion import RecordedMotion, SplineMotion
 from slam_graph.simulation.simulation_config import SimulatedImuConfig, random_stream
-
-__all__ = ["ImuSource", "RecordedImu", "SimulatedImu"]
 
 SAMPLES_PER_BLOCK = 2000
 

@@ -14,15 +14,13 @@ from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.views import View
 from slam_graph.simulation.world import World
 
-__all__ = ["Landmarks", "ahead", "moving_box", "on_walls"]
-
-CHECK_PERIOD_S = 0.5
+_CHECK_PERIOD_S = 0.5
 """Time between two checks whether the cameras see enough landmarks ahead."""
 
 AHEAD_DEPTH_M = (2.0, 8.0)
 """Smallest and largest depth of landmarks ahead: those of a large room."""
 
-BOX_M = 0.8
+_BOX_M = 0.8
 """Edge of the moving box."""
 
 
@@ -105,7 +103,7 @@ def ahead(
         features: how many each must see.
         rng: random pixels and depths.
     """
-    stamps = np.arange(motion.start_ns, motion.end_ns, round(CHECK_PERIOD_S * 1e9), dtype=np.int64)
+    stamps = np.arange(motion.start_ns, motion.end_ns, round(_CHECK_PERIOD_S * 1e9), dtype=np.int64)
     rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
     points, empty = np.zeros((0, 3)), World(())
     for R, p in zip(rotations, positions, strict=True):
@@ -144,9 +142,9 @@ def moving_box(
         count: number of points.
         rng: random points and frequencies.
     """
-    points: NDArray[np.float64] = rng.uniform(-0.5, 0.5, (count, 3)) * BOX_M
+    points: NDArray[np.float64] = rng.uniform(-0.5, 0.5, (count, 3)) * _BOX_M
     side = rng.integers(0, 3, count)
-    points[np.arange(count), side] = 0.5 * BOX_M * rng.choice([-1.0, 1.0], count)
+    points[np.arange(count), side] = 0.5 * _BOX_M * rng.choice([-1.0, 1.0], count)
     low, high = positions.min(axis=0), positions.max(axis=0)
     swing = np.maximum(0.5 * (high - low), 0.5)
     return _MovingBox(points, 0.5 * (low + high), swing, rng.uniform(0.2, 0.5, 3), start_ns)

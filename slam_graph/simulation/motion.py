@@ -18,10 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory
-
-__all__ = ["GRAVITY", "Motion", "RecordedMotion", "SplineMotion"]
+from slam_graph.geometry import Trajectory, interpolate
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """m/s², in the world."""

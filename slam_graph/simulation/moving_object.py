@@ -13,11 +13,9 @@ from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import MovingObjectConfig, random_stream
 from slam_graph.simulation.world import Panel
 
-__all__ = ["MovingBoard"]
-
-SMOOTHING_NS = 1_000_000_000
+_SMOOTHING_NS = 1_000_000_000
 """The path of the board is that of the camera, averaged over this time before and after."""
-SMOOTHING_SAMPLES = 21
+_SMOOTHING_SAMPLES = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,7 @@ class MovingBoard:
 
     def _smooth_view(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean position of the camera around a time, and its mean right and viewing directions."""
-        around = np.linspace(-SMOOTHING_NS, SMOOTHING_NS, SMOOTHING_SAMPLES).astype(np.int64)
+        around = np.linspace(-_SMOOTHING_NS, _SMOOTHING_NS, _SMOOTHING_SAMPLES).astype(np.int64)
         stamps = np.clip(stamp_ns + around, self.motion.start_ns, self.motion.end_ns)
         world_R_body = self.motion.rotations(stamps).as_matrix()
         eye = (self.motion.positions(stamps) + world_R_body @ self.body_p_camera).mean(axis=0)

@@ -10,18 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.datasets.formats.euroc import EurocSequence
-from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.datasets.sequence import ReaderOptions
+from slam_graph.datasets import EurocSequence, ReaderOptions, read_groundtruth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, Rig
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
-
-__all__ = ["LEAD_NS", "RecordedFlight"]
 
 LEAD_NS = 100_000_000
 """Time by which motion and IMU extend beyond the first and last frame."""

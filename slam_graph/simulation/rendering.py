@@ -12,18 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
-from slam_graph.sensors.measurements import CameraFrame
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors import CameraFrame, Rig, RigCamera
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.moving_object import MovingBoard
 from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
 
-__all__ = ["Renderer"]
-
-NEAREST_M = 1e-3
-LIGHT = np.array([0.25, 0.45, 0.86])
+_NEAREST_M = 1e-3
+_LIGHT = np.array([0.25, 0.45, 0.86])
 """Direction of the light: walls of different orientation differ in brightness."""
 
 BLUR_SAMPLES = 5
@@ -180,7 +177,7 @@ def cast(world: World, eye: FloatArray, rays: Grey) -> _Hits:
     for index, panel in enumerate(world.panels):
         away = panel.corner - eye
         height = float(away @ panel.normal)
-        if height >= -NEAREST_M:
+        if height >= -_NEAREST_M:
             continue
         frame = np.stack([panel.normal, panel.across, panel.along]).astype(np.float32)
         slope, across, along = frame @ rays.T
@@ -198,4 +195,4 @@ def cast(world: World, eye: FloatArray, rays: Grey) -> _Hits:
 
 
 def _shade(panel: Panel) -> float:
-    return 0.8 + 0.2 * float(panel.normal @ LIGHT)
+    return 0.8 + 0.2 * float(panel.normal @ _LIGHT)

@@ -16,19 +16,18 @@ import numpy as np
 import yaml
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.formats.euroc_writer import EurocWriter
-from slam_graph.datasets.formats.track_recorder import TrackRecorder
-from slam_graph.datasets.sequence import (
+from slam_graph.datasets import (
+    EurocWriter,
     Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
+    TrackRecorder,
     within,
 )
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
@@ -39,9 +38,7 @@ from slam_graph.simulation.textures import paint
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
-__all__ = ["Flight", "SimulatedImages", "SimulatedSequence", "SimulatedTracks"]
-
-SETTINGS_FILE = "simulation.yaml"
+_SETTINGS_FILE = "simulation.yaml"
 
 Progress = Callable[[int], None]
 """Called with the time of every frame that has been written, ns."""
@@ -156,7 +153,7 @@ class SimulatedSequence(RecordedSequence):
         """
         self._write(Path(path), progress if progress is not None else _ignore)
         settings = self.config.model_dump(mode="json")
-        (Path(path) / SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+        (Path(path) / _SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
 
     @abstractmethod
     def _write(self, path: Path, progress: Progress) -> None:

@@ -11,20 +11,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
-from slam_graph.settings.base import Settings, expert
-from slam_graph.settings.tree import ConfigTree, override, read_tree, validate
-
-__all__ = [
-    "FlightConfig",
-    "ImageConfig",
-    "LandmarkConfig",
-    "MovingObjectConfig",
-    "SimulatedImuConfig",
-    "SimulationConfig",
-    "StartConfig",
-    "TrackConfig",
-    "load_simulation_config",
-]
+from slam_graph.settings import ConfigTree, Settings, expert, override, read_tree, validate
 
 TRAJECTORIES = ("figure8", "rooms", "random")
 """Names of the generated trajectories; any other text is the path of a recorded one."""
@@ -166,7 +153,7 @@ class StartConfig(Settings):
     """Standard deviation of the gyroscope bias, rad/s."""
 
 
-REAL_START = StartConfig(
+_REAL_START = StartConfig(
     rotation_rad=0.01, position_m=0.01, velocity=0.05, accel_bias=0.05, gyro_bias=0.01
 )
 """Uncertainty of the ground truth of a real flight, used with `real_imu` unless `start` is set."""
@@ -216,7 +203,7 @@ class SimulationConfig(Settings):
         """The settings of the start state, with the default that fits the kind of IMU."""
         if self.start is not None:
             return self.start
-        return REAL_START if self.real_imu else StartConfig()
+        return _REAL_START if self.real_imu else StartConfig()
 
     @property
     def recorded(self) -> Path | None:

@@ -18,9 +18,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera, pose_from_matrix
+from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera, pose_from_matrix, read_kalibr
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion
@@ -41,33 +39,31 @@ from slam_graph.simulation.trajectories import fly
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import room_around, three_rooms
 
-__all__ = ["euroc_rig", "simulate"]
+_DEFAULT_DURATION_S = 60.0
 
-DEFAULT_DURATION_S = 60.0
-
-POSITION_PERIOD_NS = 100_000_000
+_POSITION_PERIOD_NS = 100_000_000
 """Spacing of the positions around which a room is built."""
 
 SIZE = (752, 480)
-LEFT = Camera(
+_LEFT = Camera(
     *(458.654, 457.296, 367.215, 248.375),
     "radtan",
     (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
     *SIZE,
 )
-RIGHT = Camera(
+_RIGHT = Camera(
     *(457.587, 456.134, 379.999, 255.238),
     "radtan",
     (-0.28368365, 0.07451284, -0.00010473, -3.55590700e-05),
     *SIZE,
 )
-BODY_T_LEFT = (
+_BODY_T_LEFT = (
     (0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975),
     (0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768),
     (-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949),
     (0.0, 0.0, 0.0, 1.0),
 )
-BODY_T_RIGHT = (
+_BODY_T_RIGHT = (
     (0.0125552670891, -0.999755099723, 0.0182237714554, -0.0198435579556),
     (0.999598781151, 0.0130119051815, 0.0251588363115, 0.0453689425024),
     (-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038),
@@ -123,8 +119,8 @@ def simulate(
 def euroc_rig() -> Rig:
     """EuRoC's calibrated rig: two cameras 11 cm apart, and an IMU at 200 Hz."""
     cameras = (
-        RigCamera(LEFT, _pose(BODY_T_LEFT), 0.0, "cam0"),
-        RigCamera(RIGHT, _pose(BODY_T_RIGHT), 0.0, "cam1"),
+        RigCamera(_LEFT, _pose(_BODY_T_LEFT), 0.0, "cam0"),
+        RigCamera(_RIGHT, _pose(_BODY_T_RIGHT), 0.0, "cam1"),
     )
     return Rig(cameras, ImuNoise())
 
@@ -150,7 +146,7 @@ def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
 
 def _generated(config: SimulationConfig) -> Flight:
     rig = _rig(config, None)
-    duration_s = config.duration_s if config.duration_s is not None else DEFAULT_DURATION_S
+    duration_s = config.duration_s if config.duration_s is not None else _DEFAULT_DURATION_S
     rng = np.random.default_rng(random_stream(config.seed, "trajectory"))
     total_s = duration_s + 2e-9 * LEAD_NS
     motion = fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flight, rng)
@@ -186,7 +182,7 @@ def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
 
 
 def _positions(motion: Motion) -> FloatArray:
-    stamps = np.arange(motion.start_ns, motion.end_ns, POSITION_PERIOD_NS, dtype=np.int64)
+    stamps = np.arange(motion.start_ns, motion.end_ns, _POSITION_PERIOD_NS, dtype=np.int64)
     return motion.positions(stamps)
 
 

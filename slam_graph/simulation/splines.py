@@ -10,17 +10,15 @@ from scipy.interpolate import BPoly, CubicSpline, make_lsq_spline
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.simulation.motion import SplineMotion
 
-__all__ = ["continuous", "fit", "stamps_between", "through_waypoints"]
-
-KNOT_SPACING_S = 0.1
+_KNOT_SPACING_S = 0.1
 """Distance of the knots of a fitted spline: it follows motions of up to about 4 Hz and smooths
 faster ones (noise of the recording)."""
 
-DEGREE = 5
-LONGEST_GAP_S = 0.5
+_DEGREE = 5
+_LONGEST_GAP_S = 0.5
 
 
 def through_waypoints(times_s: FloatArray, poses: FloatArray) -> BPoly:
@@ -60,7 +58,7 @@ def _stretches(moving: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def fit(trajectory: Trajectory, spacing_s: float = KNOT_SPACING_S) -> SplineMotion:
+def fit(trajectory: Trajectory, spacing_s: float = _KNOT_SPACING_S) -> SplineMotion:
     """A smooth motion along a recorded trajectory, by least squares.
 
     Args:
@@ -71,17 +69,17 @@ def fit(trajectory: Trajectory, spacing_s: float = KNOT_SPACING_S) -> SplineMoti
         DataError: if there are too few poses, or gaps among them.
     """
     times_s = (trajectory.stamps_ns - trajectory.stamps_ns[0]) * 1e-9
-    if len(times_s) < 2 * DEGREE + 2:
+    if len(times_s) < 2 * _DEGREE + 2:
         raise DataError(f"a trajectory of {len(times_s)} poses is too short to fly along")
     gap = int(np.argmax(np.diff(times_s)))
-    if times_s[gap + 1] - times_s[gap] > LONGEST_GAP_S:
+    if times_s[gap + 1] - times_s[gap] > _LONGEST_GAP_S:
         raise DataError(
             f"the recorded trajectory has a gap of {times_s[gap + 1] - times_s[gap]:.2f} s at "
             f"{trajectory.stamps_ns[gap]}; choose another part of it (start_s, duration_s)"
         )
     knots = _knots(times_s, spacing_s)
     poses = np.column_stack([trajectory.positions, continuous(trajectory.quaternions)])
-    spline = make_lsq_spline(times_s, poses, knots, DEGREE)
+    spline = make_lsq_spline(times_s, poses, knots, _DEGREE)
     return SplineMotion(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1]), spline)
 
 
@@ -93,7 +91,7 @@ def _knots(times_s: FloatArray, spacing_s: float) -> FloatArray:
     for candidate in index.tolist():
         if candidate - kept[-1] >= 2 and candidate < len(times_s) - 2:
             kept.append(candidate)
-    ends = np.full(DEGREE + 1, times_s[0]), np.full(DEGREE + 1, times_s[-1])
+    ends = np.full(_DEGREE + 1, times_s[0]), np.full(_DEGREE + 1, times_s[-1])
     return np.concatenate([ends[0], times_s[kept[1:]], ends[1]])
 
 

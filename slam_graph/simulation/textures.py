@@ -13,19 +13,17 @@ from numpy.typing import NDArray
 
 from slam_graph.simulation.simulation_config import random_stream
 
-__all__ = ["Atlas", "Grey", "paint"]
-
 Grey = NDArray[np.float32]
 """Grey values, or other single-precision numbers per pixel."""
 
 LEVELS = 7
 """Levels of a pyramid: each has half the resolution of the previous one, the last 1/64."""
 
-FINEST_WAVE_TEXELS = 4
+_FINEST_WAVE_TEXELS = 4
 """Distance of the nodes of the finest noise; linear interpolation of texels is accurate then."""
 
-COARSEST_WAVE_M = 0.7
-FADING = 0.9
+_COARSEST_WAVE_M = 0.7
+_FADING = 0.9
 """Amplitude of each octave of noise relative to the next coarser one."""
 
 MEAN_GREY, CONTRAST = 118.0, 75.0
@@ -117,14 +115,14 @@ def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed:
 def _noise(width: int, height: int, texel_m: float, rng: np.random.Generator) -> Grey:
     """Sum of noise of several wavelengths (height, width), with limited contrast."""
     total: Grey = np.zeros((height, width), np.float32)
-    wave, amplitude = COARSEST_WAVE_M / texel_m, 1.0
-    while wave >= FINEST_WAVE_TEXELS:
+    wave, amplitude = _COARSEST_WAVE_M / texel_m, 1.0
+    while wave >= _FINEST_WAVE_TEXELS:
         nodes = rng.normal(size=(int(height / wave) + 4, int(width / wave) + 4))
         smooth = cv2.resize(
             nodes.astype(np.float32), None, fx=wave, fy=wave, interpolation=cv2.INTER_CUBIC
         )
         total += np.float32(amplitude) * smooth[:height, :width]
-        wave, amplitude = wave / 2.0, amplitude * FADING
+        wave, amplitude = wave / 2.0, amplitude * _FADING
     total -= total.mean()
     total *= np.float32(0.9) / max(float(total.std()), 1e-6)
     return np.float32(MEAN_GREY) + np.float32(CONTRAST) * np.tanh(total)

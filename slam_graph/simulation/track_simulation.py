@@ -11,27 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import TrackConfig, random_stream
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import World
 
-__all__ = ["TrackSimulator"]
-
 GRID = (8, 5)
 """Columns and rows of the grid over which new features are distributed."""
 
-LANDMARKS_AT_ONCE = 2048
+_LANDMARKS_AT_ONCE = 2048
 """Landmarks that are projected at a time in the search for new features."""
 
-POSES_AT_ONCE = 256
+_POSES_AT_ONCE = 256
 """Poses that are evaluated at a time; it bounds memory."""
 
-DESCRIPTOR_BYTES = 32
+_DESCRIPTOR_BYTES = 32
 
 BIT_FLIP_PROBABILITY = 0.08
 """Of each bit of an observed descriptor. Two observations of a landmark then differ in 38 of 256
@@ -116,8 +112,8 @@ class TrackSimulator:
             exposures_ns: (N,) times of exposure on the clock of the IMU.
             offset_ns: time of the IMU clock minus time of the camera clock.
         """
-        for first in range(0, len(exposures_ns), POSES_AT_ONCE):
-            stamps = exposures_ns[first : first + POSES_AT_ONCE]
+        for first in range(0, len(exposures_ns), _POSES_AT_ONCE):
+            stamps = exposures_ns[first : first + _POSES_AT_ONCE]
             rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
             for stamp_ns, R, p in zip(stamps.tolist(), rotations, positions, strict=True):
                 seen = self._observe(_Pose(stamp_ns, R, p))
@@ -160,7 +156,7 @@ class TrackSimulator:
         total, searched = len(self._landmarks), 0
         taken = [t.landmarks for t in self._tracks]
         while searched < total and len(tracks.ids) < self._config.features:
-            count = min(LANDMARKS_AT_ONCE, total - searched)
+            count = min(_LANDMARKS_AT_ONCE, total - searched)
             block = (self._next_landmark + np.arange(count)) % total
             self._next_landmark, searched = (self._next_landmark + count) % total, searched + count
             block = block[~np.isin(block, np.concatenate(taken))]
@@ -223,12 +219,12 @@ class _Descriptors:
 
     def __init__(self, landmarks: int, config: TrackConfig, seed: int) -> None:
         rng = np.random.default_rng(random_stream(seed, "looks"))  # the name is part of the seed
-        shape = (config.distinct_descriptors, DESCRIPTOR_BYTES)
+        shape = (config.distinct_descriptors, _DESCRIPTOR_BYTES)
         self._distinct = rng.integers(0, 256, shape, dtype=np.uint8)
         self._of_landmark = rng.integers(0, config.distinct_descriptors, landmarks)
         self._rng = np.random.default_rng(random_stream(seed, "descriptors"))
 
     def observe(self, landmarks: IntArray) -> NDArray[np.uint8]:
         """Descriptors (N, 32) of landmarks (N,), with wrong bits that differ between calls."""
-        flipped = self._rng.random((len(landmarks), 8 * DESCRIPTOR_BYTES)) < BIT_FLIP_PROBABILITY
+        flipped = self._rng.random((len(landmarks), 8 * _DESCRIPTOR_BYTES)) < BIT_FLIP_PROBABILITY
         return self._distinct[self._of_landmark[landmarks]] ^ np.packbits(flipped, axis=1)

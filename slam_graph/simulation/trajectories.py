@@ -22,18 +22,16 @@ from slam_graph.simulation.motion import SplineMotion
 from slam_graph.simulation.simulation_config import FlightConfig
 from slam_graph.simulation.splines import continuous, through_waypoints
 
-__all__ = ["ROOM_PITCH_M", "fly"]
-
-WAYPOINT_PERIOD_S = 0.25
-RAMP_S = 1.5
+_WAYPOINT_PERIOD_S = 0.25
+_RAMP_S = 1.5
 """Time from standing still to full speed."""
 SPEED_CHANGE, SPEED_CHANGE_PERIOD_S = 0.3, 9.0
 """Relative amplitude and period of the changes of speed, which excite the accelerometer."""
-HEADING_SMOOTHING_M = 0.35
-PATH_STEP_M = 0.02
+_HEADING_SMOOTHING_M = 0.35
+_PATH_STEP_M = 0.02
 WOBBLE_RAD = 0.1
 """Amplitude of roll and pitch: enough to excite all axes of the gyroscope."""
-WOBBLE_LENGTHS_M = ((1.3, 3.7), (1.7, 2.9))
+_WOBBLE_LENGTHS_M = ((1.3, 3.7), (1.7, 2.9))
 """Wavelengths of pitch and of roll, along the path."""
 
 MIN_LEG_M, SHARPEST_TURN = 2.0, 0.0
@@ -110,9 +108,9 @@ def fly(
         config: speed and stops.
         rng: random heights, waypoints and phases.
     """
-    waypoints = int(np.ceil(duration_s / WAYPOINT_PERIOD_S)) + 1
-    times_s = np.arange(waypoints, dtype=np.float64) * WAYPOINT_PERIOD_S
-    flown_m = distance_flown(times_s, config)
+    waypoints = int(np.ceil(duration_s / _WAYPOINT_PERIOD_S)) + 1
+    times_s = np.arange(waypoints, dtype=np.float64) * _WAYPOINT_PERIOD_S
+    flown_m = _distance_flown(times_s, config)
     path = _by_arc_length(_SHAPES[shape](float(flown_m[-1]) + 2.0, rng))
     view = _view_angles(path, flown_m, rng)
     # the view frame (x ahead, y left, z up) seen from a camera (x right, y down, z ahead)
@@ -124,14 +122,14 @@ def fly(
     return SplineMotion(START_NS, end_ns, through_waypoints(times_s, poses))
 
 
-def distance_flown(times_s: FloatArray, config: FlightConfig) -> FloatArray:
+def _distance_flown(times_s: FloatArray, config: FlightConfig) -> FloatArray:
     """Distance flown (N,) at times (N,), in metres; constant while hovering."""
     fine = np.arange(0.0, times_s[-1] + 0.01, 0.01)
     speed = config.speed * (1.0 + SPEED_CHANGE * np.sin(2 * np.pi * fine / SPEED_CHANGE_PERIOD_S))
     if config.hover_s > 0:
         since = np.mod(fine, config.hover_s + config.hover_every_s)
         left = config.hover_s + config.hover_every_s - since
-        speed *= _smooth_step((since - config.hover_s) / RAMP_S) * _smooth_step(left / RAMP_S)
+        speed *= _smooth_step((since - config.hover_s) / _RAMP_S) * _smooth_step(left / _RAMP_S)
     distance = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * 0.01])
     return np.asarray(np.interp(times_s, fine, distance))
 
@@ -153,12 +151,12 @@ def _by_arc_length(points: FloatArray) -> CubicSpline:
 
 def _view_angles(path: CubicSpline, flown_m: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Yaw along the path, and oscillating pitch and roll (N, 3), at distances `flown_m` (N,)."""
-    dense = np.arange(0.0, flown_m[-1] + 2.0 * HEADING_SMOOTHING_M, PATH_STEP_M)
+    dense = np.arange(0.0, flown_m[-1] + 2.0 * _HEADING_SMOOTHING_M, _PATH_STEP_M)
     tangent = path(dense, 1)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    heading = gaussian_filter1d(heading, HEADING_SMOOTHING_M / PATH_STEP_M, mode="nearest")
+    heading = gaussian_filter1d(heading, _HEADING_SMOOTHING_M / _PATH_STEP_M, mode="nearest")
     angles = [np.interp(flown_m, dense, heading)]
-    for lengths in WOBBLE_LENGTHS_M:
+    for lengths in _WOBBLE_LENGTHS_M:
         waves = [np.sin(2 * np.pi * flown_m / x + rng.uniform(0, 2 * np.pi)) for x in lengths]
         angles.append(WOBBLE_RAD * np.mean(waves, axis=0))
     return np.column_stack(angles)

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.sensors import Camera, Rig, RigCamera
 from slam_graph.simulation.world import World
 
-__all__ = ["View", "camera_groups"]
-
-OVERLAP_DEPTH_M = 4.0
+_OVERLAP_DEPTH_M = 4.0
 """Depth at which the overlap of two cameras is determined."""
 
 MIN_DEPTH_M = 0.3
@@ -125,13 +122,13 @@ def camera_groups(rig: Rig, views: list[View]) -> list[list[int]]:
 
 
 def _points_in_view(view: View) -> FloatArray:
-    """Points (N, 3) in the body frame that fill the image of a camera at `OVERLAP_DEPTH_M`."""
+    """Points (N, 3) in the body frame that fill the image of a camera at `_OVERLAP_DEPTH_M`."""
     camera = view.camera
     u, v = np.meshgrid(
         np.linspace(20, camera.width - 21, 9), np.linspace(20, camera.height - 21, 7)
     )
     plane, usable = camera.visible(np.column_stack([u.ravel(), v.ravel()]))
     rays = plane[usable]
-    depth = min(OVERLAP_DEPTH_M, 0.9 * MAX_DEPTH_M)
+    depth = min(_OVERLAP_DEPTH_M, 0.9 * MAX_DEPTH_M)
     in_camera = np.column_stack([rays, np.ones(len(rays))]) * depth
     return in_camera @ view.body_R_camera.T + view.position

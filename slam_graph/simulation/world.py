@@ -12,9 +12,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.simulation.trajectories import ROOM_PITCH_M
 
-__all__ = ["Panel", "World", "box", "room_around", "three_rooms"]
-
-HEADROOM_M = 1.2
+_HEADROOM_M = 1.2
 """Distance of floor and ceiling from a trajectory."""
 
 ROOM_WIDTH_M, ROOM_HEIGHT_M = 7.0, 3.2
@@ -99,7 +97,7 @@ def box(low: FloatArray, high: FloatArray) -> tuple[Panel, ...]:
 
 def room_around(positions: FloatArray, margin_m: float) -> World:
     """An empty room around a trajectory (N, 3)."""
-    margin = np.array([margin_m, margin_m, HEADROOM_M])
+    margin = np.array([margin_m, margin_m, _HEADROOM_M])
     return World(box(positions.min(axis=0) - margin, positions.max(axis=0) + margin))
 
 

@@ -7,3 +7,29 @@ which is read back in segments (`recording_segment.py`); `track_fusion.py` finds
 point, `recording_problem.py` minimises the cost of `recording_factors.py`. Settings are in
 `smoothing_config.py`.
 """
+
+from typing import TYPE_CHECKING
+
+from slam_graph.lazy import lazy_exports
+
+__all__ = [
+    "FinalBa",
+    "FinalBaConfig",
+    "FrameLog",
+    "UndeterminedError",
+    "adjust_recording",
+]
+
+if TYPE_CHECKING:
+    from slam_graph.smoothing.final_adjustment import FinalBa, UndeterminedError, adjust_recording
+    from slam_graph.smoothing.frame_log import FrameLog
+    from slam_graph.smoothing.smoothing_config import FinalBaConfig
+else:
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "final_adjustment": ("FinalBa", "UndeterminedError", "adjust_recording"),
+            "frame_log": ("FrameLog",),
+            "smoothing_config": ("FinalBaConfig",),
+        },
+    )

@@ -20,8 +20,6 @@ from scipy.stats import binom
 
 from slam_graph.arrays import BoolArray, FloatArray
 
-__all__ = ["consistent_matches", "drift_jacobian"]
-
 _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
 """Standard deviation of the drift between visits, a weak prior: shift (m) and yaw (rad)."""
 _MAX_FALSE_ALARMS = 0.01

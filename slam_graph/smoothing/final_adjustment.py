@@ -19,11 +19,10 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend import BackendConfig
 from slam_graph.errors import EstimationError
-from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
-from slam_graph.sensors.imu_buffer import preintegration_params
-from slam_graph.sensors.rig import Rig
+from slam_graph.geometry import NavState, StateHistory, Trajectory
+from slam_graph.sensors import Rig, preintegration_params
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.keyframe_states import states_at
 from slam_graph.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
@@ -33,8 +32,6 @@ from slam_graph.smoothing.track_fusion import with_fused_features
 
 logger = logging.getLogger(__name__)
 
-
-__all__ = ["FinalBa", "FinalBaSummary", "Report", "UndeterminedError", "adjust_recording"]
 
 OVERLAP = 50
 """Keyframes that consecutive segments share (10 s at the default spacing); half of a short one."""

@@ -18,10 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-
-__all__ = ["averaged", "nearest_keyframe"]
+from slam_graph.backend import Geometry, Observations, RigProjection
 
 
 def nearest_keyframe(stamps_ns: IntArray, keyframes: IntArray) -> IntArray:

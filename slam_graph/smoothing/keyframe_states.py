@@ -11,11 +11,8 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate
-
-__all__ = ["fill_in", "states_at"]
+from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.sensors import ImuBuffer, predict, preintegrate
 
 _MAX_GAP_S = 1.0
 """States farther apart are not interpolated: the IMU predicts across the gap."""

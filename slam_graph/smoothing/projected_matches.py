@@ -10,11 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend import Geometry, Observations, RigProjection
 from slam_graph.smoothing.drift_consensus import drift_jacobian
-
-__all__ = ["Matches", "Scene", "projected_matches"]
 
 REACH_PX = 8.0
 """Largest mean offset of a match: how far drift may have moved the projection of a feature."""

@@ -15,19 +15,19 @@ import numpy as np
 from gtsam.symbol_shorthand import B, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.imu_factor import imu_factor
-from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
-from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
-from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
-from slam_graph.sensors.rig import Rig
+from slam_graph.backend import (
+    IMU_GAP_SCALE,
+    BackendConfig,
+    Observations,
+    ProjectionFactors,
+    RobustLoss,
+    imu_factor,
+    pixel_noise,
+    zero_velocity_factors,
+)
+from slam_graph.sensors import Rig, preintegrate, preintegration_params
 from slam_graph.smoothing.recording_segment import RecordingSegment
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
-
-__all__ = ["RecordingFactors"]
 
 _ANCHOR_SIGMA = 1e-3
 """Prior on position (m) and yaw (rad) of the anchor, which are unobservable: it fixes the gauge."""

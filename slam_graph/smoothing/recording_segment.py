@@ -9,24 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.triangulation import triangulate
-from slam_graph.backend.cost.zero_velocity import StandstillDetector
-from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.measurements import FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.backend import (
+    BackendConfig,
+    Observations,
+    RigProjection,
+    StandstillDetector,
+    ZeroVelocityConfig,
+    triangulate,
+)
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
 from slam_graph.smoothing.frame_log import FrameLog
-
-__all__ = [
-    "RecordingSegment",
-    "longest_tracks",
-    "read_segment",
-    "triangulated",
-    "views",
-    "with_gtsam_cameras",
-]
 
 _MAX_INITIAL_ERROR = 30.0
 """Features with a larger root-mean-square reprojection error are left out, in units of σ."""

@@ -22,11 +22,9 @@ from dataclasses import replace
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.rig import Rig
+from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection
+from slam_graph.geometry import NavState
+from slam_graph.sensors import Rig
 from slam_graph.smoothing.drift_consensus import consistent_matches
 from slam_graph.smoothing.projected_matches import REACH_PX, Matches, Scene, projected_matches
 from slam_graph.smoothing.recording_problem import BundleAdjustment
@@ -37,8 +35,6 @@ from slam_graph.smoothing.recording_segment import (
     with_gtsam_cameras,
 )
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
-
-__all__ = ["fused_labels", "relabelled", "with_fused_features"]
 
 _VISIT_S = 6.0
 """Length of a visit: the drift within it is negligible."""

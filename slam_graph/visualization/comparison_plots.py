@@ -13,8 +13,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 
-__all__ = ["Curve", "Panel", "plot_panels"]
-
 _PANEL_INCHES = (5.6, 3.3)
 _DPI = 100
 _COLUMNS = 2

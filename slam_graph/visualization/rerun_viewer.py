@@ -12,13 +12,8 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.geometry.trajectory_alignment import align_first_pose
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["RerunViewer", "ViewerMode"]
+from slam_graph.geometry import NavState, Trajectory, align_first_pose, interpolate
+from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
 
 ViewerMode = Literal["save", "spawn", "connect"]
 

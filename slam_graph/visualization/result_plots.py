@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.geometry.trajectory import Trajectory
-
-__all__ = ["plot_bundle", "plot_errors", "plot_pose_graph"]
+from slam_graph.geometry import Trajectory
 
 _TRAJECTORY_INCHES = (11.0, 4.5)
 _PROBLEM_INCHES = (11.0, 5.2)

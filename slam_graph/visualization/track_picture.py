@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-
-__all__ = ["Picture", "TrackPainter", "TrackVideo", "save_picture"]
+from slam_graph.sensors import CameraFrame, FeatureFrame
 
 Picture = NDArray[np.uint8]
 

@@ -7,11 +7,8 @@ from __future__ import annotations
 from typing import Protocol
 
 from slam_graph.arrays import FloatArray
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["NullViewer", "Viewer"]
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
 
 
 class Viewer(Protocol):

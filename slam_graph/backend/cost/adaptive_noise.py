@@ -19,11 +19,8 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import preintegration_params
-from slam_graph.sensors.rig import ImuNoise
-
-__all__ = ["IMU_GAP_SCALE", "DensityScale", "DynamicsNoise", "predicted_covariance"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import ImuNoise, preintegration_params
 
 PERSISTENCE_TIME_S = 0.5
 """Time constant of the mean correction, which shows whether corrections keep their direction."""

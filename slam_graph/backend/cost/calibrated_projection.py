@@ -28,8 +28,6 @@ from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of, distortion_key, stacked_poses
 
-__all__ = ["CalibratedProjection"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shift:

@@ -18,8 +18,6 @@ import numpy as np
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.plugins import Registry
 
-__all__ = ["FEATURE_POLICIES", "FeaturePolicy", "WaitingTracks"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaitingTracks:

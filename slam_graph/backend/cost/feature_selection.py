@@ -32,8 +32,6 @@ from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
-__all__ = ["FeatureSelection", "seen_by_leaving"]
-
 RETRY_FRAMES = 4
 """Candidates for the state beyond those with the longest tracks are tried one frame in so many."""
 MIN_FRAMES = 2

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.measurements import FeatureFrame
+from slam_graph.sensors import FeatureFrame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

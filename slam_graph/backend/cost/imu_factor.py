@@ -23,11 +23,8 @@ from slam_graph.backend.cost.adaptive_noise import (
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate
-from slam_graph.sensors.rig import ImuNoise
-
-__all__ = ["Propagation", "imu_factor"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import ImuBuffer, ImuNoise, predict, preintegrate
 
 
 def imu_factor(

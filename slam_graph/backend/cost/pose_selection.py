@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from slam_graph.backend.policies import CostPolicy
     from slam_graph.backend.window import Window
 
-__all__ = ["POSE_SELECTIONS", "PoseSelection", "PoseSelector"]
-
 
 @dataclass(frozen=True, slots=True)
 class PoseSelection:

@@ -20,9 +20,7 @@ from gtsam.symbol_shorthand import X
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.solve.state import State, stacked_poses
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["MIN_DEPTH", "Geometry", "RigProjection"]
+from slam_graph.sensors import Rig
 
 MIN_DEPTH = 1e-3
 """Points nearer than this (m) are projected as if at this depth; depth checks reject them."""

@@ -15,8 +15,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 
-__all__ = ["WIDTH_2D", "LossName", "RobustLoss"]
-
 LossName = Literal["none", "huber", "cauchy"]
 
 WIDTH_2D = 2.45

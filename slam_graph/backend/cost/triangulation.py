@@ -18,8 +18,6 @@ from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 
-__all__ = ["Triangulation", "triangulate"]
-
 STEPS = 5
 """Damped Gauss-Newton steps that refine the linear solution, at most."""
 _REGULARISATION = 1e-9

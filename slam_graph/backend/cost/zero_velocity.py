@@ -19,10 +19,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-
-__all__ = ["POSITION_SIGMA", "VELOCITY_SIGMA", "StandstillDetector", "zero_velocity_factors"]
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer
 
 DYNAMIC_RATIO = 3.0
 """Disparity over the standstill limit above which a feature is dynamic while the platform is

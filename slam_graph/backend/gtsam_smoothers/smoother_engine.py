@@ -25,10 +25,8 @@ from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import ConfigError
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import FeatureFrame
-
-__all__ = ["SmootherEngine"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
 
 
 class SmootherEngine:

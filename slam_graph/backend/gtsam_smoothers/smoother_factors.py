@@ -13,10 +13,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.errors import ConfigError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["ProjectionFactors", "calibration", "joint_prior", "pixel_noise"]
+from slam_graph.sensors import Camera, Rig
 
 
 def calibration(camera: Camera) -> tuple[Any, Any]:

@@ -25,11 +25,9 @@ from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactor
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import Rig
 
-__all__ = ["NewObservations", "SmootherFeatures"]
-
-GATE_SCALE = 4.0
+_GATE_SCALE = 4.0
 """The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error do not enter, in units of σ."""
@@ -124,7 +122,7 @@ class SmootherFeatures:
         sigma = self._config.noise.pixel_sigma
         distances = squared_mahalanobis(residuals / sigma, by_pose / sigma, covariance)
         dof = np.full(len(obs), 2)
-        largest = GATE_SCALE * threshold(dof, self._config.gating.confidence)
+        largest = _GATE_SCALE * threshold(dof, self._config.gating.confidence)
         good = (distances < largest) & (depths > 0.0)
         self.rejected = np.unique(obs.ids[obs.feature[~good]])
         self.innovations = Innovations.of(distances, dof, largest, good)

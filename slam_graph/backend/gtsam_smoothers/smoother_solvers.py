@@ -19,8 +19,6 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.state import dim
 
-__all__ = ["SOLVERS", "SmootherSolver"]
-
 Stamps = Mapping[Any, float]
 """Time of each key, in seconds."""
 

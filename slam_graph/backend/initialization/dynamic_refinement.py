@@ -37,20 +37,18 @@ from slam_graph.backend.solve.gauss_newton import minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import preintegrate
+from slam_graph.geometry import NavState
+from slam_graph.sensors import preintegrate
 
-__all__ = ["DynamicRefinement"]
-
-BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
+_BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the batch problem is solved."""
-FINAL = GaussNewtonPolicy(max_steps=1)
+_FINAL = GaussNewtonPolicy(max_steps=1)
 """The last step, whose linear system becomes the prior."""
 MAX_FEATURES = 150
 """How many features the batch problem has at most, those with the longest tracks."""
 MOTION_PRIOR = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
 """Uncertainty of the first state of the guess."""
-MIN_INLIERS = 0.5
+_MIN_INLIERS = 0.5
 """Smallest share of the features that must fit the motion."""
 MAX_NORMALIZED_COST = 3.0
 """Largest accepted mean squared residual, in σ²."""
@@ -58,10 +56,10 @@ MAX_VELOCITY_SIGMA = 0.1
 """Largest accepted standard deviation of the velocity, m/s."""
 MAX_SCALE_SIGMA = 0.15
 """Largest accepted standard deviation of the scale, relative to it."""
-MAX_COST_CHANGE = 0.1
+_MAX_COST_CHANGE = 0.1
 """Largest accepted relative change of the cost by the last step: beyond it, the steps have not
 converged."""
-BEST_FEATURES = 0.1
+_BEST_FEATURES = 0.1
 """Quantile of the features' relative distance errors that is taken for the error of the scale."""
 
 
@@ -92,18 +90,18 @@ class DynamicRefinement:
         """
         cost = self._batch_cost(frames, guess)
         try:
-            minimize(cost, BATCH)
+            minimize(cost, _BATCH)
             if not self._remove_outliers(cost, frames):
                 return "features that fit the motion"
-            minimize(cost, BATCH)
+            minimize(cost, _BATCH)
             features = self._keep_features(cost, frames)
-            final = minimize(cost, FINAL)
+            final = minimize(cost, _FINAL)
             before, after = final.costs
             normalized_cost = _normalized_cost(cost)
             scale_sigma = _scale_sigma(cost, final.posterior)
         except np.linalg.LinAlgError:
             return "motion that determines gravity and scale"
-        if not abs(after - before) < MAX_COST_CHANGE * max(before, 1.0):
+        if not abs(after - before) < _MAX_COST_CHANGE * max(before, 1.0):
             return "steps that converge"
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
         keep = [L(j) for j in features.tolist()]
@@ -165,7 +163,7 @@ class DynamicRefinement:
         good = result.good & fits
         self.outliers = obs.ids[~fits]
         _set_features(cost, obs, result, good)
-        return bool(np.sum(good) >= max(MIN_FEATURES, MIN_INLIERS * len(good)))
+        return bool(np.sum(good) >= max(MIN_FEATURES, _MIN_INLIERS * len(good)))
 
     def _keep_features(self, cost: Cost, frames: StartFrames) -> IntArray:
         """Make variables of the features that the last frame still sees."""
@@ -264,4 +262,4 @@ def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
     by_state[:, position] -= toward @ pose.rotation().matrix()
     variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)
     variances += np.sum(by_r_1**2, axis=1)
-    return float(np.quantile(np.sqrt(variances) / distances, BEST_FEATURES))
+    return float(np.quantile(np.sqrt(variances) / distances, _BEST_FEATURES))

@@ -21,11 +21,8 @@ from slam_graph.backend.initialization.first_state import level_rotation
 from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import Alignment, Motion, align
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import ImuBuffer, preintegrate
-from slam_graph.sensors.measurements import FeatureFrame, ImuData
-
-__all__ = ["MIN_FEATURES", "OUTLIER_SIGMAS", "StartFrames", "StartGuess", "guess_states"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, preintegrate
 
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error are outliers, in units of σ."""

@@ -18,17 +18,8 @@ from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.measurements import ImuData
-
-__all__ = [
-    "fix_gauge",
-    "level_rotation",
-    "prior_covariance",
-    "prior_of",
-    "start_from",
-    "state_at_rest",
-]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import ImuData
 
 
 def state_at_rest(samples: ImuData, stamp_ns: int, prior: PriorConfig) -> NavState:

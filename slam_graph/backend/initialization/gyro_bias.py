@@ -24,16 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.sensors.imu_buffer import preintegrate
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, preintegrate
 
-__all__ = ["estimate_gyro_bias"]
-
-MIN_COMMON = 8
+_MIN_COMMON = 8
 """Pairs of frames with fewer common features than this are left out."""
-STEP_RAD_S = 1e-4
+_STEP_RAD_S = 1e-4
 """Step of the numerical derivative by the bias."""
-ROBUST_WIDTH = 0.02
+_ROBUST_WIDTH = 0.02
 """Width of the robust loss on the whitened residual of a pair."""
 
 
@@ -79,7 +76,7 @@ def estimate_gyro_bias(
         if pairs is None:
             return None
         result = least_squares(
-            _residuals, np.zeros(3), args=(pairs,), loss="huber", f_scale=ROBUST_WIDTH
+            _residuals, np.zeros(3), args=(pairs,), loss="huber", f_scale=_ROBUST_WIDTH
         )
         bias = bias + result.x
     return bias
@@ -106,7 +103,7 @@ def _pairs(
         R, by_bias = _rotation_by_bias(samples, bias, params)
         for camera, (one, two) in enumerate(zip(before.cameras, after.cameras, strict=True)):
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
-            if len(i) >= MIN_COMMON:
+            if len(i) >= _MIN_COMMON:
                 mounting = rig.body_R_camera[camera]
                 first.append(_bearings(one, i, mounting))
                 second.append(_bearings(two, j, mounting))
@@ -147,8 +144,8 @@ def _rotation_by_bias(
 ) -> tuple[FloatArray, FloatArray]:
     """The rotation (3, 3) over some samples and its derivative (3, 3) by the gyroscope bias."""
     R = _rotation(samples, bias, params)
-    moved = np.array([_rotation(samples, bias + step, params) for step in STEP_RAD_S * np.eye(3)])
-    return R, Rotation.from_matrix(R.T @ moved).as_rotvec().T / STEP_RAD_S
+    moved = np.array([_rotation(samples, bias + step, params) for step in _STEP_RAD_S * np.eye(3)])
+    return R, Rotation.from_matrix(R.T @ moved).as_rotvec().T / _STEP_RAD_S
 
 
 def _rotation(

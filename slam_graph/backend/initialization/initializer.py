@@ -21,9 +21,7 @@ from slam_graph.backend.initialization.dynamic_start import (
 )
 from slam_graph.backend.initialization.first_state import start_from, state_at_rest
 from slam_graph.backend.window import Window
-from slam_graph.sensors.measurements import FeatureFrame
-
-__all__ = ["FRAME_SPACING_S", "Initializer"]
+from slam_graph.sensors import FeatureFrame
 
 STATIC_DISPARITY_PX = 1.5
 """Largest median disparity at a static start: larger than that of a later standstill, because

@@ -27,16 +27,14 @@ from slam_graph.backend.initialization.visual_inertial_alignment import (
     constrained_solution,
 )
 
-__all__ = ["static_features"]
-
-SAMPLES = 100
+_SAMPLES = 100
 """If half of the features are static, one sample of four has only such with a probability of
 0.998."""
-SAMPLE_FEATURES = 4
+_SAMPLE_FEATURES = 4
 """Features in a sample."""
-REFINED = 5
+_REFINED = 5
 """How many of the best samples are refined by their inliers."""
-REFINEMENTS = 3
+_REFINEMENTS = 3
 """How often a sample is refined by its inliers."""
 
 
@@ -116,10 +114,10 @@ def static_features(
         return float(np.sum(np.minimum(model.errors(x), limit)))
 
     motions = [model.solve(np.arange(count), None)]
-    for _ in range(SAMPLES):
-        sample = rng.choice(count, min(SAMPLE_FEATURES, count), replace=False)
+    for _ in range(_SAMPLES):
+        sample = rng.choice(count, min(_SAMPLE_FEATURES, count), replace=False)
         motions.append(model.solve(sample, None))
-    best = sorted((x for x in motions if x is not None), key=score)[:REFINED]
+    best = sorted((x for x in motions if x is not None), key=score)[:_REFINED]
     if not best:
         return np.ones(count, np.bool_)
     x = min((_refined(model, x, limit) for x in best), key=score)
@@ -128,7 +126,7 @@ def static_features(
 
 def _refined(model: _Model, x: FloatArray, limit: float) -> FloatArray:
     """A motion that is computed from its inliers again and again."""
-    for _ in range(REFINEMENTS):
+    for _ in range(_REFINEMENTS):
         agree = np.flatnonzero(model.errors(x) < limit)
         better = model.solve(agree, 1.0 / model.distances(x)) if len(agree) else None
         if better is None:

@@ -25,16 +25,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.solve.square_root import triangularize
 
-__all__ = [
-    "MIN_DEPTH_M",
-    "Alignment",
-    "Motion",
-    "align",
-    "alignment_equations",
-    "constrained_solution",
-]
-
-REWEIGHTINGS = 2
+_REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
@@ -95,7 +86,7 @@ def align(
     """
     weights = np.ones(len(obs))
     alignment = None
-    for _ in range(1 + REWEIGHTINGS):
+    for _ in range(1 + _REWEIGHTINGS):
         A, b = _reduced_equations(obs, motion, rig, weights)
         try:
             alignment = constrained_solution(A, b, gravity)

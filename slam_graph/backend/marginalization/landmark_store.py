@@ -31,7 +31,7 @@ from slam_graph.backend.solve.square_root import (
 )
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
 
-MAX_EXCHANGES = 300
+_MAX_EXCHANGES = 300
 """Work limit: after this many conditionals were reordered to recall features, the store closes."""
 
 
@@ -99,7 +99,7 @@ class LandmarkStore:
     def due(self, seen: IntArray) -> IntArray:
         """Which features must become variables again: of those seen; all if the store closes."""
         again = [j for j in seen.tolist() if j in self._places]
-        if again and self._exchanges > MAX_EXCHANGES:
+        if again and self._exchanges > _MAX_EXCHANGES:
             again = list(self._places)
         return np.array(again, dtype=np.int64)
 
@@ -123,7 +123,7 @@ class LandmarkStore:
         self._exchanges += len(self._conditionals) - first
         for k in range(first, len(self._conditionals)):
             self._conditionals[k], carried = _exchanged(self._conditionals[k], carried, wanted)
-        if not self._places and self._exchanges > MAX_EXCHANGES:
+        if not self._places and self._exchanges > _MAX_EXCHANGES:
             self.open = False
             self._conditionals.clear()
         carried = carried.shifted(self._bases(carried))

@@ -21,17 +21,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-__all__ = [
-    "Attempt",
-    "DampedProblem",
-    "Damping",
-    "GainRatioDamping",
-    "StepSettings",
-    "Steps",
-    "TenfoldDamping",
-    "levenberg_marquardt",
-]
-
 
 class DampedProblem(Protocol):
     """A cost over estimates that the problem keeps and moves."""

@@ -19,9 +19,9 @@ from scipy.linalg import lapack
 
 from slam_graph.arrays import FloatArray
 
-BLOCK_SIZE = 32
+_BLOCK_SIZE = 32
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
-ROWS_AT_ONCE = 48
+_ROWS_AT_ONCE = 48
 """Block height for eliminating leading variables."""
 
 
@@ -164,7 +164,7 @@ class SquareRootInformation:
         if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
         triangle = np.asfortranarray(self.Rd[first:, first:])
-        block = min(BLOCK_SIZE, len(triangle))
+        block = min(_BLOCK_SIZE, len(triangle))
         triangle, _, _, info = lapack.dtpqrt(0, block, triangle, np.asfortranarray(Ab))
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
@@ -281,8 +281,8 @@ def _eliminate_behind(
         (w, w + …) rows that determine all of them.
     """
     w, width = len(gone), rows.shape[1]
-    for stop in range(len(rows), 0, -ROWS_AT_ONCE):
-        start = max(stop - ROWS_AT_ONCE, 0)
+    for stop in range(len(rows), 0, -_ROWS_AT_ONCE):
+        start = max(stop - _ROWS_AT_ONCE, 0)
         before, upto = np.searchsorted(gone, [start, stop])
         first, last = start - before, stop - upto  # rows of the result
         stacked = np.vstack([carried, rows[start:stop]])

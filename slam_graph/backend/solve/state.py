@@ -25,26 +25,12 @@ from gtsam.symbol_shorthand import B, D, L, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import Layout
-from slam_graph.geometry.trajectory import NavState
-
-__all__ = [
-    "POINT_DIM",
-    "POSE_DIM",
-    "FrameMotion",
-    "State",
-    "dim",
-    "dims_of",
-    "distortion_key",
-    "imu_state_keys",
-    "letter_and_index",
-    "stacked_points",
-    "stacked_poses",
-]
+from slam_graph.geometry import NavState
 
 POSE_DIM, VELOCITY_DIM, BIAS_DIM, POINT_DIM = 6, 3, 6, 3
-IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
-CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "t": 1}
-DIMS = IMU_STATE_DIMS | CALIBRATION_DIMS
+_IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
+_CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "t": 1}
+DIMS = _IMU_STATE_DIMS | _CALIBRATION_DIMS
 """Tangent dimension by the letter of the symbol. Distortion coefficients (`d`) are not here: their
 number depends on the camera model, and their keys carry it (see `distortion_key`)."""
 

@@ -47,26 +47,21 @@ from slam_graph.datasets.streams.track_frames import (
     frames_from_tables,
 )
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["EqvioTracks", "is_eqvio_file", "wheel_tracks"]
+from slam_graph.sensors import Camera, ImuData, ImuNoise, Rig, RigCamera, read_kalibr
 
 HEADER = "row_type,"
 META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"
 
-QUATERNION_TOLERANCE = 1e-3
+_QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of the length of the calibration's quaternion from one."""
 
-RESOLUTION = (752, 480)
+_RESOLUTION = (752, 480)
 """Of EuRoC's cameras; it is not in the file."""
 
 IMU_COLUMNS = (1, 6, 7, 8, 9, 10, 11)
 IMU_ROW = [("stamp", STAMP_TEXT), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
-FEATURE_COLUMNS = (1, 5, 18, 19)
-FEATURE_ROW = [("stamp", STAMP_TEXT), ("id", "i8"), ("normalized", "f8", (2,))]
+_FEATURE_COLUMNS = (1, 5, 18, 19)
+_FEATURE_ROW = [("stamp", STAMP_TEXT), ("id", "i8"), ("normalized", "f8", (2,))]
 
 
 def wheel_tracks() -> Path:
@@ -145,7 +140,7 @@ def _parse_imu(rows: Rows) -> ImuData:
 def _parse_features(rows: Rows) -> TrackTable:
     """The tracks among some rows, without their pixels."""
     rows = rows.select(FEATURE_PREFIX)
-    parsed = parse(rows, FEATURE_ROW, "a vision_feature row", FEATURE_COLUMNS)
+    parsed = parse(rows, _FEATURE_ROW, "a vision_feature row", _FEATURE_COLUMNS)
     table = np.zeros(len(parsed), TRACK_ROW)
     table["stamp"] = _stamps(rows, parsed["stamp"])
     table["id"] = parsed["id"]
@@ -197,10 +192,10 @@ def _read_rig(path: Path) -> Rig:
     fx, fy, cx, cy = meta.numbers("camera_", "fx fy cx cy")
     quaternion = np.array(meta.numbers("T_ci_", "qw qx qy qz"))
     length = float(np.linalg.norm(quaternion))
-    if not abs(length - 1.0) < QUATERNION_TOLERANCE:
+    if not abs(length - 1.0) < _QUATERNION_TOLERANCE:
         raise DataError(f"{path}: T_ci is not a rotation, its quaternion has length {length:.4g}")
     body_T_camera = gtsam.Pose3(
         gtsam.Rot3.Quaternion(*(quaternion / length)), np.array(meta.numbers("T_ci_", "tx ty tz"))
     )
-    camera = Camera(fx, fy, cx, cy, "none", (), *RESOLUTION)
+    camera = Camera(fx, fy, cx, cy, "none", (), *_RESOLUTION)
     return Rig((RigCamera(camera, body_T_camera, 0.0, "cam0"),), ImuNoise())

@@ -26,12 +26,7 @@ from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration_yaml import read_yaml
-from slam_graph.sensors.euroc_calibration import read_euroc_rig, read_imu_noise
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["EurocSequence", "ordered_images"]
+from slam_graph.sensors import Rig, read_euroc_rig, read_imu_noise, read_kalibr, read_yaml
 
 
 def _find_mav0(path: Path) -> Path:

@@ -23,13 +23,16 @@ import yaml
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.euroc_calibration import camera_entry
-from slam_graph.sensors.kalibr_calibration import write_kalibr
-from slam_graph.sensors.measurements import CameraFrame, ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
-
-__all__ = ["EurocWriter", "convert_to_euroc", "refuse_existing"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import (
+    CameraFrame,
+    ImuData,
+    ImuNoise,
+    Rig,
+    RigCamera,
+    camera_entry,
+    write_kalibr,
+)
 
 CALIBRATION = "calibration.yaml"
 """The calibration in Kalibr's format, beside ``mav0``."""
@@ -38,15 +41,15 @@ IMU_COLUMNS = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
-CAMERA_COLUMNS = "#timestamp [ns],filename"
-TRUTH_COLUMNS = (
+_CAMERA_COLUMNS = "#timestamp [ns],filename"
+_TRUTH_COLUMNS = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],"
     "q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],"
     "v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],"
     "b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],"
     "b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]"
 )
-TRUTH_FOLDER = "state_groundtruth_estimate0"
+_TRUTH_FOLDER = "state_groundtruth_estimate0"
 
 
 Progress = Callable[[int], None]
@@ -107,7 +110,7 @@ class EurocWriter:
             raise DataError(f"{self._path}: cannot be written ({error.strerror})") from None
         mav0 = self._folder / "mav0"
         self._indices = [
-            self._open(mav0 / f"cam{k}", CAMERA_COLUMNS, _camera_values(mounted, self._rate_hz))
+            self._open(mav0 / f"cam{k}", _CAMERA_COLUMNS, _camera_values(mounted, self._rate_hz))
             for k, mounted in enumerate(self._rig.cameras)
         ]
         self._images = [mav0 / f"cam{k}" / "data" for k in range(len(self._indices))]
@@ -117,8 +120,8 @@ class EurocWriter:
             self._imu = self._open(mav0 / "imu0", IMU_COLUMNS, _imu_values(self._rig.imu))
         if self._truth is not None:
             rows = _truth_rows(self._truth)
-            columns = ",".join(TRUTH_COLUMNS.split(",")[: rows.shape[1] + 1])
-            file = self._open(mav0 / TRUTH_FOLDER, columns, {})
+            columns = ",".join(_TRUTH_COLUMNS.split(",")[: rows.shape[1] + 1])
+            file = self._open(mav0 / _TRUTH_FOLDER, columns, {})
             _write_rows(file, self._truth.stamps_ns, rows)
         return self
 
@@ -155,7 +158,7 @@ class EurocWriter:
         """The index of a new sensor, beside its calibration."""
         folder.mkdir(parents=True)
         kind = folder.name.rstrip("0123456789")
-        content = {"sensor_type": SENSOR_TYPES[kind], "comment": self._comment, **calibration}
+        content = {"sensor_type": _SENSOR_TYPES[kind], "comment": self._comment, **calibration}
         text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (folder / "sensor.yaml").write_text(text)
         file = (folder / "data.csv").open("w", encoding="ascii", newline="\n")
@@ -215,7 +218,7 @@ def convert_to_euroc(
                 progress(frame.stamp_ns)
 
 
-SENSOR_TYPES = {"cam": "camera", "imu": "imu", TRUTH_FOLDER.rstrip("0"): "ground truth"}
+_SENSOR_TYPES = {"cam": "camera", "imu": "imu", _TRUTH_FOLDER.rstrip("0"): "ground truth"}
 
 
 def _write_rows(file: TextIO, stamps_ns: IntArray, values: FloatArray) -> None:

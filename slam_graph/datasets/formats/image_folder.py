@@ -23,8 +23,6 @@ from slam_graph.datasets.streams.images import FileImages
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 
-__all__ = ["ImageFolderSequence", "is_image_folder"]
-
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
 FOLDERS = ("", "images", "data")

@@ -17,17 +17,7 @@ from slam_graph.datasets.streams.csv_rows import STAMP_TEXT, parse, read_rows, s
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import pose_from_matrix
-
-__all__ = [
-    "CalibrationFile",
-    "increasing",
-    "read_calibration",
-    "read_dates",
-    "read_seconds",
-    "rectified_camera",
-]
+from slam_graph.sensors import Camera, pose_from_matrix
 
 
 @dataclass(frozen=True, slots=True)

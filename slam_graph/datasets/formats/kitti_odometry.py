@@ -29,13 +29,10 @@ from slam_graph.datasets.streams.csv_rows import parse, read_rows
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import Rig, RigCamera, read_kalibr
 
-__all__ = ["KittiOdometrySequence", "is_kitti_odometry"]
-
-WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Turns x right, y down, z forward into the x forward, y left, z up of a world frame."""
 
 
@@ -87,10 +84,10 @@ class KittiOdometrySequence(ImageSequence):
                 f"{self._poses}: {len(matrices)} poses, {self.path} has {len(self._times_ns)} times"
             )
         kept = np.flatnonzero(np.diff(self._times_ns, prepend=self._times_ns[0] - 1) > 0)
-        rotations = WORLD_R_CAMERA0 @ matrices[kept, :, :3]
+        rotations = _WORLD_R_CAMERA0 @ matrices[kept, :, :3]
         return Trajectory(
             self._times_ns[kept],
-            matrices[kept, :, 3] @ WORLD_R_CAMERA0.T,
+            matrices[kept, :, 3] @ _WORLD_R_CAMERA0.T,
             Rotation.from_matrix(rotations).as_quat(),
         )
 

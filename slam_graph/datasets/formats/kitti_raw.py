@@ -39,20 +39,16 @@ from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera, read_kalibr
 
-__all__ = ["KittiRawSequence", "is_kitti_raw"]
+_EARTH_RADIUS_M = 6_378_137.0
 
-EARTH_RADIUS_M = 6_378_137.0
-
-VALUES = 30
+_VALUES = 30
 POSITION, ANGLES, ACCEL, GYRO = slice(0, 3), slice(3, 6), slice(11, 14), slice(17, 20)
-EAST_NORTH_UP = [7, 6, 10]
+_EAST_NORTH_UP = [7, 6, 10]
 
-FILES_PER_BLOCK = 256
+_FILES_PER_BLOCK = 256
 
 
 class _Oxts:
@@ -95,8 +91,8 @@ class _Oxts:
     def _samples_in_blocks(
         self, after_ns: int | None
     ) -> Iterator[tuple[Callable[[int], str], ImuData]]:
-        for begin in range(0, len(self.stamps_ns), FILES_PER_BLOCK):
-            stamps = self.stamps_ns[begin : begin + FILES_PER_BLOCK]
+        for begin in range(0, len(self.stamps_ns), _FILES_PER_BLOCK):
+            stamps = self.stamps_ns[begin : begin + _FILES_PER_BLOCK]
             if after_ns is not None and np.all(stamps < after_ns):
                 continue
             files = [self._file(begin + k) for k in range(len(stamps))]
@@ -127,7 +123,7 @@ class _Oxts:
             stamps_ns[kept],
             positions - positions[0],
             rotations.as_quat(),
-            values[:, EAST_NORTH_UP].copy(),
+            values[:, _EAST_NORTH_UP].copy(),
         )
 
     def _file(self, index: int) -> Path:
@@ -139,11 +135,11 @@ class _Oxts:
         try:
             values = [float(text) for text in path.read_text(encoding="ascii").split()]
         except FileNotFoundError:
-            return np.full(VALUES, np.nan)
+            return np.full(_VALUES, np.nan)
         except (OSError, ValueError):
             values = []
-        if len(values) != VALUES:
-            raise DataError(f"{path}: expected {VALUES} numbers, as KITTI's oxts files have")
+        if len(values) != _VALUES:
+            raise DataError(f"{path}: expected {_VALUES} numbers, as KITTI's oxts files have")
         return np.array(values)
 
 
@@ -154,7 +150,7 @@ def _file_name(files: Sequence[Path], index: int) -> str:
 def _mercator(places: FloatArray) -> FloatArray:
     """Positions (N, 3) east, north, up [m] of latitude, longitude [deg] and altitude [m] (N, 3)."""
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
-    scale = EARTH_RADIUS_M * np.cos(latitude[0])
+    scale = _EARTH_RADIUS_M * np.cos(latitude[0])
     north = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
     return np.column_stack([scale * longitude, north, places[:, 2]])
 
@@ -165,7 +161,7 @@ GREY = ("00", "01")
 STEREO_TOLERANCE_S = 0.02
 """The cameras are triggered together, 10 times a second; their stamps are the computer's."""
 
-SLOW_IMU_HZ = 50.0
+_SLOW_IMU_HZ = 50.0
 
 NOISE = {
     "gyro_noise_density": 5e-4,
@@ -230,7 +226,7 @@ class KittiRawSequence(ImageSequence):
             lambda: self._oxts.trajectory(self.diagnostics),
             STEREO_TOLERANCE_S,
         )
-        if self._oxts.rate_hz < SLOW_IMU_HZ:
+        if self._oxts.rate_hz < _SLOW_IMU_HZ:
             what = f"{self._oxts.folder}: the IMU has {self._oxts.rate_hz:.0f} Hz only"
             better = self.path.name.replace("_sync", "_extract")
             options.diagnostics.warn(

@@ -25,20 +25,9 @@ from slam_graph.datasets.streams.csv_rows import (
 )
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.errors import DataError, closest
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import ImuData, Rig, read_kalibr
 
-__all__ = [
-    "LooseFiles",
-    "find_files",
-    "is_usable_rate",
-    "read_stamps",
-    "regular_stamps",
-    "stamps_from_names",
-]
-
-SHORTEST_PERIOD_NS = 100_000
+_SHORTEST_PERIOD_NS = 100_000
 """Frames closer in time than this have stamps in another unit."""
 
 SLOWEST_HZ, FASTEST_HZ = 0.01, 1000.0
@@ -144,7 +133,7 @@ def _require_unit(stamps_ns: IntArray, path: Path) -> None:
     if len(stamps_ns) < 2:
         return
     period = float(np.median(np.abs(np.diff(stamps_ns))))
-    if period < SHORTEST_PERIOD_NS:
+    if period < _SHORTEST_PERIOD_NS:
         raise DataError(
             f"{path}: stamps are {period:.0f} ns apart; whole numbers are nanoseconds, "
             "seconds need a decimal point"
@@ -161,7 +150,7 @@ def stamps_from_names(paths: Sequence[Path]) -> IntArray | None:
         except (ValueError, OverflowError, InvalidOperation):
             return None
     together = np.array(stamps, np.int64)
-    if len(together) > 1 and float(np.median(np.abs(np.diff(together)))) < SHORTEST_PERIOD_NS:
+    if len(together) > 1 and float(np.median(np.abs(np.diff(together)))) < _SHORTEST_PERIOD_NS:
         return None
     return together
 

@@ -43,22 +43,24 @@ from slam_graph.datasets.streams.track_frames import (
     frames_from_tables,
 )
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.calibration_yaml import read_yaml
-from slam_graph.sensors.euroc_calibration import read_camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import (
+    ImuData,
+    ImuNoise,
+    Rig,
+    RigCamera,
+    read_camera,
+    read_kalibr,
+    read_yaml,
+)
 
-__all__ = ["OpenvinsSimulation"]
+_STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
+_STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"
 
-STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
-STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"
-
-DEFAULT_SIGMAS = {"q": 0.017, "p": 0.05, "v": 0.01, "bg": 0.02, "ba": 0.02}
+_DEFAULT_SIGMAS = {"q": 0.017, "p": 0.05, "v": 0.01, "bg": 0.02, "ba": 0.02}
 """Standard deviations of the start state where the file gives none: rad, m, m/s, rad/s, m/s²."""
 
-COVARIANCE_ORDER = ("q", "p", "v", "ba", "bg")
+_COVARIANCE_ORDER = ("q", "p", "v", "ba", "bg")
 """Blocks of `NavState.covariance`."""
 
 
@@ -127,25 +129,25 @@ def _read_start(path: Path) -> NavState:
 
 def _parse_states(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (N,) in ns and values (N, 16): p, q, v, gyro bias, accel bias."""
-    table = parse(rows, STATE_ROW, STATE_COLUMNS)
+    table = parse(rows, _STATE_ROW, _STATE_COLUMNS)
     return stamps_from_seconds(rows, table["stamp"]), table["values"]
 
 
 def _prior_covariance(text: str) -> NDArray[np.float64]:
     """(15, 15) from a comment like ``prior sigma: q 0.017 rad, p 0.05 m, …``."""
     _, _, stated = text.partition("prior sigma")
-    sigmas = DEFAULT_SIGMAS | {
+    sigmas = _DEFAULT_SIGMAS | {
         name: float(value)
         for name, value in re.findall(r"\b(q|p|v|bg|ba) ([0-9.]+(?:e[-+]?\d+)?)", stated)
     }
-    return np.diag(np.repeat([sigmas[name] ** 2 for name in COVARIANCE_ORDER], 3))
+    return np.diag(np.repeat([sigmas[name] ** 2 for name in _COVARIANCE_ORDER], 3))
 
 
-ROWS_PER_TRACK_BLOCK = 8192
+_ROWS_PER_TRACK_BLOCK = 8192
 """About 16 frames of two cameras: large enough to parse fast, half a megabyte of text."""
 
 IMU_ROW = [("stamp", STAMP_TEXT), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
-TRACK_COLUMNS = [("stamp", STAMP_TEXT), ("camera", "i8"), ("id", "i8"), ("pixel", "f8", (2,))]
+_TRACK_COLUMNS = [("stamp", STAMP_TEXT), ("camera", "i8"), ("id", "i8"), ("pixel", "f8", (2,))]
 
 
 class OpenvinsSimulation(RecordedSequence):
@@ -178,7 +180,7 @@ class OpenvinsSimulation(RecordedSequence):
     def measure(self) -> Extent:
         """Count frames and IMU samples in one pass over the files."""
         counter, latest = StampCounter(), ""
-        for rows in read_rows(self._tracks, ROWS_PER_TRACK_BLOCK):
+        for rows in read_rows(self._tracks, _ROWS_PER_TRACK_BLOCK):
             for k, line in enumerate(rows.lines):
                 text = line.partition(",")[0]
                 if text != latest:
@@ -205,8 +207,8 @@ class OpenvinsSimulation(RecordedSequence):
         return _read_start(file) if file.is_file() else None
 
     def _tables(self, start_ns: int | None, end_ns: int | None) -> Iterator[TrackTable]:
-        for rows in read_rows(self._tracks, ROWS_PER_TRACK_BLOCK):
-            parsed = parse(rows, TRACK_COLUMNS, "time [s], camera, feature, u, v")
+        for rows in read_rows(self._tracks, _ROWS_PER_TRACK_BLOCK):
+            parsed = parse(rows, _TRACK_COLUMNS, "time [s], camera, feature, u, v")
             unknown = (parsed["camera"] < 0) | (parsed["camera"] >= self._known_cameras)
             if unknown.any():
                 raise DataError(

@@ -30,15 +30,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
-
-__all__ = [
-    "frame_record",
-    "load_state",
-    "load_trajectory",
-    "save_state",
-    "save_trajectory",
-]
+from slam_graph.geometry import NavState, Trajectory
 
 FORMAT_NAME = "slam_graph-tracks"
 FORMAT_VERSION = 1

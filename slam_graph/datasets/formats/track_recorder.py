@@ -17,12 +17,8 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.formats import track_format as layout
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState, Trajectory
-from slam_graph.sensors.kalibr_calibration import write_kalibr
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["TrackRecorder"]
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig, write_kalibr
 
 
 class TrackRecorder:

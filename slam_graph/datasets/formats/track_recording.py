@@ -27,12 +27,8 @@ from slam_graph.datasets.sequence import (
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.calibration_yaml import read_yaml
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
-
-__all__ = ["TrackRecordingSequence", "is_recording"]
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, read_kalibr, read_yaml
 
 SAMPLES_PER_BLOCK = 4096
 """IMU samples that are read at a time."""

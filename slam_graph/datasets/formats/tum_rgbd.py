@@ -33,11 +33,7 @@ from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages, Image
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.rig import Rig, RigCamera
-
-__all__ = ["TumRgbdSequence", "is_tum_rgbd", "rectifier"]
+from slam_graph.sensors import Camera, Rig, RigCamera, read_kalibr
 
 Size = tuple[int, int]
 

@@ -18,8 +18,6 @@ from typing import ClassVar
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.sequence import ReaderOptions
 
-__all__ = ["TumViSequence", "is_tum_vi"]
-
 CHAIN = Path("dso") / "camchain.yaml"
 
 

@@ -32,13 +32,11 @@ from slam_graph.datasets.streams.image_sequence import (
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
 from slam_graph.errors import DataError
-from slam_graph.sensors.measurements import CameraFrame
-
-__all__ = ["VideoSequence", "is_video"]
+from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
 
-SILENT = "-8"
+_SILENT = "-8"
 """FFmpeg's level of logging; damage is found and counted without its messages."""
 
 
@@ -55,7 +53,7 @@ class _VideoReader:
     """
 
     def __init__(self, path: Path) -> None:
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", SILENT)
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _SILENT)
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:

@@ -20,16 +20,14 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
-__all__ = ["Bag", "Message", "is_bag"]
-
 ROS1_SUFFIX, ROS2_SUFFIXES = ".bag", (".mcap", ".db3")
 
 METADATA = "metadata.yaml"
 
-HEADER_BYTES = 12
+_HEADER_BYTES = 12
 """Length of the beginning of a message that ends with its stamp."""
 
-REINDEX = (
+_REINDEX = (
     "if its recording was cut short, rebuild its index first (rosbag reindex, ros2 bag reindex)"
 )
 
@@ -124,7 +122,7 @@ class Bag:
 
     def header_stamp_ns(self, message: Message) -> int:
         """The stamp in the header that a message begins with; 0 if it is not set."""
-        if len(message.raw) < HEADER_BYTES:
+        if len(message.raw) < _HEADER_BYTES:
             return 0
         if self._is_ros2:  # four bytes with the byte order, and the stamp
             order = "<" if message.raw[1] & 1 else ">"
@@ -168,7 +166,7 @@ class Bag:
         except Exception as error:  # its parsers raise anything from struct.error to KeyError
             what = " ".join(str(error).split()) or type(error).__name__
             raise DataError(
-                f"{self.path}: this bag cannot be read ({what[:150]}); {REINDEX}"
+                f"{self.path}: this bag cannot be read ({what[:150]}); {_REINDEX}"
             ) from None
 
 

@@ -11,18 +11,6 @@ import numpy as np
 
 from slam_graph.datasets.streams.images import Fault, Image, decode_grey
 
-__all__ = [
-    "CAMERA_INFO",
-    "COMPRESSED_IMAGE",
-    "IMAGE",
-    "IMU",
-    "POSES",
-    "TRANSFORMS",
-    "image_of",
-    "inertial_of",
-    "pose_of",
-]
-
 IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -52,7 +40,7 @@ class _Encoding(NamedTuple):
     to_grey: int | None
 
 
-ENCODINGS = {
+_ENCODINGS = {
     "mono8": _Encoding(1, 8, None),
     "8UC1": _Encoding(1, 8, None),
     "mono16": _Encoding(1, 16, None),
@@ -81,9 +69,9 @@ def image_of(message: Any, where: str) -> Image | Fault:
     """
     if not hasattr(message, "encoding"):
         return decode_grey(bytes(message.data), where)
-    encoding = ENCODINGS.get(message.encoding)
+    encoding = _ENCODINGS.get(message.encoding)
     if encoding is None:
-        known = ", ".join(ENCODINGS)
+        known = ", ".join(_ENCODINGS)
         what = f"{where}: unknown encoding '{message.encoding}'; known: {known}"
         return Fault("image_unreadable", what)
     row = message.width * encoding.channels * encoding.bits // 8

@@ -14,13 +14,9 @@ from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import CAMERA_INFO, IMAGE, TRANSFORMS
 from slam_graph.datasets.rosbag.topics import Topics
 from slam_graph.errors import DataError
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.camera_model import CAMERA_MODELS
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera
 
-__all__ = ["read_bag_rig"]
-
-STATIC_TOPIC = "/tf_static"
+_STATIC_TOPIC = "/tf_static"
 
 
 def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
@@ -90,9 +86,9 @@ def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
 def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:
     """parent_T_child by parent and child, and the inverse by child and parent."""
     known: dict[str, dict[str, gtsam.Pose3]] = {}
-    if bag.topics.get(STATIC_TOPIC) != TRANSFORMS:
+    if bag.topics.get(_STATIC_TOPIC) != TRANSFORMS:
         return known
-    for message in bag.messages([STATIC_TOPIC]):
+    for message in bag.messages([_STATIC_TOPIC]):
         for stamped in message.decode().transforms:
             parent, child = _plain(stamped.header.frame_id), _plain(stamped.child_frame_id)
             move, turn = stamped.transform.translation, stamped.transform.rotation
@@ -118,7 +114,7 @@ def _path(
                 queue.append(other)
     if end not in reached:
         raise DataError(
-            f"{bag.path}: {STATIC_TOPIC} does not connect the IMU ('{begin}') with the camera "
+            f"{bag.path}: {_STATIC_TOPIC} does not connect the IMU ('{begin}') with the camera "
             f"('{end}'); give --calibration"
         )
     return reached[end]

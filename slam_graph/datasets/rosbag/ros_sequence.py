@@ -31,12 +31,8 @@ from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.kalibr_calibration import read_kalibr
-from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise
-
-__all__ = ["RosBagSequence"]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData, ImuNoise, read_kalibr
 
 SAMPLES_PER_BLOCK = 256
 

@@ -12,9 +12,7 @@ from pathlib import Path
 from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import COMPRESSED_IMAGE, IMAGE, IMU, POSES
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-
-__all__ = ["Topics", "find_topics"]
+from slam_graph.sensors import YamlValue, read_yaml
 
 
 @dataclass(frozen=True, slots=True)

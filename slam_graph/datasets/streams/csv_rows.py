@@ -17,19 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 
-__all__ = [
-    "ROWS_PER_BLOCK",
-    "STAMP_TEXT",
-    "Rows",
-    "count_rows",
-    "parse",
-    "read_rows",
-    "require_rows",
-    "stamp_from_seconds",
-    "stamps_from_seconds",
-]
-
-ROWS_PER_BLOCK = 1024
+_ROWS_PER_BLOCK = 1024
 """Rows in memory at a time: about five seconds of an IMU."""
 
 STAMP_TEXT = "S40"
@@ -62,7 +50,7 @@ class Rows:
         return Rows(self.path, [self.lines[k] for k in kept], [self.numbers[k] for k in kept])
 
 
-def read_rows(path: Path, rows_per_block: int = ROWS_PER_BLOCK) -> Iterator[Rows]:
+def read_rows(path: Path, rows_per_block: int = _ROWS_PER_BLOCK) -> Iterator[Rows]:
     """Stream the data rows of a text file in blocks.
 
     Blank lines, lines that start with ``#`` or ``%``, and a header (a first line that does not
@@ -185,7 +173,7 @@ def require_rows(path: Path) -> None:
 def count_rows(path: Path) -> tuple[int, str, str]:
     """Number of data rows of a file, its first and its last one (empty if there are none)."""
     count, first, last = 0, "", ""
-    for rows in read_rows(path, 16 * ROWS_PER_BLOCK):
+    for rows in read_rows(path, 16 * _ROWS_PER_BLOCK):
         first = first or rows.lines[0]
         last = rows.lines[-1]
         count += len(rows.lines)

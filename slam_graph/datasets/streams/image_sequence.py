@@ -25,20 +25,8 @@ from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.imu_stream import ImuSource
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, group_by_time
 from slam_graph.errors import DataError
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.measurements import CameraFrame, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = [
-    "LOOKED_AT",
-    "STEREO_TOLERANCE_S",
-    "GroupedSequence",
-    "ImageSequence",
-    "ImageStream",
-    "check_size",
-    "require_size",
-]
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import Camera, CameraFrame, ImuData, Rig
 
 STEREO_TOLERANCE_S = 0.003
 """Images at most this far apart are one frame; EuRoC's pairs differ by a few hundred ns."""

@@ -18,17 +18,15 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 
-__all__ = ["Fault", "FileImages", "Image", "decode_grey", "find_damage", "prefetch"]
-
 T = TypeVar("T")
 
 Image = NDArray[np.uint8]
 """(height, width), grey."""
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
-FRAMES_AHEAD = 3
+_FRAMES_AHEAD = 3
 """Frames decoded ahead: enough to hide the time of decoding, few enough to save memory."""
 
 
@@ -105,7 +103,7 @@ def find_damage(data: bytes) -> str | None:
     """What is wrong with the bytes of an image file, as far as is known without decoding it."""
     if not data:
         return "empty file"
-    if data.startswith(PNG_SIGNATURE):
+    if data.startswith(_PNG_SIGNATURE):
         return _find_png_damage(data)
     if data.startswith(JPEG_SIGNATURE) and JPEG_END not in data[-1024:]:
         return "truncated JPEG"
@@ -115,7 +113,7 @@ def find_damage(data: bytes) -> str | None:
 def _find_png_damage(data: bytes) -> str | None:
     """Compare the checksums of the chunks of a PNG file (0.1 ms for EuRoC's)."""
     view = memoryview(data)
-    position = len(PNG_SIGNATURE)
+    position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
         end = position + 12 + int.from_bytes(view[position : position + 4], "big")
         if end > len(data):
@@ -129,7 +127,7 @@ def _find_png_damage(data: bytes) -> str | None:
 
 
 def prefetch(
-    jobs: Iterable[Callable[[], T]], ahead: int = FRAMES_AHEAD
+    jobs: Iterable[Callable[[], T]], ahead: int = _FRAMES_AHEAD
 ) -> Generator[T, None, None]:
     """Results of jobs in their order, the next ones computed in a thread.
 

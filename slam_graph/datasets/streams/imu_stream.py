@@ -17,19 +17,9 @@ from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, count_rows, parse, read_rows, require_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors import ImuData
 
-__all__ = [
-    "INTEGER_STAMPS",
-    "ImuArrays",
-    "ImuCleaner",
-    "ImuFile",
-    "ImuSource",
-    "clean_blocks",
-    "parse_imu_rows",
-]
-
-GAP_PERIODS = 5.0
+_GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not
 hurt preintegration; five are 25 ms at 200 Hz, half the time between two frames."""
 
@@ -40,7 +30,7 @@ INTEGER_STAMPS = [("stamp", "i8"), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
 
 
 @dataclass
-class ImuCleaner:
+class _ImuCleaner:
     """Drops samples that cannot be used, counts them, and reports gaps.
 
     Counted kinds: `imu_not_finite`, `imu_duplicate` (the stamp of the latest sample again),
@@ -99,7 +89,7 @@ class ImuCleaner:
             self.period_ns = float(np.median(np.diff(stamps)))
         latest = stamps[0] if self.latest_ns is None else self.latest_ns
         pauses = np.diff(stamps, prepend=latest)
-        for k in np.flatnonzero(pauses > GAP_PERIODS * self.period_ns):
+        for k in np.flatnonzero(pauses > _GAP_PERIODS * self.period_ns):
             self.diagnostics.warn(
                 "imu_gap",
                 f"{where(int(k))}: no sample for {pauses[k] * 1e-9:.3f} s before {stamps[k]}",
@@ -112,14 +102,14 @@ def clean_blocks(
     diagnostics: Diagnostics,
     after_ns: int | None,
 ) -> Iterator[ImuData]:
-    """Run a stream of blocks through one `ImuCleaner`.
+    """Run a stream of blocks through one `_ImuCleaner`.
 
     Args:
         blocks: samples, each block after a function that gives the place of its samples.
         diagnostics: where faults are counted.
         after_ns: samples before this time are left out; None for all.
     """
-    cleaner = ImuCleaner(diagnostics, after_ns)
+    cleaner = _ImuCleaner(diagnostics, after_ns)
     for where, data in blocks:
         cleaned = cleaner.clean(data, where)
         if len(cleaned):

@@ -41,12 +41,10 @@ def in_order(
     return np.array(kept, np.intp)
 
 
-__all__ = ["ABSENT", "Groups", "group_by_time", "in_order"]
-
 ABSENT = -1
 """Stands in a group for a camera that has no image in it."""
 
-LARGEST_TOLERANCE_PERIODS = 0.4
+_LARGEST_TOLERANCE_PERIODS = 0.4
 """The tolerance is at most this share of a camera's period, so that neighbours are never paired."""
 
 
@@ -107,4 +105,4 @@ def _name_groups(cameras: Sequence[NDArray[np.int64]], members: NDArray[np.int64
 def _largest_tolerance(stamps: NDArray[np.int64]) -> int:
     if len(stamps) < 2:
         return int(np.iinfo(np.int64).max)
-    return int(LARGEST_TOLERANCE_PERIODS * float(np.median(np.diff(stamps))))
+    return int(_LARGEST_TOLERANCE_PERIODS * float(np.median(np.diff(stamps))))

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.sequence import FrameStream
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-
-__all__ = ["TRACK_ROW", "StampCounter", "TrackTable", "frames_from_tables"]
+from slam_graph.sensors import FeatureFrame, FeatureObservations
 
 TRACK_ROW = np.dtype(
     [

@@ -7,11 +7,8 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from slam_graph.datasets.dataset_registry import Format
-from slam_graph.datasets.memory_sequence import dataset_from_arrays
-from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.rig import Rig, RigCamera
+from slam_graph.datasets import Format, ReaderOptions, RecordedSequence, dataset_from_arrays
+from slam_graph.sensors import Camera, Rig, RigCamera
 
 
 def _open(path: Path, options: ReaderOptions) -> RecordedSequence:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from slam_graph.arrays import IntArray
+from slam_graph.frontend import Image, Keypoints
 from slam_graph.frontend.descriptors import Vectors
-from slam_graph.frontend.keypoints import Image, Keypoints
 
 SIDE_PX = 11
 

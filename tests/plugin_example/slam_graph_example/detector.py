@@ -5,8 +5,7 @@
 import cv2
 import numpy as np
 
-from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.keypoints import Image, Keypoints
+from slam_graph.frontend import FrontendConfig, Image, Keypoints
 
 SIGMA_PX = 2.0
 MIN_SCORE = 2.0

@@ -4,10 +4,8 @@
 
 from slam_graph.arrays import IntArray
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.frontend.frontend_config import FRONTENDS, FrontendConfig
-from slam_graph.frontend.frontend_protocol import Feedback
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.frontend import FRONTENDS, Feedback, FrontendConfig
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 
 class EveryOtherFeature:

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pose selection: the pose before the current one leaves."""
 
-from slam_graph.backend.cost.pose_selection import PoseSelection
-from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend import PoseSelection, RigProjection
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.window import Window
 

@@ -18,18 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.loop_closure.loop_pose_graph import body_poses, drift_sigmas, loop_graph
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.pose_graph.optimize import optimize_pose_graph
-from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["LoopClosures", "close_loops", "correct_by"]
+from slam_graph.pose_graph import PoseGraphCostPolicy, PoseGraphPolicy, Poses, optimize_pose_graph
+from slam_graph.sensors import Rig
 
 _MAX_PASSES = 3
 """The pose graph is solved again while loop closures are rejected, at most this often: the drift of

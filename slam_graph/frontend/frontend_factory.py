@@ -13,11 +13,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, Frontend
-from slam_graph.sensors.imu_buffer import STANDARD_GRAVITY
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
-
-__all__ = ["build_frontend"]
+from slam_graph.sensors import STANDARD_GRAVITY, CameraFrame, FeatureFrame, ImuData, Rig
 
 
 def build_frontend(

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.config import RunConfig, load_config
-from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import Sequence, open_dataset
 from slam_graph.errors import DataError
-from slam_graph.frontend.build_frontend import build_frontend
-from slam_graph.maps.map_model import SlamMap
+from slam_graph.frontend import build_frontend
+from slam_graph.maps import SlamMap
 from slam_graph.pipeline.estimation import Estimation
 from slam_graph.pipeline.graphs import GraphKeeping
 from slam_graph.pipeline.localization import Localization
@@ -32,10 +31,8 @@ from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
 from slam_graph.pipeline.supervision import interrupts_between_frames, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
-from slam_graph.results.run_result import RunInput, RunResult
-from slam_graph.visualization.viewer import NullViewer, Viewer
-
-__all__ = ["NullProgress", "Progress", "Recorder", "RunResult", "run"]
+from slam_graph.results import RunInput, RunResult
+from slam_graph.visualization import NullViewer, Viewer
 
 
 def run(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation.ape import (
+from slam_graph.evaluation.absolute_pose_error import (
     ErrorSeries,
     Statistics,
     aligned_pair,
@@ -28,8 +28,7 @@ from slam_graph.evaluation.choices import (
     PoseRelation,
     require_known,
 )
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.geometry import AlignmentMode, Trajectory
 
 DEFAULT_TOLERANCE = 0.1
 
@@ -70,7 +69,7 @@ def rpe(
     require_known(relation, ERROR_UNITS, "relation")
     require_known(unit, STEP_UNITS, "unit of a step")
     truth, aligned, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
-    start, end = step_pairs(
+    start, end = _step_pairs(
         truth if pairs_from_reference else aligned, delta, unit, all_pairs, tolerance
     )
     if len(start) == 0:
@@ -84,7 +83,7 @@ def rpe(
     return ErrorSeries(stamps, values, Statistics.of(values), similarity, len(truth))
 
 
-def step_pairs(
+def _step_pairs(
     trajectory: Trajectory, delta: float, unit: DeltaUnit, all_pairs: bool, tolerance: float
 ) -> tuple[IntArray, IntArray]:
     """Indices (M,) of the first and the last pose of each step of length `delta`."""

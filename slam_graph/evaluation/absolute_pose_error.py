@@ -19,6 +19,7 @@ the numbers are evo's.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +28,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry.trajectory import Trajectory
-from slam_graph.geometry.trajectory_alignment import (
-    ALIGNMENT_MODES,
-    AlignmentMode,
-    Similarity,
-    align,
-)
+from slam_graph.geometry import AlignmentMode, Similarity, Trajectory, align
 
 
 @dataclass(frozen=True)
@@ -140,7 +135,7 @@ def aligned_pair(
         ConfigError: if there is no such alignment or pairing.
         DataError: if the trajectories share no time, or cannot be aligned.
     """
-    require_known(alignment, ALIGNMENT_MODES, "alignment")
+    require_known(alignment, get_args(AlignmentMode), "alignment")
     truth, guess = synchronize(reference, estimate, pairing, limit_s)
     similarity = align(truth.positions, guess.positions, alignment)
     return truth, similarity.apply(guess), similarity
