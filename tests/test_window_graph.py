@@ -175,3 +175,9 @@ def test_without_a_state_there_is_none() -> None:
     estimator = Estimator(rig(), load_config().algorithm)
     with pytest.raises(EstimationError, match="no state"):
         estimator.factor_graph()
+
+
+def test_a_second_start_leaves_nothing_of_the_first() -> None:
+    estimator = flown("msckf")
+    estimator.start(Flight().nav_state(2.0, SIGMAS))
+    assert estimator.factor_graph().values.size() == 3  # pose, velocity, bias

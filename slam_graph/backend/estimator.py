@@ -9,7 +9,7 @@ step of its engine: this package's own loop (`engine.py`) or one of GTSAM's smoo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -77,7 +77,10 @@ class Estimator:
             rig, algorithm, config, diagnostics, calibration, projection, propagation
         )
         own = algorithm.engine == "square_root"
-        self._engine: Engine = SquareRootEngine(context) if own else SmootherEngine(context)
+        self._make_engine: Callable[[EngineContext], Engine] = (
+            SquareRootEngine if own else SmootherEngine
+        )
+        self._engine: Engine = self._make_engine(context)
         self._context = context
         self._initializer = Initializer(context)
         self._standstill = StandstillDetector(config.zero_velocity)
@@ -105,6 +108,7 @@ class Estimator:
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
         self.window = start_from(state, self.config, self._context.calibration)
+        self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""

@@ -23,7 +23,8 @@ def _no_ids() -> IntArray:
     return np.zeros(0, np.int64)
 
 
-def _no_points() -> tuple[IntArray, FloatArray]:
+def no_points() -> tuple[IntArray, FloatArray]:
+    """Ids and world positions of no features."""
     return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
@@ -60,8 +61,8 @@ class Window:
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
     state_features: IntArray = field(default_factory=_no_ids)
     lost_features: LandmarkStore = field(default_factory=LandmarkStore)
-    kept_points: tuple[IntArray, FloatArray] = field(default_factory=_no_points)
-    last_points: tuple[IntArray, FloatArray] = field(default_factory=_no_points)
+    kept_points: tuple[IntArray, FloatArray] = field(default_factory=no_points)
+    last_points: tuple[IntArray, FloatArray] = field(default_factory=no_points)
     calibration: tuple[int, ...] = ()
 
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:

@@ -25,7 +25,7 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.gauss_newton import Minimum, linearized
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
-from slam_graph.backend.window import Window
+from slam_graph.backend.window import Window, no_points
 
 LinearizationPoints = Literal["first", "current", "corrected"]
 """Where variables of the prior are linearised (see `marginalize`)."""
@@ -68,6 +68,8 @@ def _keep_points(window: Window, constructed: ConstructedCost) -> None:
     """Remember where the features are that the step estimated outside the state."""
     tracks = constructed.cost.tracks
     if tracks is None:
+        if constructed.predicted is not None:  # images were used, and none of such features
+            window.last_points = window.kept_points = no_points()
         return
     again = ~constructed.absorbed
     window.last_points = tracks.obs.ids, tracks.points
