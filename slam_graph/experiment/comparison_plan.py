@@ -81,9 +81,12 @@ def with_variants(configs: Mapping[str, RunConfig]) -> dict[str, RunConfig]:
         both[name] = config
         algorithm = config.algorithm
         if algorithm.engine == "square_root" and algorithm.marginalization.first_estimates:
-            policy = algorithm.marginalization.model_copy(update={"first_estimates": False})
-            changed = {"name": f"{name}{WITHOUT_FEJ}", "marginalization": policy}
-            variant = config.model_copy(update={"algorithm": algorithm.model_copy(update=changed)})
+            variant = config.with_overrides(
+                {
+                    "algorithm.name": f"{name}{WITHOUT_FEJ}",
+                    "algorithm.marginalization.first_estimates": False,
+                }
+            )
             both[variant.algorithm.name] = variant
     return both
 
@@ -156,9 +159,7 @@ def _adapted(config: RunConfig, source: Source) -> RunConfig:
     """
     if source.simulation is None or not source.simulation.known_start.error:
         return config
-    start = config.backend.initialization.model_copy(update={"fix_gauge": False})
-    backend = config.backend.model_copy(update={"initialization": start})
-    return config.model_copy(update={"backend": backend})
+    return config.with_overrides({"backend.initialization.fix_gauge": False})
 
 
 def _do(

@@ -19,6 +19,12 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
+from slam_graph.backend.solve.damped_steps import (
+    Attempt,
+    StepSettings,
+    TenfoldDamping,
+    levenberg_marquardt,
+)
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 
 INITIAL_DAMPING = 1e-4
@@ -115,28 +121,56 @@ def _levenberg_marquardt(
     cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
-    layout = cost.layout()
-    linear = linear or cost.linearize(summed=True)
-    system, costs, damping = _system(cost, linear, layout), [cost.value()], 0.0
-    for left in reversed(range(policy.max_steps)):
-        delta = _damped(system, damping).solution()
-        before = cost.snapshot()
-        cost.apply(delta, linear, layout)
-        value = cost.value()
-        if not value < costs[-1]:
-            cost.restore(before)
-            if _promised(system) < policy.tolerance * costs[-1] or damping > MAX_DAMPING:
-                break
-            damping = max(10.0 * damping, INITIAL_DAMPING)
-            continue
-        gain = costs[-1] - value
-        costs.append(value)
-        if left == 0 or max(gain, 0.0 if damping else _promised(system)) < policy.tolerance * value:
-            return Minimum(system.shifted(delta), tuple(costs))
-        linear = cost.linearize(summed=True)
-        system = _system(cost, linear, layout)
-        damping = 0.1 * damping if damping > INITIAL_DAMPING else 0.0
-    return Minimum(system, tuple(costs))
+    problem = _DampedCost(cost, linear)
+
+    def converged(attempt: Attempt) -> bool:
+        if not attempt.accepted:
+            return attempt.predicted < policy.tolerance * attempt.before
+        gain = attempt.before - attempt.after
+        undamped = 0.0 if attempt.damping else attempt.predicted
+        return max(gain, undamped) < policy.tolerance * attempt.after
+
+    settings = StepSettings(policy.max_steps, converged)
+    steps = levenberg_marquardt(problem, settings, TenfoldDamping(INITIAL_DAMPING, MAX_DAMPING))
+    return Minimum(problem.posterior(), steps.costs)
+
+
+class _DampedCost:
+    """A cost as `levenberg_marquardt` takes it (see `DampedProblem`)."""
+
+    def __init__(self, cost: Cost, linear: Linearization | None) -> None:
+        self._cost, self._layout, self._given = cost, cost.layout(), linear
+        self._delta: FloatArray | None = None
+
+    def value(self) -> float:
+        """The cost under the robust loss."""
+        return self._cost.value()
+
+    def linearize(self) -> None:
+        """Linearise all residuals."""
+        self._linear = self._given or self._cost.linearize(summed=True)
+        self._given, self._delta = None, None
+        self._system = _system(self._cost, self._linear, self._layout)
+
+    def solve(self, damping: float) -> float:
+        """Solve the damped system; the decrease that the undamped one predicts."""
+        self._delta = _damped(self._system, damping).solution()
+        return _promised(self._system)
+
+    def apply(self) -> None:
+        """Move the state."""
+        assert self._delta is not None, "solved before"
+        self._before = self._cost.snapshot()
+        self._cost.apply(self._delta, self._linear, self._layout)
+
+    def undo(self) -> None:
+        """Move the state back."""
+        self._cost.restore(self._before)
+        self._delta = None
+
+    def posterior(self) -> SquareRootInformation:
+        """At the current estimates, linearised where the last step was."""
+        return self._system if self._delta is None else self._system.shifted(self._delta)
 
 
 def _promised(system: SquareRootInformation) -> float:
