@@ -180,3 +180,8 @@ def test_merging_leaves_the_parts_as_they_were() -> None:
 
 def test_configs_are_found() -> None:
     assert read_tree(config_folder() / "algorithms" / "msckf.yaml").values["name"] == "msckf"
+
+
+def test_an_old_word_names_the_new_one() -> None:
+    with pytest.raises(ConfigError, match="'window' is 'every_step' now"):
+        load_config(overrides=["algorithm.cost.features=window"])

@@ -82,6 +82,14 @@ class CostPolicy(Settings):
         "robust_loss": "is backend.gating.robust_loss now, the same for all algorithms",
     }
 
+    @field_validator("features", mode="before")
+    @classmethod
+    def _renamed(cls, value: Any) -> Any:
+        """Name the new word for an old one."""
+        if value == "window":
+            raise ValueError("'window' is 'every_step' now")
+        return value
+
     @model_validator(mode="after")
     def _has_effect(self) -> CostPolicy:
         """Refuse what another choice makes of no effect."""
