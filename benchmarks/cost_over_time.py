@@ -26,7 +26,7 @@ from benchmarks.suite import GROWING, PEERS, RECURSIVE, UNBOUNDED, Benchmark, Ou
 from slam_graph.experiment.comparison_figures import draw
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import Series, read_series
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 
 DURATION_S = 60.0
 CAMERAS = 2

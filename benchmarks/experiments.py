@@ -19,8 +19,7 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.experiment.comparison_plan import Comparison, load_configs, run_tasks
 from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
-from slam_graph.experiment.sources import Source
-from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Task
+from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Source, Task
 
 RESULTS = Path("results/benchmarks")
 

@@ -19,7 +19,7 @@ from benchmarks.suite import Benchmark, Outcome
 from benchmarks.wheel import TRUTH
 from slam_graph.datasets.dataset_registry import DEMO
 from slam_graph.datasets.groundtruth import read_groundtruth
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 
 ALGORITHM = "msckf"
 

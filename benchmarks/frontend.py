@@ -15,7 +15,7 @@ from benchmarks.speed_worker import Watch, time_flow
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
-from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.sensors.measurements import CameraFrame
 
 RECORDING = "euroc/MH_01_easy_17s"

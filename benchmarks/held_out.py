@@ -18,7 +18,7 @@ from benchmarks.recordings import FIRST_HELD_OUT_SEED, HELD_OUT
 from benchmarks.running import Run
 from benchmarks.suite import CORE, Benchmark, Outcome
 from slam_graph.evaluation.consistency import mean_bounds
-from slam_graph.experiment.sources import Source, find_sources
+from slam_graph.experiment.tasks import Source, find_sources
 
 CLIP_S = 30.0
 

@@ -24,7 +24,7 @@ from slam_graph.evaluation.consistency import average_nees, mean_bounds
 from slam_graph.experiment.comparison_figures import NEES_DOF
 from slam_graph.experiment.comparison_plan import WITHOUT_FEJ, Comparison, with_variants
 from slam_graph.experiment.comparison_results import Series, read_series
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 
 SEEDS = 20
 DURATION_S = 15.0

@@ -20,15 +20,14 @@ from benchmarks.metric import EXACT, Metric, info
 from benchmarks.policy_combinations import combinations, values_of
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
-from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
+from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES, POSE_SELECTIONS
 from slam_graph.backend.policies import AlgorithmConfig, CostPolicy
 from slam_graph.config import RunConfig
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.experiment.comparison_figures import NEES_DOF
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import Series, read_series
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 
 SEEDS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 5)
 DURATION_S = 8.0

@@ -16,7 +16,7 @@ from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import is_held_out
 from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
 from slam_graph.experiment.comparison_plan import Comparison
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 
 FLIGHTS = tuple(
     f"euroc_inertial/{name}"

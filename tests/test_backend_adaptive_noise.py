@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from slam_graph.backend.cost.adaptive_noise import DensityScale
+from slam_graph.backend.cost.imu_factor import DensityScale
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
 from slam_graph.pipeline.run_recording import run

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
 
-from slam_graph.backend.cost.feature_factors import reduce_features, whiten
+from slam_graph.backend.cost.feature_factors import (
+    information_root,
+    reduce_features,
+    sum_features,
+    whiten,
+)
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.schur import information_root, sum_features
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

@@ -21,7 +21,6 @@ from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.calibration_estimate import CalibrationEstimate
 from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import (
     FeatureFrame,
@@ -29,7 +28,7 @@ from slam_graph.sensors.measurements import (
     ImuData,
     Packet,
 )
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors.rig import CalibrationEstimate, Rig
 from slam_graph.simulation.simulation_config import FlightConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fov_camera import FOV, FieldOfView
 
-from slam_graph.backend.gtsam_smoothers.smoother_factors import calibration
+from slam_graph.backend.gtsam_smoothers.smoother_features import calibration
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import FrontendConfig

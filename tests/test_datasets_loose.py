@@ -28,7 +28,7 @@ from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame
 

@@ -17,7 +17,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.marginalization.observability import unobservable_directions
+from slam_graph.backend.marginalization.marginalize import unobservable_directions
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of

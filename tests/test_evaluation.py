@@ -13,8 +13,7 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import Trajectory, seconds_text, tum_lines
+from slam_graph.geometry.trajectory import Trajectory, interpolate, seconds_text, tum_lines
 from slam_graph.geometry.trajectory_alignment import Similarity, align, align_first_pose, umeyama
 
 MODES = ("yaw", "se3", "sim3")

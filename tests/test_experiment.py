@@ -26,8 +26,7 @@ from slam_graph.experiment.comparison_figures import binned_mean
 from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
 from slam_graph.experiment.comparison_results import ALIGNMENTS
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
-from slam_graph.experiment.sources import find_sources
-from slam_graph.experiment.tasks import RecordTask, RunTask
+from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
 from slam_graph.pipeline.run_recording import run as run_pipeline
 from slam_graph.results.metrics import peak_memory_mb
 

@@ -29,10 +29,9 @@ from slam_graph.simulation.simulation_config import (
 )
 from slam_graph.simulation.simulator import simulate
 from slam_graph.smoothing import final_adjustment
-from slam_graph.smoothing.drift_consensus import consistent_matches, drift_jacobian
 from slam_graph.smoothing.final_adjustment import UndeterminedError, adjust_recording
 from slam_graph.smoothing.frame_log import FrameLog
-from slam_graph.smoothing.projected_matches import Scene
+from slam_graph.smoothing.projected_matches import Scene, consistent_matches, drift_jacobian
 from slam_graph.smoothing.recording_segment import read_segment, triangulated
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.smoothing.track_fusion import fused_labels, relabelled

@@ -34,8 +34,8 @@ from slam_graph.simulation.simulation_config import (
 from slam_graph.simulation.simulator import simulate
 from slam_graph.smoothing import final_adjustment
 from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, segments
-from slam_graph.smoothing.frame_averaging import nearest_keyframe
 from slam_graph.smoothing.frame_log import FrameLog
+from slam_graph.smoothing.recording_factors import nearest_keyframe
 from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 LENGTH_S = 8.0

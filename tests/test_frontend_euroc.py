@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations

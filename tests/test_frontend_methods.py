@@ -27,11 +27,10 @@ from images import (
 
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
-from slam_graph.frontend.frontend_factory import build_frontend
-from slam_graph.frontend.frontend_protocol import Feedback
-from slam_graph.frontend.imu_motion import ImuMotion
+from slam_graph.frontend.frontend_protocol import Feedback, build_frontend
 from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
+from slam_graph.frontend.prediction import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
 from slam_graph.sensors.imu_buffer import (
     ImuBuffer,

@@ -33,7 +33,7 @@ from pydantic import ValidationError
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
-from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera

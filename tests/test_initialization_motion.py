@@ -14,16 +14,22 @@ from slam_graph.backend.backend_config import BackendConfig, InitializationConfi
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess, guess_states
-from slam_graph.backend.initialization.gyro_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.dynamic_start import (
+    StartFrames,
+    StartGuess,
+    guess_states,
+    static_features,
+)
 from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
-from slam_graph.backend.initialization.start_consensus import static_features
-from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
+from slam_graph.backend.initialization.visual_inertial_alignment import (
+    Motion,
+    align,
+    estimate_gyro_bias,
+)
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.frontend.frontend_factory import build_frontend
-from slam_graph.geometry.interpolation import interpolate
-from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.frontend.frontend_protocol import build_frontend
+from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
 from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from slam_graph.frontend.frontend_factory import build_frontend
+from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.loop_closure.loop_config import KeyframeConfig, VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog
 from slam_graph.loop_closure.loop_verification import LoopVerifier

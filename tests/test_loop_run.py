@@ -127,7 +127,7 @@ def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatc
         def fail(*_: object, error: BaseException = error) -> None:
             raise error
 
-        monkeypatch.setattr("slam_graph.pipeline.loops.close_loops", fail)
+        monkeypatch.setattr("slam_graph.pipeline.mapping.close_loops", fail)
         result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
         assert result.status == "ok"
         assert len(result.trajectory) > 10

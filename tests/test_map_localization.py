@@ -11,10 +11,9 @@ from map_flights import World
 
 from slam_graph.errors import DataError
 from slam_graph.loop_closure.loop_config import VerificationConfig
-from slam_graph.maps.map_config import LocalizationConfig
-from slam_graph.maps.map_localization import MapLocalizer
+from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter, with_roll_and_pitch
+from slam_graph.maps.map_model import LocalizationConfig
 from slam_graph.maps.map_places import MapPlaces
-from slam_graph.maps.pose_filter import MapPoseFilter, with_roll_and_pitch
 
 CONFIG = LocalizationConfig()
 SIGMAS = np.array([0.004] * 3 + [0.02] * 3)

@@ -22,10 +22,9 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend import engine
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost, Linearization
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, Outcome
 from slam_graph.backend.cost.gating import Gate
-from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
+from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES, POSE_SELECTIONS
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize

@@ -18,7 +18,7 @@ from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.config import RunConfig
 from slam_graph.evaluation.consistency import mean_bounds, nees
-from slam_graph.experiment.sources import find_sources
+from slam_graph.experiment.tasks import find_sources
 from slam_graph.pipeline.run_recording import run
 from slam_graph.settings.tree import ConfigTree, validate
 

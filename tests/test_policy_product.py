@@ -23,13 +23,14 @@ from scipy.linalg import eigvalsh, solve_triangular
 from benchmarks.policy_combinations import Options, combinations, values_of
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig, TriangulationConfig
-from slam_graph.backend.cost.feature_policies import (
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.selection_policies import (
     FEATURE_POLICIES,
+    POSE_SELECTIONS,
     FeaturePolicy,
+    PoseSelection,
     WaitingTracks,
 )
-from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
-from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.policies import AlgorithmConfig, CostPolicy
 from slam_graph.backend.solve.state import dims_of

@@ -11,9 +11,9 @@ from scipy.optimize import approx_fprime
 
 from slam_graph.pose_graph import certificate
 from slam_graph.pose_graph.certificate import certify
-from slam_graph.pose_graph.chordal import chordal_cost, stacked, whitened_rows
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_files import read_pose_graph
+from slam_graph.pose_graph.graph_initialization import chordal_cost, stacked, whitened_rows
 from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy, PoseGraphPolicy
 

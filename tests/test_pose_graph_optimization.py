@@ -11,11 +11,10 @@ from pose_graphs import distance, laps, turns, with_false_loops
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.pose_graph.chordal import chordal_cost
 from slam_graph.pose_graph.graph import Poses
 from slam_graph.pose_graph.graph_cost import chi2_table
 from slam_graph.pose_graph.graph_files import read_pose_graph
-from slam_graph.pose_graph.graph_initialization import along_tree, initialize
+from slam_graph.pose_graph.graph_initialization import along_tree, chordal_cost, initialize
 from slam_graph.pose_graph.optimize import marginal_covariances, optimize_pose_graph
 from slam_graph.pose_graph.pose_graph_policy import (
     PoseGraphCostPolicy,

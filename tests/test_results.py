@@ -16,8 +16,8 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, finite
-from slam_graph.results.point_map import PointMap, write_ply
 from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
 from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
 from slam_graph.results.run_result import RunInput, RunResult
@@ -112,7 +112,7 @@ def test_map_keeps_the_last_estimate_and_reads_back(tmp_path: Path) -> None:
 def test_map_of_many_features_is_what_a_table_of_them_would_be(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("slam_graph.results.point_map.RECENT", 300)
+    monkeypatch.setattr("slam_graph.results.map_output.RECENT", 300)
     rng, points = np.random.default_rng(2), PointMap()
     table: dict[int, list[float]] = {}
     for _ in range(40):

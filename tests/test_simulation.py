@@ -30,8 +30,8 @@ from slam_graph.simulation.simulation_config import (
     TrackConfig,
 )
 from slam_graph.simulation.simulator import euroc_rig, simulate
-from slam_graph.simulation.splines import continuous, fit, stamps_between, through_waypoints
 from slam_graph.simulation.track_simulation import TrackSimulator
+from slam_graph.simulation.trajectories import continuous, fit, stamps_between, through_waypoints
 from slam_graph.simulation.world import box, three_rooms
 
 SHAPES = ("figure8", "rooms", "random")

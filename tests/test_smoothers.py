@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import B, L, V, X
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.gtsam_smoothers.smoother_factors import (
+from slam_graph.backend.gtsam_smoothers.smoother_features import (
     ProjectionFactors,
     joint_prior,
     pixel_noise,

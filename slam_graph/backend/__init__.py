@@ -44,18 +44,20 @@ if TYPE_CHECKING:
         TriangulationConfig,
         ZeroVelocityConfig,
     )
-    from slam_graph.backend.cost.adaptive_noise import IMU_GAP_SCALE
-    from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
     from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
     from slam_graph.backend.cost.gating import Innovations
-    from slam_graph.backend.cost.imu_factor import imu_factor
-    from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
+    from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
     from slam_graph.backend.cost.reprojection import Geometry, RigProjection
     from slam_graph.backend.cost.robust_loss import RobustLoss
+    from slam_graph.backend.cost.selection_policies import (
+        FEATURE_POLICIES,
+        POSE_SELECTIONS,
+        PoseSelection,
+    )
     from slam_graph.backend.cost.triangulation import triangulate
     from slam_graph.backend.cost.zero_velocity import StandstillDetector, zero_velocity_factors
     from slam_graph.backend.estimator import Estimator
-    from slam_graph.backend.gtsam_smoothers.smoother_factors import ProjectionFactors, pixel_noise
+    from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
     from slam_graph.backend.policies import AlgorithmConfig
     from slam_graph.backend.solve.damped_steps import (
         Attempt,
@@ -71,18 +73,16 @@ else:
         __name__,
         {
             "backend_config": ("BackendConfig", "TriangulationConfig", "ZeroVelocityConfig"),
-            "cost.adaptive_noise": ("IMU_GAP_SCALE",),
-            "cost.feature_policies": ("FEATURE_POLICIES",),
             "cost.feature_tracks": ("FeatureTracks", "Observations"),
             "cost.gating": ("Innovations",),
-            "cost.imu_factor": ("imu_factor",),
-            "cost.pose_selection": ("POSE_SELECTIONS", "PoseSelection"),
+            "cost.imu_factor": ("IMU_GAP_SCALE", "imu_factor"),
             "cost.reprojection": ("Geometry", "RigProjection"),
             "cost.robust_loss": ("RobustLoss",),
+            "cost.selection_policies": ("FEATURE_POLICIES", "POSE_SELECTIONS", "PoseSelection"),
             "cost.triangulation": ("triangulate",),
             "cost.zero_velocity": ("StandstillDetector", "zero_velocity_factors"),
             "estimator": ("Estimator",),
-            "gtsam_smoothers.smoother_factors": ("ProjectionFactors", "pixel_noise"),
+            "gtsam_smoothers.smoother_features": ("ProjectionFactors", "pixel_noise"),
             "policies": ("AlgorithmConfig",),
             "solve.damped_steps": (
                 "Attempt",

@@ -21,7 +21,7 @@ class AdaptiveNoiseConfig(Settings):
     without vibration whose noise was measured."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        name: f"is a constant now: {constant} in backend/cost/adaptive_noise.py"
+        name: f"is a constant now: {constant} in backend/cost/imu_factor.py"
         for name, constant in (
             ("whiteness_s", "PERSISTENCE_TIME_S"),
             ("size_s", "SIZE_TIME_S"),
@@ -51,7 +51,7 @@ class NoiseConfig(Settings):
     for little between the two frames around. Raise it for an IMU slower than 33 Hz."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "imu_gap_scale": ("is a constant now: IMU_GAP_SCALE in backend/cost/adaptive_noise.py"),
+        "imu_gap_scale": ("is a constant now: IMU_GAP_SCALE in backend/cost/imu_factor.py"),
     }
 
 

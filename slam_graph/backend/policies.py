@@ -3,8 +3,8 @@
 """The policy table: what makes one algorithm differ from another, module by module.
 
 An algorithm is a YAML file in `configs/algorithms/` with one section for each module of the loop.
-How poses are selected is in `cost/pose_selection.py`, what becomes of features in
-`cost/feature_policies.py`.
+How poses are selected is in `cost/selection_policies.py`, what becomes of features in
+`cost/selection_policies.py`.
 
 Every combination of policies that is accepted counts each measurement exactly once. What one policy
 would make of no effect in another is refused when the file is loaded.
@@ -25,8 +25,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
-from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS
+from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES, POSE_SELECTIONS
 from slam_graph.plugins import Choice
 from slam_graph.settings import Settings, expert
 

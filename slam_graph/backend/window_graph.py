@@ -24,7 +24,7 @@ from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.gtsam_smoothers.smoother_factors import pixel_noise
+from slam_graph.backend.gtsam_smoothers.smoother_features import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
-from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.experiment import Comparison, Task

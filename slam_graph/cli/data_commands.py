@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import (
     Calibration,
     Data,
@@ -21,7 +22,6 @@ from slam_graph.cli.options import (
     Sources,
     open_recording,
 )
-from slam_graph.cli.printing import echo_json, echo_table
 
 if TYPE_CHECKING:
     from slam_graph.datasets import Sequence
@@ -91,7 +91,7 @@ def convert(
     progress: Progress = True,
 ) -> None:
     """Write a recording of images as an EuRoC folder, whole or not at all."""
-    from slam_graph.cli.progress import ProgressBar
+    from slam_graph.cli.console import ProgressBar
     from slam_graph.datasets import convert_to_euroc, refuse_existing
 
     refuse_existing(output, force)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import Json
-from slam_graph.cli.printing import echo_json, echo_table
 from slam_graph.evaluation import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from slam_graph.cli.console import echo_json, echo_table, number
 from slam_graph.cli.options import (
     Calibration,
     Cameras,
@@ -25,7 +26,6 @@ from slam_graph.cli.options import (
     Start,
     open_recording,
 )
-from slam_graph.cli.printing import echo_json, echo_table, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,29 +11,66 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from slam_graph.cli import (
     compare,
-    config_commands,
     data_commands,
     evaluate,
     frontend,
-    localize,
     map,
     optimize,
     run,
     simulate,
 )
-from slam_graph.cli.options import INTERRUPTED
+from slam_graph.cli.console import echo_json
+from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
 
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
 # where other work shares the cores. OpenBLAS reads this when NumPy is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+config_app = typer.Typer(
+    help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@config_app.command()
+def dump(config: ConfigFile = None, set_: Overrides = None, algorithm: Algorithm = None) -> None:
+    """Print all settings as YAML with their meanings; the output is a valid --config file."""
+    from slam_graph.config import dump_yaml, load_config
+
+    typer.echo(dump_yaml(load_config(config, set_ or (), algorithm=algorithm)), nl=False)
+
+
+@config_app.command()
+def schema() -> None:
+    """Print the JSON schema of a configuration."""
+    from slam_graph.config import RunConfig
+
+    echo_json(RunConfig.model_json_schema())
+
+
+@config_app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="YAML file to check.")],
+    set_: Overrides = None,
+    algorithm: Algorithm = None,
+) -> None:
+    """Check a YAML file of settings, or of an algorithm.
+
+    An error names the file and line, and the exit code is 2.
+    """
+    from slam_graph.config import load_config
+
+    load_config(file, set_ or (), algorithm=algorithm)
+    typer.echo(f"{file}: ok")
+
 
 app = typer.Typer(
     help="Factor-graph SLAM: a recorded sequence in, a trajectory out.",
@@ -43,7 +80,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run.run)
-app.command("localize")(localize.localize)
+app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
 app.command("rpe")(evaluate.rpe)
@@ -52,7 +89,7 @@ app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)
 app.add_typer(frontend.app, name="frontend")
 app.add_typer(data_commands.app, name="data")
-app.add_typer(config_commands.app, name="config")
+app.add_typer(config_app, name="config")
 
 
 def _print_version(wanted: bool) -> None:

@@ -12,12 +12,12 @@ from zipfile import is_zipfile
 import typer
 
 from slam_graph.cli.optimize_bal import optimize_bal
-from slam_graph.cli.optimize_common import read_policy
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
 from slam_graph.cli.options import (
     ConfigFile,
     Json,
     Overrides,
+    read_policy,
 )
 from slam_graph.errors import ConfigError, DataError
 

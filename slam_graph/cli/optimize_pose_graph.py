@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from slam_graph.cli.logs import collected_log
-from slam_graph.cli.optimize_common import timed, write_result
-from slam_graph.cli.printing import echo_json, echo_table
+from slam_graph.cli.console import collected_log, echo_json, echo_table
+from slam_graph.cli.options import timed, write_result
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics

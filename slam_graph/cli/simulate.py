@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from slam_graph.cli.console import ProgressBar, echo_json, echo_table
 from slam_graph.cli.options import ConfigFile, Json, Overrides
-from slam_graph.cli.printing import echo_json, echo_table
-from slam_graph.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
     from slam_graph.simulation import SimulatedSequence

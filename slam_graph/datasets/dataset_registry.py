@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slam_graph.datasets.formats.eqvio import EqvioTracks, is_eqvio_file, wheel_tracks
-from slam_graph.datasets.formats.euroc import EurocSequence
+from slam_graph.datasets.formats.euroc import EurocSequence, TumViSequence, is_tum_vi
 from slam_graph.datasets.formats.image_folder import ImageFolderSequence, is_image_folder
 from slam_graph.datasets.formats.kitti_odometry import KittiOdometrySequence, is_kitti_odometry
 from slam_graph.datasets.formats.kitti_raw import KittiRawSequence, is_kitti_raw
 from slam_graph.datasets.formats.openvins_sim import OpenvinsSimulation
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence, is_recording
 from slam_graph.datasets.formats.tum_rgbd import TumRgbdSequence, is_tum_rgbd
-from slam_graph.datasets.formats.tum_vi import TumViSequence, is_tum_vi
 from slam_graph.datasets.formats.video import VideoSequence, is_video
 from slam_graph.datasets.rosbag.bag import is_bag
 from slam_graph.datasets.rosbag.ros_sequence import RosBagSequence

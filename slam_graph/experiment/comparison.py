@@ -19,8 +19,7 @@ from slam_graph.experiment.comparison_plan import (
 )
 from slam_graph.experiment.comparison_report import write_report
 from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesses
-from slam_graph.experiment.sources import find_sources
-from slam_graph.experiment.tasks import Task
+from slam_graph.experiment.tasks import Task, find_sources
 
 _DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 

@@ -13,8 +13,7 @@ from typing import Any
 from slam_graph.config import RunConfig
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
-from slam_graph.experiment.sources import Source
-from slam_graph.experiment.tasks import RecordTask, RunTask, Task
+from slam_graph.experiment.tasks import RecordTask, RunTask, Source, Task
 from slam_graph.smoothing import FinalBaConfig
 
 WITHOUT_FEJ = "_no_fej"

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
         FRONTENDS,
         FrontendConfig,
     )
-    from slam_graph.frontend.frontend_factory import build_frontend
-    from slam_graph.frontend.frontend_protocol import Feedback, Frontend
+    from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
     from slam_graph.frontend.keypoints import Image, Keypoints
     from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
 else:
@@ -43,8 +42,7 @@ else:
             "descriptors": ("Descriptor", "Orb"),
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
-            "frontend_factory": ("build_frontend",),
-            "frontend_protocol": ("Feedback", "Frontend"),
+            "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
             "keypoints": ("Image", "Keypoints"),
             "outliers": ("epipolar_distance", "essential_matrix"),
         },

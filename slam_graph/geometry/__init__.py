@@ -28,8 +28,14 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.geometry.interpolation import DEFAULT_MAX_GAP_S, interpolate
-    from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory, tum_lines
+    from slam_graph.geometry.trajectory import (
+        DEFAULT_MAX_GAP_S,
+        NavState,
+        StateHistory,
+        Trajectory,
+        interpolate,
+        tum_lines,
+    )
     from slam_graph.geometry.trajectory_alignment import (
         AlignmentMode,
         Similarity,
@@ -42,8 +48,14 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "interpolation": ("DEFAULT_MAX_GAP_S", "interpolate"),
-            "trajectory": ("NavState", "StateHistory", "Trajectory", "tum_lines"),
+            "trajectory": (
+                "DEFAULT_MAX_GAP_S",
+                "NavState",
+                "StateHistory",
+                "Trajectory",
+                "interpolate",
+                "tum_lines",
+            ),
             "trajectory_alignment": (
                 "AlignmentMode",
                 "Similarity",

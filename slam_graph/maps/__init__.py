@@ -28,24 +28,32 @@ __all__ = [
 
 if TYPE_CHECKING:
     from slam_graph.maps.map_building import build_map
-    from slam_graph.maps.map_config import LocalizationConfig, MapConfig
     from slam_graph.maps.map_file import read_map, write_map
-    from slam_graph.maps.map_localization import MapLocalizer
+    from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter
     from slam_graph.maps.map_merge import merge_maps
-    from slam_graph.maps.map_model import MapRecording, PoseSource, SlamMap
+    from slam_graph.maps.map_model import (
+        LocalizationConfig,
+        MapConfig,
+        MapRecording,
+        PoseSource,
+        SlamMap,
+    )
     from slam_graph.maps.map_places import MapPlaces
-    from slam_graph.maps.pose_filter import MapPoseFilter
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "map_building": ("build_map",),
-            "map_config": ("LocalizationConfig", "MapConfig"),
             "map_file": ("read_map", "write_map"),
-            "map_localization": ("MapLocalizer",),
+            "map_localization": ("MapLocalizer", "MapPoseFilter"),
             "map_merge": ("merge_maps",),
-            "map_model": ("MapRecording", "PoseSource", "SlamMap"),
+            "map_model": (
+                "LocalizationConfig",
+                "MapConfig",
+                "MapRecording",
+                "PoseSource",
+                "SlamMap",
+            ),
             "map_places": ("MapPlaces",),
-            "pose_filter": ("MapPoseFilter",),
         },
     )

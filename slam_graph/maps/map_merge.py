@@ -29,14 +29,13 @@ from slam_graph.maps.map_building import (
     train_vocabulary,
     with_points,
 )
-from slam_graph.maps.map_config import LocalizationConfig
-from slam_graph.maps.map_model import NO_FEATURE, SlamMap
-from slam_graph.maps.map_places import MapPlaces, PlaceMatch
-from slam_graph.maps.pose_filter import (
+from slam_graph.maps.map_localization import (
     CONSISTENT_CHI2,
     MapPoseFilter,
     with_roll_and_pitch,
 )
+from slam_graph.maps.map_model import NO_FEATURE, LocalizationConfig, SlamMap
+from slam_graph.maps.map_places import MapPlaces, PlaceMatch
 from slam_graph.pose_graph import PoseGraphCostPolicy, PoseGraphPolicy, Poses, optimize_pose_graph
 from slam_graph.version import __version__
 

@@ -1,20 +1,113 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimation: the back end at work on one frame after the other, under supervision."""
+"""Estimation: the back end at work on one frame after the other, from a known start or its own.
+
+A known start is a first state that comes with the data, or is taken from the ground truth.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
-from slam_graph.geometry import NavState
+from slam_graph.errors import DataError
+from slam_graph.geometry import NavState, Trajectory, interpolate
 from slam_graph.pipeline.stage import EstimatedFrame
-from slam_graph.pipeline.start import KnownStart
 from slam_graph.pipeline.supervision import Agreement, DivergenceError, check_sane
 from slam_graph.pipeline.tracking import TrackedPacket
-from slam_graph.results import RunResult
+from slam_graph.results import RunInput, RunResult
 from slam_graph.sensors import FeatureFrame
+
+_LEAD_NS = 1_000_000_000
+"""A given state may be this much older than the first frame: the IMU reaches back that far."""
+
+_DIFFERENCE_NS = 25_000_000
+"""Half the step of the central difference that gives the velocity where the truth has none."""
+
+_TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
+"""Standard deviations of the true rotation (rad), position (m), velocity (m/s), accelerometer bias
+(m/s²) and gyroscope bias (rad/s)."""
+
+_UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
+"""Standard deviations of the accelerometer and gyroscope bias where the truth has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownStart:
+    """Where the first state comes from, if not from the estimator's own initialisation.
+
+    Attributes:
+        state: a state that came with the data.
+        truth: ground truth to start from at the first frame that it covers.
+    """
+
+    state: NavState | None = None
+    truth: Trajectory | None = None
+
+    @staticmethod
+    def of(sequence: Sequence, asked: RunInput) -> KnownStart:
+        """The known start that the initialisation mode asks for (`backend.initialization.mode`).
+
+        Raises:
+            DataError: if the mode needs a state or a ground truth that the sequence does not have.
+        """
+        name, mode = asked.info.name, asked.config.backend.initialization.mode
+        if mode == "groundtruth":
+            if asked.truth is None:
+                raise DataError(f"{name}: no ground truth to start from; use another mode")
+            return KnownStart(truth=asked.truth)
+        if mode not in ("auto", "given"):
+            return KnownStart()
+        state = sequence.initial_state()
+        if state is not None and not (asked.start_ns - _LEAD_NS <= state.stamp_ns <= asked.end_ns):
+            state = None
+        if state is None and mode == "given":
+            raise DataError(
+                f"{name}: no start state comes with the data at {asked.config.start_s:g} s; "
+                "use --set backend.initialization.mode=auto"
+            )
+        return KnownStart(state=state)
+
+    def at(self, stamp_ns: int) -> NavState | None:
+        """The state to start from at a frame, or None if it is not known by then."""
+        if self.truth is not None:
+            return true_state(self.truth, stamp_ns)
+        if self.state is not None and self.state.stamp_ns <= stamp_ns:
+            return self.state
+        return None
+
+
+def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
+    """The state at a time, with its covariance; None where the truth does not reach.
+
+    Velocity is taken from positions where the truth has none, and biases are zero.
+    """
+    stamps = np.array([stamp_ns - _DIFFERENCE_NS, stamp_ns, stamp_ns + _DIFFERENCE_NS])
+    near, valid = interpolate(truth, stamps)
+    if not valid[1]:
+        return None
+    middle = int(valid[0])
+    if near.velocities is not None:
+        velocity = near.velocities[middle]
+    elif len(near) > 1:
+        seconds = (near.stamps_ns[-1] - near.stamps_ns[0]) * 1e-9
+        velocity = (near.positions[-1] - near.positions[0]) / seconds
+    else:
+        return None
+    sigmas = _TRUTH_SIGMAS
+    if near.accel_biases is None or near.gyro_biases is None:
+        sigmas = _TRUTH_SIGMAS[:3] + _UNKNOWN_BIAS_SIGMAS
+    return NavState(
+        stamp_ns,
+        near.pose(middle),
+        velocity,
+        accel_bias=np.zeros(3) if near.accel_biases is None else near.accel_biases[middle],
+        gyro_bias=np.zeros(3) if near.gyro_biases is None else near.gyro_biases[middle],
+        covariance=np.diag(np.repeat(np.square(sigmas), 3)),
+    )
 
 
 class Estimation:

@@ -16,11 +16,9 @@ from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.maps import SlamMap
 from slam_graph.pipeline.estimation import Estimation
-from slam_graph.pipeline.graphs import GraphKeeping
-from slam_graph.pipeline.localization import Localization
-from slam_graph.pipeline.loops import Keyframes, LoopClosing
-from slam_graph.pipeline.map import MapBuilding
+from slam_graph.pipeline.mapping import Keyframes, Localization, LoopClosing, MapBuilding
 from slam_graph.pipeline.observers import (
+    GraphKeeping,
     NullProgress,
     NullRecorder,
     Observers,

@@ -27,14 +27,14 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import Attempt, StepSettings, TenfoldDamping, levenberg_marquardt
 from slam_graph.errors import EstimationError
-from slam_graph.pose_graph.chordal import (
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_initialization import (
     chordal_cost,
     factorized,
     stacked,
     unstacked,
     whitened_rows,
 )
-from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 _RELATIVE_GAP = 1e-6
 """An optimum is global if no poses can have an F lower by more than this part of it, plus …"""

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.pose_graph.chordal import chordal_cost
 from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_initialization import chordal_cost
 from slam_graph.pose_graph.gtsam_graph import (
     anchor_factors,
     edge_chi2,

@@ -32,11 +32,10 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.results.bundle_result import BalResult
     from slam_graph.results.localization_result import LocalizationLog
     from slam_graph.results.map_output import export_ply, export_tum, find_map, load_map, save_map
     from slam_graph.results.metrics import finite, versions
-    from slam_graph.results.pose_graph_result import PoseGraphResult
+    from slam_graph.results.optimization_result import BalResult, PoseGraphResult
     from slam_graph.results.result_files import (
         appearing,
         create_run_folder,
@@ -51,11 +50,10 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "bundle_result": ("BalResult",),
             "localization_result": ("LocalizationLog",),
             "map_output": ("export_ply", "export_tum", "find_map", "load_map", "save_map"),
             "metrics": ("finite", "versions"),
-            "pose_graph_result": ("PoseGraphResult",),
+            "optimization_result": ("BalResult", "PoseGraphResult"),
             "result_files": (
                 "appearing",
                 "create_run_folder",

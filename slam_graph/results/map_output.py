@@ -1,16 +1,115 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Saves and loads maps, and exports them for other programs."""
+"""Maps as files of a run: the estimated points, PLY files, saving and loading of maps."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.geometry import tum_lines
 from slam_graph.maps import SlamMap, read_map, write_map
-from slam_graph.results.point_map import write_ply
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
+
+_POINT_COLOUR = (200, 200, 200)
+_CAMERA_COLOUR = (220, 30, 30)
+
+_POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
+
+RECENT = 10_000
+"""Features are moved from the dictionary into the arrays when there are more than this."""
+
+
+class PointMap:
+    """The last estimate of every feature; 32 bytes for each but the recent ones."""
+
+    def __init__(self) -> None:
+        self._recent: dict[int, tuple[float, float, float]] = {}
+        self._ids = np.zeros(0, np.int64)
+        self._points = np.zeros((0, 3))
+
+    def __len__(self) -> int:
+        self._pack()
+        return len(self._ids)
+
+    def update(self, ids: IntArray, points: FloatArray) -> None:
+        """Replace the positions of features.
+
+        Args:
+            ids: (N,) of the features.
+            points: (N, 3) in the world, m.
+        """
+        self._recent.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
+        if len(self._recent) > RECENT:
+            self._pack()
+
+    def points(self) -> FloatArray:
+        """(N, 3) in the world, m."""
+        self._pack()
+        return self._points
+
+    def _pack(self) -> None:
+        """Move the recent features into the arrays; older positions of the same ids are dropped."""
+        ids = np.array(list(self._recent), dtype=np.int64)
+        points = np.array(list(self._recent.values()), dtype=np.float64).reshape(-1, 3)
+        kept = ~np.isin(self._ids, ids)
+        self._ids = np.concatenate([self._ids[kept], ids])
+        self._points = np.concatenate([self._points[kept], points])
+        self._recent = {}
+
+
+def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None) -> None:
+    """Write points (N, 3) as a binary PLY point cloud; points that are not finite are left out.
+
+    Args:
+        path: of the file.
+        points: of the world.
+        centres: (M, 3) of cameras, if they are to be shown: then points are grey and these red.
+    """
+    finite = points[np.isfinite(points).all(axis=1)]
+    fields: list[tuple[str, str, int]] = [("place", "<f8", 3)]
+    lines = list(_POSITION_PROPERTIES)
+    if centres is not None:
+        fields.append(("colour", "u1", 3))
+        lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    places = finite if centres is None else np.concatenate([finite, centres])
+    vertices = np.empty(len(places), fields)
+    vertices["place"] = places
+    if centres is not None:
+        vertices["colour"][: len(finite)] = _POINT_COLOUR
+        vertices["colour"][len(finite) :] = _CAMERA_COLOUR
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *lines,
+        "end_header",
+    ]
+    with appearing(path) as partial:
+        partial.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
+
+
+def read_ply(path: Path | str) -> FloatArray:
+    """Read the points (N, 3) of a point cloud that `write_ply` wrote without cameras.
+
+    Raises:
+        DataError: if the file is missing or has another form.
+    """
+    path = Path(path)
+    try:
+        header, separator, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    lines = header.decode("ascii", errors="replace").splitlines()
+    properties = tuple(line for line in lines if line.startswith("property"))
+    binary = "format binary_little_endian 1.0" in lines
+    if not separator or not binary or properties != _POSITION_PROPERTIES or len(body) % 24:
+        raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
+    return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
+
 
 MAP_NAME = "map.slam"
 """Name of the map in the folder of a run."""

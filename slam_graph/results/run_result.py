@@ -22,10 +22,9 @@ from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory, tum_lin
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
-from slam_graph.results import run_files as names
+from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
-from slam_graph.results.map_output import MAP_NAME, save_map
-from slam_graph.results.point_map import PointMap, write_ply
+from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder, appearing
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.sensors import Rig, write_kalibr

@@ -50,7 +50,6 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.sensors.calibration_estimate import CalibrationEstimate
     from slam_graph.sensors.calibration_yaml import YamlValue, parse_yaml, read_yaml
     from slam_graph.sensors.camera import Camera
     from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
@@ -82,12 +81,17 @@ if TYPE_CHECKING:
         ImuData,
         Packet,
     )
-    from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera, pose_from_matrix
+    from slam_graph.sensors.rig import (
+        CalibrationEstimate,
+        ImuNoise,
+        Rig,
+        RigCamera,
+        pose_from_matrix,
+    )
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "calibration_estimate": ("CalibrationEstimate",),
             "calibration_yaml": ("YamlValue", "parse_yaml", "read_yaml"),
             "camera": ("Camera",),
             "camera_model": ("CAMERA_MODELS", "CameraModel"),
@@ -114,6 +118,6 @@ else:
                 "ImuData",
                 "Packet",
             ),
-            "rig": ("ImuNoise", "Rig", "RigCamera", "pose_from_matrix"),
+            "rig": ("CalibrationEstimate", "ImuNoise", "Rig", "RigCamera", "pose_from_matrix"),
         },
     )

@@ -152,7 +152,7 @@ def _is_model(part: object) -> bool:
 CAMERA_MODELS: Registry[type[CameraModel]] = Registry(
     "slam_graph.camera_models",
     "camera model",
-    home="slam_graph.sensors.omnidirectional_models",  # which needs the other built-in models
+    home="slam_graph.sensors.lens_models",  # which needs the other built-in models
     accepts=_is_model,
 )
 """The camera models by name, those of installed plugins too."""

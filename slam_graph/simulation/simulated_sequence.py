@@ -29,12 +29,10 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 from slam_graph.simulation.imu_simulation import ImuSource
-from slam_graph.simulation.landmarks import Landmarks
+from slam_graph.simulation.landmarks import Landmarks, MovingBoard
 from slam_graph.simulation.motion import Motion
-from slam_graph.simulation.moving_object import MovingBoard
-from slam_graph.simulation.rendering import Renderer
+from slam_graph.simulation.rendering import Renderer, paint
 from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
-from slam_graph.simulation.textures import paint
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
@@ -144,7 +142,7 @@ class SimulatedSequence(RecordedSequence):
         """Write the simulation to a new folder, completely or not at all, with its settings.
 
         Args:
-            path: the folder. Tracks become a recording (`datasets/formats/track_format.py`),
+            path: the folder. Tracks become a recording (`datasets/formats/track_recording.py`),
                 images an EuRoC (ASL) folder with the calibration in Kalibr's format beside it.
             progress: called after every frame.
 

@@ -34,8 +34,7 @@ from slam_graph.simulation.simulation_config import (
     load_simulation_config,
     random_stream,
 )
-from slam_graph.simulation.splines import fit, stamps_between
-from slam_graph.simulation.trajectories import fly
+from slam_graph.simulation.trajectories import fit, fly, stamps_between
 from slam_graph.simulation.views import View, camera_groups
 from slam_graph.simulation.world import room_around, three_rooms
 

@@ -29,9 +29,8 @@ from slam_graph.backend import (
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig, preintegration_params
-from slam_graph.smoothing.frame_averaging import averaged, nearest_keyframe
 from slam_graph.smoothing.keyframe_states import fill_in
-from slam_graph.smoothing.recording_factors import RecordingFactors
+from slam_graph.smoothing.recording_factors import RecordingFactors, averaged, nearest_keyframe
 from slam_graph.smoothing.recording_segment import (
     RecordingSegment,
     longest_tracks,

@@ -25,8 +25,13 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
-from slam_graph.smoothing.drift_consensus import consistent_matches
-from slam_graph.smoothing.projected_matches import REACH_PX, Matches, Scene, projected_matches
+from slam_graph.smoothing.projected_matches import (
+    REACH_PX,
+    Matches,
+    Scene,
+    consistent_matches,
+    projected_matches,
+)
 from slam_graph.smoothing.recording_problem import BundleAdjustment
 from slam_graph.smoothing.recording_segment import (
     RecordingSegment,

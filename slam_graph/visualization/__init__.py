@@ -22,18 +22,30 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.visualization.comparison_plots import Curve, Panel, plot_panels
+    from slam_graph.visualization.plots import (
+        Curve,
+        Panel,
+        plot_bundle,
+        plot_errors,
+        plot_panels,
+        plot_pose_graph,
+    )
     from slam_graph.visualization.rerun_viewer import RerunViewer
-    from slam_graph.visualization.result_plots import plot_bundle, plot_errors, plot_pose_graph
     from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
     from slam_graph.visualization.viewer import NullViewer, Viewer
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "comparison_plots": ("Curve", "Panel", "plot_panels"),
+            "plots": (
+                "Curve",
+                "Panel",
+                "plot_bundle",
+                "plot_errors",
+                "plot_panels",
+                "plot_pose_graph",
+            ),
             "rerun_viewer": ("RerunViewer",),
-            "result_plots": ("plot_bundle", "plot_errors", "plot_pose_graph"),
             "track_picture": ("TrackPainter", "TrackVideo", "save_picture"),
             "viewer": ("NullViewer", "Viewer"),
         },

@@ -20,7 +20,6 @@ from gtsam.symbol_shorthand import L
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
 from slam_graph.backend.cost.feature_tracks import (
     Observations,
@@ -29,9 +28,13 @@ from slam_graph.backend.cost.feature_tracks import (
     is_in,
 )
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
-from slam_graph.backend.cost.pose_selection import POSE_SELECTIONS, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.cost.selection_policies import (
+    FEATURE_POLICIES,
+    POSE_SELECTIONS,
+    PoseSelection,
+)
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM

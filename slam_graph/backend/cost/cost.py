@@ -21,15 +21,16 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     ReducedFeatures,
+    SummedFeatures,
     WhitenedObservations,
     reduce_features,
+    sum_features,
     whiten,
 )
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.gating import Gate, Innovations, squared_mahalanobis, threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.cost.schur import SummedFeatures, sum_features
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
 

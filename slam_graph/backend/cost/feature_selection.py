@@ -17,7 +17,6 @@ from gtsam.symbol_shorthand import X
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import TrackFeatures
-from slam_graph.backend.cost.feature_policies import FEATURE_POLICIES, WaitingTracks
 from slam_graph.backend.cost.feature_tracks import (
     FeatureTracks,
     Observations,
@@ -25,8 +24,12 @@ from slam_graph.backend.cost.feature_tracks import (
     Removals,
     is_in,
 )
-from slam_graph.backend.cost.pose_selection import PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.selection_policies import (
+    FEATURE_POLICIES,
+    PoseSelection,
+    WaitingTracks,
+)
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.window import Window

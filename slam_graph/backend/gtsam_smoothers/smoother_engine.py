@@ -16,8 +16,11 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
-from slam_graph.backend.gtsam_smoothers.smoother_factors import joint_prior
-from slam_graph.backend.gtsam_smoothers.smoother_features import NewObservations, SmootherFeatures
+from slam_graph.backend.gtsam_smoothers.smoother_features import (
+    NewObservations,
+    SmootherFeatures,
+    joint_prior,
+)
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
 from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation

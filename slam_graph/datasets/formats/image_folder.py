@@ -1,27 +1,208 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of images of one camera, with a table of their times, and with or without an IMU."""
+"""Images without a format: their files, time stamps, IMU and calibration, each on its own.
+
+Images without a format: the files with their time stamps, IMU and calibration. Times in these files
+are nanoseconds if they are whole numbers, seconds if any has a decimal point.
+
+A folder of images of one camera, with a table of their times, and with or without an IMU.
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.formats.euroc import ordered_images
-from slam_graph.datasets.formats.loose_files import (
-    LooseFiles,
-    find_files,
-    read_stamps,
-    regular_stamps,
-    stamps_from_names,
-)
 from slam_graph.datasets.sequence import ReaderOptions
+from slam_graph.datasets.streams.csv_rows import (
+    STAMP_TEXT,
+    Rows,
+    parse,
+    read_rows,
+    stamp_from_seconds,
+)
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages
+from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import DataError, closest
+from slam_graph.sensors import ImuData, Rig, read_kalibr
+
+_SHORTEST_PERIOD_NS = 100_000
+"""Frames closer in time than this have stamps in another unit."""
+
+SLOWEST_HZ, FASTEST_HZ = 0.01, 1000.0
+
+SOURCES = ("stamps", "rate", "imu")
+
+
+@dataclass(frozen=True, slots=True)
+class LooseFiles:
+    """The files that belong to some images.
+
+    Attributes:
+        stamps: table with a time for each image, or None.
+        rate_hz: of the images, if that was given instead.
+        imu: CSV with time, rate x y z [rad/s], specific force x y z [m/s²], or None.
+        rig: one camera; without an IMU its frame is the body frame.
+    """
+
+    stamps: Path | None
+    rate_hz: float | None
+    imu: ImuFile | None
+    rig: Rig
+
+
+def find_files(
+    path: Path, beside: Mapping[str, Sequence[Path]], options: ReaderOptions
+) -> LooseFiles:
+    """Find the files that belong to some images: as named, or where they usually are.
+
+    Args:
+        path: of the images.
+        beside: where to look for ``stamps``, ``imu`` and ``calibration`` that are not named.
+        options: `sources` names ``stamps`` and ``imu``, or gives ``rate`` in Hz.
+
+    Raises:
+        DataError: if there is no calibration, a source is unknown, or its file is not there.
+    """
+    named, calibration = options.sources, options.calibration
+    unknown = [key for key in named if key not in SOURCES]
+    if unknown:
+        raise DataError(f"unknown source '{unknown[0]}'; {closest(unknown[0], SOURCES)}")
+    found = {key: next(filter(Path.is_file, files), None) for key, files in beside.items()}
+    files = {key: Path(named[key]) if key in named else found[key] for key in ("stamps", "imu")}
+    for file in files.values():
+        if file is not None and not file.is_file():
+            raise DataError(f"{file}: no such file")
+    chain = calibration if calibration is not None else found["calibration"]
+    if chain is None:
+        looked = ", ".join(file.name for file in beside["calibration"])
+        raise DataError(f"{path}: no calibration ({looked}) beside the images; give --calibration")
+    imu = files["imu"]
+    rate_hz = _rate(named["rate"]) if "rate" in named else None
+    if rate_hz is not None and "stamps" in named:
+        raise DataError(f"{path}: stamps and rate are both given; one of them is enough")
+    return LooseFiles(
+        stamps=None if rate_hz is not None else files["stamps"],
+        rate_hz=rate_hz,
+        imu=None if imu is None else ImuFile(imu, _parse_timed_imu),
+        rig=options.select(read_kalibr(chain, needs_imu=imu is not None).select(1)),
+    )
+
+
+def is_usable_rate(rate_hz: float) -> bool:
+    """Whether a camera can have this rate."""
+    return SLOWEST_HZ <= rate_hz <= FASTEST_HZ
+
+
+def regular_stamps(count: int, rate_hz: float) -> IntArray:
+    """Stamps (N,) in ns of images at a constant rate, the first one at 0."""
+    stamps: IntArray = np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    return stamps
+
+
+def read_stamps(path: Path) -> tuple[IntArray, list[str]]:
+    """Times of a table, one a row, in its first column.
+
+    Returns:
+        stamps_ns: (N,) in the order of the file.
+        names: the second column of each row; empty where there is none.
+
+    Raises:
+        DataError: if there are none, one cannot be read, or they are of another unit.
+    """
+    blocks = list(read_rows(path))
+    cells = [[_cells(line) for line in rows.lines] for rows in blocks]
+    if not blocks:
+        raise DataError(f"{path}: no time stamps in this file")
+    seconds = any(_in_seconds(row[0]) for block in cells for row in block)
+    stamps = np.array(
+        [
+            _stamp(row[0], rows, k, seconds)
+            for rows, block in zip(blocks, cells, strict=True)
+            for k, row in enumerate(block)
+        ],
+        np.int64,
+    )
+    _require_unit(stamps, path)
+    return stamps, [row[1] if len(row) > 1 else "" for block in cells for row in block]
+
+
+def _require_unit(stamps_ns: IntArray, path: Path) -> None:
+    """Refuse stamps that are too close to be in nanoseconds."""
+    if len(stamps_ns) < 2:
+        return
+    period = float(np.median(np.abs(np.diff(stamps_ns))))
+    if period < _SHORTEST_PERIOD_NS:
+        raise DataError(
+            f"{path}: stamps are {period:.0f} ns apart; whole numbers are nanoseconds, "
+            "seconds need a decimal point"
+        )
+
+
+def stamps_from_names(paths: Sequence[Path]) -> IntArray | None:
+    """Stamps (N,) of files whose names are their times; None if one is not."""
+    stamps = []
+    for path in paths:
+        try:
+            seconds = _in_seconds(path.stem)
+            stamps.append(int(Decimal(path.stem).scaleb(9)) if seconds else int(path.stem))
+        except (ValueError, OverflowError, InvalidOperation):
+            return None
+    together = np.array(stamps, np.int64)
+    if len(together) > 1 and float(np.median(np.abs(np.diff(together)))) < _SHORTEST_PERIOD_NS:
+        return None
+    return together
+
+
+def _parse_timed_imu(rows: Rows) -> ImuData:
+    """Samples of rows: time, gyro xyz in rad/s, accel xyz in m/s²."""
+    what = "time, gyro xyz, accel xyz"
+    if not any(_in_seconds(_cells(line)[0]) for line in rows.lines):
+        table = parse(rows, INTEGER_STAMPS, what)
+        return ImuData(table["stamp"], table["gyro"], table["accel"])
+    table = parse(rows, [("stamp", STAMP_TEXT), *INTEGER_STAMPS[1:]], what)
+    stamps = [stamp_from_seconds(text, rows, k) for k, text in enumerate(table["stamp"])]
+    return ImuData(np.array(stamps, np.int64), table["gyro"], table["accel"])
+
+
+def _cells(line: str) -> list[str]:
+    """The cells of a row, which is separated by commas or else by white space."""
+    cells = line.split(",") if "," in line else line.split()
+    return [cell.strip() for cell in cells]
+
+
+def _in_seconds(text: str) -> bool:
+    return any(mark in text for mark in ".eE")
+
+
+def _stamp(text: str, rows: Rows, index: int, seconds: bool) -> int:
+    if seconds:
+        return stamp_from_seconds(text, rows, index)
+    try:
+        return int(text)
+    except ValueError:
+        raise DataError(f"{rows.where(index)}: '{text[:80]}' is not a time") from None
+
+
+def _rate(text: str) -> float:
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = float("nan")
+    if not is_usable_rate(rate_hz):
+        raise DataError(f"rate={text} is not a number of images a second")
+    return rate_hz
+
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 

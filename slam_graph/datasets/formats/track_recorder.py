@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Records feature tracks for replay; `track_format` describes the files."""
+"""Records feature tracks for replay; `track_recording` describes the files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from slam_graph.datasets.formats import track_format as layout
+from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig, write_kalibr

@@ -1,23 +1,43 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded feature tracks: replayed, so that every algorithm gets the same features.
+"""Recorded feature tracks: the folder format, and its replay.
 
-`TrackRecorder` writes recordings; `track_format` describes the files.
+The folder format of recorded feature tracks: its files and their records. All numbers are little-
+endian, and no file is a pickle:
+
+- ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, `name`, and the number of `cameras`,
+  `frames`, `imu_samples` and `features`, by which a truncated file is recognised;
+- ``calibration.yaml``: the rig, as `slam_graph.sensors.kalibr_calibration` writes it;
+- ``frames.bin``: for each frame `stamp` (int64, ns) and `counts` (int64 for each camera), the
+  number of features of each camera;
+- ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
+  ordered by frame, then camera, then as in the `FeatureFrame`;
+- ``descriptors.bin``, where features have any: for each feature of the first camera, in the same
+  order, `descriptor_bytes` of ``meta.yaml`` bytes (0 or missing if there are none);
+- ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
+- ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
+  `NavState` under their names (`world_T_body` as a 4x4 matrix).
+
+A recording is replayed bit for bit.
+
+Recorded feature tracks: replayed, so that every algorithm gets the same features. `TrackRecorder`
+writes recordings; `track_format` describes the files.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, ClassVar, Literal
+from typing import Any, BinaryIO, ClassVar, Literal
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.formats import track_format as layout
 from slam_graph.datasets.sequence import (
     Extent,
     FrameStream,
@@ -27,8 +47,84 @@ from slam_graph.datasets.sequence import (
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
-from slam_graph.geometry import NavState
+from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, read_kalibr, read_yaml
+
+FORMAT_NAME = "slam_graph-tracks"
+FORMAT_VERSION = 1
+
+META, CALIBRATION = "meta.yaml", "calibration.yaml"
+FRAMES, FEATURES, IMU = "frames.bin", "features.bin", "imu.bin"
+DESCRIPTORS = "descriptors.bin"
+GROUNDTRUTH, INITIAL_STATE = "groundtruth.npz", "initial_state.npz"
+
+IMU_RECORD = np.dtype([("stamp", "<i8"), ("gyro", "<f8", (3,)), ("accel", "<f8", (3,))])
+FEATURE_RECORD = np.dtype([("id", "<i8"), ("pixel", "<f8", (2,)), ("normalized", "<f8", (2,))])
+
+
+def frame_record(cameras: int) -> np.dtype[np.void]:
+    """Type of a row of ``frames.bin`` for a number of cameras."""
+    return np.dtype([("stamp", "<i8"), ("counts", "<i8", (cameras,))])
+
+
+def save_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory; arrays that it does not have are left out."""
+    _save(path, {name: getattr(trajectory, name) for name in _names(Trajectory)})
+
+
+def load_trajectory(path: Path) -> Trajectory:
+    """Read what `save_trajectory` wrote."""
+    arrays = _load(path, ("stamps_ns", "positions", "quaternions"))
+    return Trajectory(
+        stamps_ns=arrays["stamps_ns"],
+        positions=arrays["positions"],
+        quaternions=arrays["quaternions"],
+        velocities=arrays.get("velocities"),
+        gyro_biases=arrays.get("gyro_biases"),
+        accel_biases=arrays.get("accel_biases"),
+    )
+
+
+def save_state(path: Path, state: NavState) -> None:
+    """Write a state."""
+    fields = {name: getattr(state, name) for name in _names(NavState)}
+    _save(path, fields | {"world_T_body": state.world_T_body.matrix()})
+
+
+def load_state(path: Path) -> NavState:
+    """Read what `save_state` wrote."""
+    arrays = _load(path, ("stamp_ns", "world_T_body", "velocity", "gyro_bias", "accel_bias"))
+    return NavState(
+        stamp_ns=int(arrays["stamp_ns"]),
+        world_T_body=gtsam.Pose3(arrays["world_T_body"]),
+        velocity=arrays["velocity"],
+        gyro_bias=arrays["gyro_bias"],
+        accel_bias=arrays["accel_bias"],
+        covariance=arrays.get("covariance"),
+    )
+
+
+def _save(path: Path, fields: dict[str, Any]) -> None:
+    arrays: dict[str, Any] = {k: np.asarray(v) for k, v in fields.items() if v is not None}
+    np.savez(path, **arrays)
+
+
+def _load(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # a damaged zip fails in many ways
+        raise DataError(f"{path}: cannot be read ({error}); record it again") from None
+    missing = [name for name in required if name not in arrays]
+    if missing:
+        raise DataError(f"{path}: no array '{missing[0]}' in this file; record it again")
+    return arrays
+
+
+def _names(kind: type[NavState] | type[Trajectory]) -> list[str]:
+    """The fields of a dataclass, without its class variables."""
+    return [field.name for field in dataclasses.fields(kind)]
+
 
 SAMPLES_PER_BLOCK = 4096
 """IMU samples that are read at a time."""
@@ -40,8 +136,8 @@ def _where(name: str, first: int, index: int) -> str:
 
 def is_recording(path: Path) -> bool:
     """Whether a folder is one that `TrackRecorder` wrote."""
-    meta = path / layout.META
-    return meta.is_file() and layout.FORMAT_NAME in meta.read_text(errors="replace")[:200]
+    meta = path / META
+    return meta.is_file() and FORMAT_NAME in meta.read_text(errors="replace")[:200]
 
 
 class TrackRecordingSequence(RecordedSequence):
@@ -62,19 +158,19 @@ class TrackRecordingSequence(RecordedSequence):
     def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
         options = options or ReaderOptions()
         self.path = path
-        meta = read_yaml(path / layout.META)
+        meta = read_yaml(path / META)
         version = meta.require("version")
-        if version.text() != str(layout.FORMAT_VERSION):
+        if version.text() != str(FORMAT_VERSION):
             raise DataError(
                 f"{version.where}: recording of version {version.text()}, this program reads "
-                f"version {layout.FORMAT_VERSION}; record it again"
+                f"version {FORMAT_VERSION}; record it again"
             )
-        recorded = read_kalibr(path / layout.CALIBRATION)
+        recorded = read_kalibr(path / CALIBRATION)
         chain = options.calibration
         self._recalibrated = chain is not None
         rig = options.select(recorded if chain is None else read_kalibr(chain))
-        truth = path / layout.GROUNDTRUTH
-        own = partial(layout.load_trajectory, truth) if truth.is_file() else None
+        truth = path / GROUNDTRUTH
+        own = partial(load_trajectory, truth) if truth.is_file() else None
         super().__init__(meta.require("name").text(), rig, options, own)
         counts = {
             name: int(meta.require(name).number()) for name in ("frames", "imu_samples", "features")
@@ -85,9 +181,9 @@ class TrackRecordingSequence(RecordedSequence):
             raise DataError(f"{path}: has {self._cameras} cameras, fewer than the calibration")
         width = meta.get("descriptor_bytes")
         self._descriptor_bytes = 0 if width is None else int(width.number())
-        self._record = layout.frame_record(self._cameras)
+        self._record = frame_record(self._cameras)
         self._check_sizes(counts)
-        self._index = np.fromfile(path / layout.FRAMES, self._record)
+        self._index = np.fromfile(path / FRAMES, self._record)
         self._check_descriptors()
 
     def measure(self) -> Extent:
@@ -101,9 +197,9 @@ class TrackRecordingSequence(RecordedSequence):
         return clean_blocks(self._samples_in_blocks(), self.diagnostics, after_ns)
 
     def _samples_in_blocks(self) -> Iterator[tuple[Callable[[int], str], ImuData]]:
-        with (self.path / layout.IMU).open("rb") as file:
+        with (self.path / IMU).open("rb") as file:
             first = 0
-            while len(rows := np.fromfile(file, layout.IMU_RECORD, SAMPLES_PER_BLOCK)):
+            while len(rows := np.fromfile(file, IMU_RECORD, SAMPLES_PER_BLOCK)):
                 data = ImuData(*(np.ascontiguousarray(rows[n]) for n in ("stamp", "gyro", "accel")))
                 yield partial(_where, file.name, first), data
                 first += len(rows)
@@ -113,14 +209,14 @@ class TrackRecordingSequence(RecordedSequence):
         wanted = np.flatnonzero(within(self._index["stamp"], start_ns, end_ns))
         if len(wanted) == 0:
             return
-        size, before = layout.FEATURE_RECORD.itemsize, self._index["counts"][: wanted[0]]
+        size, before = FEATURE_RECORD.itemsize, self._index["counts"][: wanted[0]]
         with ExitStack() as files:
-            file = files.enter_context((self.path / layout.FEATURES).open("rb"))
+            file = files.enter_context((self.path / FEATURES).open("rb"))
             file.seek(int(before.sum()) * size)
             descriptors_file = self._open_descriptors(files, int(before[:, 0].sum()))
             for row in self._index[wanted[0] : wanted[-1] + 1]:
                 counts = row["counts"].tolist()
-                features = np.frombuffer(file.read(sum(counts) * size), layout.FEATURE_RECORD)
+                features = np.frombuffer(file.read(sum(counts) * size), FEATURE_RECORD)
                 ends = np.cumsum([0, *counts]).tolist()
                 observed = [
                     self._unpack(features[ends[c] : ends[c + 1]], c)
@@ -136,8 +232,8 @@ class TrackRecordingSequence(RecordedSequence):
 
     def initial_state(self) -> NavState | None:
         """The state at the start, if one was recorded."""
-        file = self.path / layout.INITIAL_STATE
-        return layout.load_state(file) if file.is_file() else None
+        file = self.path / INITIAL_STATE
+        return load_state(file) if file.is_file() else None
 
     def _unpack(self, rows: NDArray[np.void], camera: int) -> FeatureObservations:
         ids, pixels = (np.ascontiguousarray(rows[name]) for name in ("id", "pixel"))
@@ -151,21 +247,21 @@ class TrackRecordingSequence(RecordedSequence):
         """The file of descriptors, positioned at feature `first`; None where there are none."""
         if self._descriptor_bytes == 0:
             return None
-        file = files.enter_context((self.path / layout.DESCRIPTORS).open("rb"))
+        file = files.enter_context((self.path / DESCRIPTORS).open("rb"))
         file.seek(first * self._descriptor_bytes)
         return file
 
     def _check_descriptors(self) -> None:
         if self._descriptor_bytes:
             features = int(self._index["counts"][:, 0].sum())
-            self._check_size(layout.DESCRIPTORS, features * self._descriptor_bytes)
+            self._check_size(DESCRIPTORS, features * self._descriptor_bytes)
 
     def _check_sizes(self, counts: dict[str, int]) -> None:
         """Refuse files that are not as long as the recorder left them."""
         sizes = {
-            layout.FRAMES: counts["frames"] * self._record.itemsize,
-            layout.IMU: counts["imu_samples"] * layout.IMU_RECORD.itemsize,
-            layout.FEATURES: counts["features"] * layout.FEATURE_RECORD.itemsize,
+            FRAMES: counts["frames"] * self._record.itemsize,
+            IMU: counts["imu_samples"] * IMU_RECORD.itemsize,
+            FEATURES: counts["features"] * FEATURE_RECORD.itemsize,
         }
         for name, expected in sizes.items():
             self._check_size(name, expected)
@@ -175,6 +271,4 @@ class TrackRecordingSequence(RecordedSequence):
         size = file.stat().st_size if file.is_file() else -1
         if size != expected:
             found = "missing" if size < 0 else f"{size} bytes long"
-            raise DataError(
-                f"{file}: {found}, {layout.META} says {expected} bytes; record it again"
-            )
+            raise DataError(f"{file}: {found}, {META} says {expected} bytes; record it again")

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.formats.loose_files import (
+from slam_graph.datasets.formats.image_folder import (
     LooseFiles,
     find_files,
     is_usable_rate,

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
-from slam_graph.datasets.rosbag.ros_calibration import read_bag_rig
-from slam_graph.datasets.rosbag.topics import find_topics
+from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
 from slam_graph.datasets.sequence import Extent, FrameStream, ReaderOptions
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,

@@ -1,13 +1,82 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a run on stderr: a bar in a terminal, a line every few seconds in a log."""
+"""What commands print: tables or JSON on stdout, progress on stderr, and the log of a run.
+
+Progress of a run on stderr: a bar in a terminal, a line every few seconds in a log.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
 import sys
 import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
+
+import typer
+
+
+def echo_json(value: Any) -> None:
+    """Print JSON on stdout."""
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def echo_table(rows: Iterable[Sequence[str]], indent: str = "") -> None:
+    """Print rows with aligned columns on stdout; rows may have fewer cells than others."""
+    table = [list(row) for row in rows]
+    columns = max((len(row) for row in table), default=0)
+    widths = [max(len(row[i]) for row in table if len(row) > i) for i in range(columns)]
+    for row in table:
+        cells = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False))
+        typer.echo((indent + "  ".join(cells)).rstrip())
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number with so many decimals, or a dash for none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+class _ListHandler(logging.Handler):
+    """Keeps formatted lines."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__(logging.INFO)
+        self.lines = lines
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(self.format(record) + "\n")
+
+
+@contextmanager
+def collected_log() -> Iterator[list[str]]:
+    """Collect what the package logs, and show its warnings on stderr."""
+    lines: list[str] = []
+    shown = logging.StreamHandler(sys.stderr)
+    shown.addFilter(lambda record: record.levelno == logging.WARNING)
+    shown.setFormatter(logging.Formatter("warning: %(message)s"))
+    logger = logging.getLogger("slam_graph")
+    logger.setLevel(logging.INFO)
+    handlers = (shown, _ListHandler(lines))
+    for handler in handlers:
+        logger.addHandler(handler)
+    try:
+        yield lines
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove the folder of a run that wrote nothing, and that of its data set if it is empty."""
+    for empty in (folder, folder.parent):
+        if empty.is_dir() and not any(empty.iterdir()):
+            empty.rmdir()
+
 
 _BAR_WIDTH = 28
 _TERMINAL_PERIOD_S = 0.1

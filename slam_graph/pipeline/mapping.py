@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Stages of places: keyframes and loop closure, the map of a run, localization in a saved map.
+
+Keyframes and loop closure as stages: keyframes are collected, loops closed at the end.
+
+The map as a stage: built at the end from the keyframes and their best poses.
+
+Localization as a stage: the pose of every frame in a map that was saved before.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import cv2
+import numpy as np
+
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry import NavState
+from slam_graph.loop_closure import (
+    Keyframe,
+    KeyframeDescriber,
+    KeyframeLog,
+    Loop,
+    close_loops,
+    reposed,
+)
+from slam_graph.maps import MapLocalizer, MapPlaces, MapRecording, PoseSource, SlamMap, build_map
+from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
+from slam_graph.pose_graph import Poses
+from slam_graph.results import LocalizationLog, RunResult
+from slam_graph.sensors import FeatureFrame
+
+NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
+
+logger = logging.getLogger(__name__)
+
+
+class Keyframes(Stage):
+    """Collects the keyframes that loop closure and map need, with their descriptors.
+
+    Args:
+        result: of the run.
+
+    Attributes:
+        seconds: that collecting them took.
+    """
+
+    def __init__(self, result: RunResult) -> None:
+        self.seconds = 0.0
+        self._log = KeyframeLog(result.input.rig, result.config.loop_closure.keyframes)
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Take a frame, if there is an estimate."""
+        state = frame.state
+        if state is None:
+            return
+        began = time.perf_counter()
+        # the state's time is on the IMU's clock, also where the camera's time offset is estimated
+        features = FeatureFrame(state.stamp_ns, frame.features.cameras)
+        self._log.add(features, state.world_T_body, frame.image)
+        self.seconds += time.perf_counter() - began
+
+    @property
+    def found(self) -> list[Keyframe]:
+        """All keyframes so far, with causal poses."""
+        return self._log.keyframes
+
+
+class LoopClosing(Stage):
+    """Closes the loops of a run; the causal and the smoothed trajectory stay as they are.
+
+    Args:
+        result: of the run; it is given the loop closures.
+        keyframes: collected on the way.
+        diagnostics: counts what goes wrong.
+    """
+
+    def __init__(self, result: RunResult, keyframes: Keyframes, diagnostics: Diagnostics) -> None:
+        self._result, self._keyframes, self._diagnostics = result, keyframes, diagnostics
+
+    def finish(self) -> None:
+        """Close the loops, starting from the best trajectory so far."""
+        result = self._result
+        if result.status not in COMPLETED:
+            return
+        if not self._keyframes.found:
+            self._diagnostics.warn("loop_closure_impossible", NOT_RECOGNISABLE)
+            return
+        began = time.perf_counter()
+        with warn_on_failure(self._diagnostics, "loop_closure_failed", "no loops are closed"):
+            closures = close_loops(
+                reposed(self._keyframes.found, result.best_trajectory),
+                result.input.rig,
+                result.config.loop_closure,
+                result.config.seed,
+                self._diagnostics,
+            )
+            logger.info(
+                "loop closure: %d keyframes, %d loop closures, %d accepted, %.1f s in all",
+                len(self._keyframes.found),
+                len(closures.loops),
+                closures.accepted.sum(),
+                self._keyframes.seconds + time.perf_counter() - began,
+            )
+            result.loops = closures
+
+
+class MapBuilding(Stage):
+    """Builds the map of a run.
+
+    Args:
+        result: of the run; it is given the map.
+        keyframes: collected on the way.
+        diagnostics: counts what goes wrong.
+    """
+
+    def __init__(self, result: RunResult, keyframes: Keyframes, diagnostics: Diagnostics) -> None:
+        self._result, self._keyframes, self._diagnostics = result, keyframes, diagnostics
+
+    def finish(self) -> None:
+        """Build the map, unless there is nothing to recognise places by."""
+        if self._result.status not in COMPLETED:
+            return
+        if not self._keyframes.found:
+            self._diagnostics.warn("map_impossible", NOT_RECOGNISABLE)
+            return
+        with warn_on_failure(self._diagnostics, "map_failed", "no map is built"):
+            self._result.slam_map = made = _build(self._result, self._keyframes.found)
+            logger.info("map: %d keyframes, %d features", len(made), len(made.points))
+
+
+def _build(result: RunResult, keyframes: list[Keyframe]) -> SlamMap:
+    """The map of the keyframes at their best poses."""
+    config = result.config.loop_closure
+    loops = _accepted_loops(result)
+    source, poses = _best_poses(result, keyframes, loops)
+    return build_map(
+        keyframes,
+        poses,
+        MapRecording(result.input.info.name, source, result.input.rig),
+        loops,
+        config.places,
+        config.verification,
+        config.degrees_of_freedom == 4,
+        result.config.seed,
+    )
+
+
+def _accepted_loops(result: RunResult) -> list[Loop]:
+    if result.loops is None:
+        return []
+    pairs = zip(result.loops.loops, result.loops.accepted.tolist(), strict=True)
+    return [loop for loop, accepted in pairs if accepted]
+
+
+def _best_poses(
+    result: RunResult, keyframes: list[Keyframe], loops: list[Loop]
+) -> tuple[PoseSource, Poses]:
+    """The best world_T_body of all keyframes, and where they come from.
+
+    After accepted loop closures these are the corrected poses, else the smoothed ones, else the
+    causal ones.
+    """
+    if loops and result.loops is not None:
+        return "loop_closed", result.loops.poses
+    if result.final_ba is not None:
+        smoothed = reposed(keyframes, result.final_ba.trajectory)
+        return "smoothed", Poses.from_gtsam([k.world_T_body for k in smoothed])
+    return "causal", Poses.from_gtsam([k.world_T_body for k in keyframes])
+
+
+class Localization(Stage):
+    """Locates a run in a map while it goes on.
+
+    Args:
+        result: of the run; it is given the poses in the map.
+        known: the map.
+        diagnostics: counts what goes wrong.
+    """
+
+    def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
+        rig, config = result.input.rig, result.config
+        loops, settings = config.loop_closure, config.localization
+        self._places = MapPlaces(known, rig, loops.verification, settings.neighbours)
+        self._localizer = MapLocalizer(self._places, settings)
+        self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
+        self._name, self._diagnostics = result.input.info.name, diagnostics
+        self._log = result.localization = LocalizationLog(known)
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Take a frame, if there is an estimate.
+
+        Raises:
+            DataError: if the run has descriptors of another kind than the map.
+        """
+        state = frame.state
+        if state is None:
+            return
+        began = time.perf_counter()
+        localizer = self._localizer
+        localizer.move(state.stamp_ns, state.world_T_body)
+        if localizer.wants(state.stamp_ns):
+            view = self._view(frame, state)
+            if view is not None:
+                self._places.check(view.descriptors, self._name)
+                try:
+                    localizer.match(view)
+                except (cv2.error, np.linalg.LinAlgError) as error:
+                    reason = " ".join(str(error).split())[:200]
+                    self._diagnostics.warn("localization_query_failed", reason)
+        self._log.append(state.stamp_ns, localizer.filter, localizer.located)
+        self._log.seconds += time.perf_counter() - began
+
+    def _view(self, frame: EstimatedFrame, state: NavState) -> Keyframe | None:
+        """What the first camera sees, with descriptors; None if it has none."""
+        seen = frame.features.cameras[0]
+        if frame.image is not None:
+            seen = self._describer.describe(frame.image, seen)
+        if seen.descriptors is None or len(seen) == 0:
+            return None
+        unknown = np.full((len(seen), 3), np.nan)
+        return Keyframe(
+            state.stamp_ns,
+            state.world_T_body,
+            seen.ids,
+            seen.normalized,
+            seen.descriptors,
+            unknown,
+        )
+
+    def finish(self) -> None:
+        """Count the comparisons with the map."""
+        localizer, log = self._localizer, self._log
+        log.count(
+            queries=localizer.queries,
+            matches=localizer.matches,
+            accepted=localizer.accepted,
+            starts=localizer.starts,
+        )
+        if len(log.located) and localizer.queries == 0:
+            self._diagnostics.warn(
+                "localization_impossible",
+                "nothing to recognise places by: no images, and tracks without descriptors",
+            )
+        located = int(log.located.sum())
+        logger.info("located in the map: %d of %d frames", located, len(log.located))
