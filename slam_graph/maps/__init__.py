@@ -4,7 +4,7 @@
 
 `map_building.py` (`build_map`) makes a `SlamMap` (`map_model.py`) of the keyframes of a run,
 `map_file.py` reads and writes it, `map_localization.py` (`MapLocalizer`) localizes a run in it, and
-`map_merge.py` (`merge_maps`) merges two. Settings are in `map_config.py`.
+`map_merge.py` (`merge_maps`) merges two. Settings are in `map_model.py`.
 """
 
 from typing import TYPE_CHECKING
