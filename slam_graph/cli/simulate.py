@@ -101,9 +101,10 @@ def simulate(
 
 
 def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:
-    info = sequence.info()
+    info, report = sequence.info(), sequence.flight.report
     if as_json:
-        echo_json({"folder": str(output), **asdict(info)})
+        path = {} if report is None else {"path": report.as_dict()}
+        echo_json({"folder": str(output), **asdict(info), **path})
         return
     rows = {
         "folder": str(output),
@@ -111,4 +112,6 @@ def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:
         "duration": f"{(info.end_ns - info.start_ns) * 1e-9:.2f} s",
         "IMU": f"{info.imu_samples} samples",
     }
+    if report is not None:
+        rows |= report.lines()
     echo_table(rows.items())

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight to simulate along: its ground truth, rig and IMU samples."""
+"""A recorded flight to simulate along: its path, rig and IMU samples.
+
+The path of a flight with an IMU is the one that agrees with it (`imu_consistent_path.py`); of a
+bare ground-truth file it is what the file says.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,12 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData, Rig
+from slam_graph.simulation.imu_consistent_path import PathReport, consistent_path
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
+
+_MARGIN_NS = 3_000_000_000
+"""Time before and after the wanted part over which the path is made consistent with the IMU."""
 
 LEAD_NS = 100_000_000
 """Time by which motion and IMU extend beyond the first and last frame."""
@@ -28,15 +36,17 @@ class RecordedFlight:
 
     Attributes:
         path: where it was read from.
-        truth: its ground truth.
+        truth: the poses to fly along.
         rig: its sensors, or None for a bare ground-truth file.
         sequence: the recording, or None for a bare ground-truth file.
+        report: how the poses differ from the ground truth; None for a bare ground-truth file.
     """
 
     path: Path
     truth: Trajectory
     rig: Rig | None
     sequence: EurocSequence | None
+    report: PathReport | None
 
     @staticmethod
     def read(path: Path, config: SimulationConfig, diagnostics: Diagnostics) -> RecordedFlight:
@@ -58,8 +68,13 @@ class RecordedFlight:
             sequence = EurocSequence(path, ReaderOptions(diagnostics=diagnostics))
         elif config.real_imu:
             raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
-        rig = None if sequence is None else sequence.rig
-        return RecordedFlight(path, _part(truth, start_ns, end_ns, path), rig, sequence)
+        if sequence is None:
+            return RecordedFlight(path, _part(truth, start_ns, end_ns, path), None, None, None)
+        around = _part(truth, start_ns - _MARGIN_NS, end_ns + _MARGIN_NS, path)
+        imu = ImuData.concatenate(list(sequence.imu_blocks()))
+        flown, report = consistent_path(around, imu, sequence.rig.imu)
+        poses = _part(flown, start_ns, end_ns, path)
+        return RecordedFlight(path, poses, sequence.rig, sequence, report)
 
     def motion(self, smooth: SplineMotion) -> RecordedMotion:
         """The recorded poses; velocities are those of a smooth fit if none were recorded."""

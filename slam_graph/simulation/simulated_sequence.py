@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from slam_graph.datasets import (
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.simulation.imu_consistent_path import PathReport
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks, MovingBoard
 from slam_graph.simulation.motion import Motion
@@ -37,6 +39,7 @@ from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
 _SETTINGS_FILE = "simulation.yaml"
+_PATH_FILE = "recorded_path.json"
 
 Progress = Callable[[int], None]
 """Called with the time of every frame that has been written, ns."""
@@ -52,6 +55,7 @@ class Flight:
         imu: the IMU samples and their true biases.
         world: the walls.
         exposures_ns: (N,) times of the frames on the clock of the IMU.
+        report: how a recorded path was made consistent with its IMU; None if it was not.
     """
 
     rig: Rig
@@ -59,6 +63,7 @@ class Flight:
     imu: ImuSource
     world: World
     exposures_ns: IntArray
+    report: PathReport | None = None
 
 
 class SimulatedSequence(RecordedSequence):
@@ -152,6 +157,9 @@ class SimulatedSequence(RecordedSequence):
         self._write(Path(path), progress if progress is not None else _ignore)
         settings = self.config.model_dump(mode="json")
         (Path(path) / _SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+        if self.flight.report is not None:
+            report = json.dumps(self.flight.report.as_dict(), indent=2)
+            (Path(path) / _PATH_FILE).write_text(report + "\n", encoding="utf-8")
 
     @abstractmethod
     def _write(self, path: Path, progress: Progress) -> None:

@@ -140,7 +140,7 @@ def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
         motion = recorded = recording.motion(smooth)
         imu = RecordedImu(recording.samples(recorded), recorded)
     world = room_around(recording.truth.positions, config.landmarks.margin_m)
-    return Flight(rig, motion, imu, world, _exposures(motion, config))
+    return Flight(rig, motion, imu, world, _exposures(motion, config), recording.report)
 
 
 def _generated(config: SimulationConfig) -> Flight:

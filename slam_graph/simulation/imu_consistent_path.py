@@ -1,0 +1,407 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The path of a recorded flight that agrees with its IMU: ground truth and IMU in one batch.
+
+A ground truth is not the path that an IMU measured: that of a laser tracker drifts while the
+tracker has lost its prism and then jumps back, that of motion capture has gaps, and both differ
+from the IMU in orientation. A camera that is simulated along it would be teleported. So the path
+is the least-squares solution of preintegrated IMU factors (Forster et al. 2017) and the positions
+and orientations of the ground truth, in which a Cauchy loss on the positions rejects stretches
+that no motion explains (Barfoot 2017, section 5.3).
+
+The solution itself would follow every sample of the IMU, noise included, and an estimator would
+find the IMU better than it is. So white noise of the densities of the calibration is drawn and
+added to the samples first: the path is then a draw from the posterior instead of its mode, and the
+difference between recorded samples and path is white and of the size that the calibration claims
+(Papandreou and Yuille 2010, "Gaussian sampling by local perturbations").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from scipy.spatial.transform import Rotation, Slerp
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.errors import DataError
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import (
+    STANDARD_GRAVITY,
+    ImuData,
+    ImuNoise,
+    preintegrate,
+    preintegration_params,
+)
+
+_STATE_SPACING_S = 0.025
+"""Time between the states of the batch; between two of them the path is integrated."""
+
+_MEASUREMENT_SPACING_S = 0.05
+"""Time between the poses of the ground truth that are used. Errors of neighbours are alike."""
+
+_POSITION_SIGMA_M = 3e-3
+_CAUCHY_WIDTH = 3.0
+"""Standard deviation of a true position, and residual (σ) from which the Cauchy loss flattens."""
+
+_ROTATION_SIGMA_RAD = np.deg2rad(3.0)
+"""Standard deviation of a true orientation. The errors last for seconds, over which forty
+orientations count as one: together they weigh as much as one with 0.5°."""
+
+_BIAS_SIGMAS = np.array([0.3] * 3 + [0.1] * 3)
+"""Standard deviation of the first biases: accelerometer (m/s²), gyroscope (rad/s)."""
+
+_LONGEST_GAP_S = 2.5
+"""Longest gap of the ground truth that the IMU bridges."""
+
+_ITERATIONS = 15
+
+_OFFSET_ROUNDS = 10
+_OFFSET_CONVERGED_RAD = np.deg2rad(0.02)
+"""The constant rotation between truth and IMU, and the states, are estimated in turn."""
+
+JUMP_M = 5e-3
+_JUMP_TO_NOISE = 8.0
+"""The ground truth jumps where a step differs from that of the path by more than this, and by more
+than this many times the median difference."""
+
+_JUMP_REACH_S = 1.0
+"""Time around a jump that counts as disturbed by it."""
+
+_NOISE_STREAM = 20260101
+"""Seed of the noise: a recorded flight has one path, whatever the seed of the simulation."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathReport:
+    """How a consistent path differs from the ground truth and from the IMU.
+
+    Attributes:
+        jumps_ns, jumps_m: (J,) times and sizes of the jumps of the ground truth.
+        bridged_s: total length of the gaps of the ground truth.
+        position_rms_m, position_p95_m, position_max_m: distance from the ground truth where it does
+            not jump.
+        rotation_offset_rad: (3,) constant rotation path_R_truth of the body.
+        rotation_rms_rad: the rest of the difference in orientation.
+        gyro_ratio, accel_ratio: standard deviation of the recorded samples minus those of the
+            path, relative to that of white noise of the calibrated density.
+        gyro_correlation, accel_correlation: correlation of neighbouring differences.
+    """
+
+    jumps_ns: IntArray
+    jumps_m: FloatArray
+    bridged_s: float
+    position_rms_m: float
+    position_p95_m: float
+    position_max_m: float
+    rotation_offset_rad: FloatArray
+    rotation_rms_rad: float
+    gyro_ratio: float
+    accel_ratio: float
+    gyro_correlation: float
+    accel_correlation: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: lists and numbers."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        }
+
+    def lines(self) -> dict[str, str]:
+        """For people: what was found, by name."""
+        jumps = "none"
+        if len(self.jumps_m):
+            jumps = f"{len(self.jumps_m)}, the largest of {1e3 * np.max(self.jumps_m):.0f} mm"
+        offset = float(np.rad2deg(np.linalg.norm(self.rotation_offset_rad)))
+        return {
+            "jumps of the truth": jumps,
+            "path to truth": f"{1e3 * self.position_rms_m:.1f} mm rms, 95 % within "
+            f"{1e3 * self.position_p95_m:.0f} mm, {1e3 * self.position_max_m:.0f} mm at most; "
+            f"{offset:.2f} deg constant, {np.rad2deg(self.rotation_rms_rad):.2f} deg rms",
+            "gaps of the truth": f"{self.bridged_s:.1f} s bridged by the IMU",
+            "IMU to path": f"gyroscope {self.gyro_ratio:.2f}, accelerometer "
+            f"{self.accel_ratio:.2f} of the calibrated noise; correlation of neighbours "
+            f"{self.gyro_correlation:.2f}, {self.accel_correlation:.2f}",
+        }
+
+
+def consistent_path(
+    truth: Trajectory, imu: ImuData, noise: ImuNoise
+) -> tuple[Trajectory, PathReport]:
+    """The path of a flight that agrees with its IMU and is near its ground truth.
+
+    Args:
+        truth: recorded poses of the body (the IMU), at some tens per second or more.
+        imu: recorded samples; the path covers the time that both cover.
+        noise: calibrated densities of the IMU.
+
+    Returns:
+        The path at the times of the samples, with velocities and biases, and how it differs from
+        both.
+
+    Raises:
+        DataError: if they overlap for less than a second, or a gap of the truth is too long.
+    """
+    first, last = _overlap(truth, imu)
+    batch = _Batch(truth, imu[first:last], _with_noise(imu, noise)[first:last], noise)
+    offset = Rotation.identity()
+    for _ in range(_OFFSET_ROUNDS):
+        states = batch.solve(offset)
+        before, offset = offset, batch.rotation_offset(states)
+        if (before.inv() * offset).magnitude() < _OFFSET_CONVERGED_RAD:
+            break
+    path = batch.path(states)
+    return path, _report(truth, path, batch.imu, noise, offset)
+
+
+def _overlap(truth: Trajectory, imu: ImuData) -> tuple[int, int]:
+    """The first sample during the truth, and the one after the last."""
+    first = int(np.searchsorted(imu.stamps_ns, truth.stamps_ns[0]))
+    last = int(np.searchsorted(imu.stamps_ns, truth.stamps_ns[-1], side="right"))
+    if last - first < 2 or imu.stamps_ns[last - 1] - imu.stamps_ns[first] < 1_000_000_000:
+        raise DataError("ground truth and IMU overlap for less than a second")
+    gaps_s = np.diff(truth.stamps_ns) * 1e-9
+    longest = int(np.argmax(gaps_s))
+    if gaps_s[longest] > _LONGEST_GAP_S:
+        raise DataError(
+            f"the ground truth has a gap of {gaps_s[longest]:.2f} s at "
+            f"{truth.stamps_ns[longest]}, and the IMU bridges {_LONGEST_GAP_S} s; choose another "
+            "part of it (start_s, duration_s)"
+        )
+    return first, last
+
+
+class _States:
+    """Poses, velocities and biases of the batch, K of each."""
+
+    def __init__(self, values: gtsam.Values, count: int) -> None:
+        poses = [values.atPose3(X(k)) for k in range(count)]
+        self.values = values
+        self.positions = np.array([pose.translation() for pose in poses])
+        self.rotations = Rotation.from_matrix([pose.rotation().matrix() for pose in poses])
+        self.velocities = np.array([values.atVector(V(k)) for k in range(count)])
+        self.biases = np.array([values.atConstantBias(B(k)).vector() for k in range(count)])
+
+
+class _Batch:
+    """The least-squares problem over all states of a flight."""
+
+    def __init__(self, truth: Trajectory, imu: ImuData, noisy: ImuData, noise: ImuNoise) -> None:
+        self.truth = truth
+        self.imu = imu
+        self._noisy = noisy
+        self._params = preintegration_params(noise, STANDARD_GRAVITY)
+        self._seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+        every = max(1, round(_STATE_SPACING_S / float(np.median(np.diff(self._seconds)))))
+        last = len(imu) - 1
+        self._rows = np.unique(np.append(np.arange(0, last, every), last))  # samples with a state
+        self._start = self._initial()
+        self._imu_factors = self._between_states()
+        self._measured = self._used_rows()
+
+    def solve(self, offset: Rotation) -> _States:
+        """The optimum; `offset` is path_R_truth of the body."""
+        graph = gtsam.NonlinearFactorGraph(self._imu_factors)
+        graph.add(
+            gtsam.PriorFactorConstantBias(
+                B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(_BIAS_SIGMAS)
+            )
+        )
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_WIDTH)
+        position = gtsam.noiseModel.Robust.Create(
+            cauchy, gtsam.noiseModel.Isotropic.Sigma(3, _POSITION_SIGMA_M)
+        )
+        rotation = gtsam.noiseModel.Isotropic.Sigma(3, _ROTATION_SIGMA_RAD)
+        turned = (Rotation.from_quat(self.truth.quaternions) * offset.inv()).as_matrix()
+        for row, state in self._measured:
+            delay_s = self._state_times()[state] - (
+                (self.truth.stamps_ns[row] - self.imu.stamps_ns[0]) * 1e-9
+            )
+            velocity = self._start.atVector(V(state))
+            there = self.truth.positions[row] + velocity * delay_s
+            graph.add(gtsam.PoseTranslationPrior3D(X(state), there, position))
+            graph.add(gtsam.PoseRotationPrior3D(X(state), gtsam.Rot3(turned[row]), rotation))
+        parameters = gtsam.GaussNewtonParams()
+        parameters.setMaxIterations(_ITERATIONS)
+        parameters.setRelativeErrorTol(1e-4)
+        parameters.setOrderingType("COLAMD")
+        values = gtsam.GaussNewtonOptimizer(graph, self._start, parameters).optimize()
+        self._start = values
+        return _States(values, len(self._rows))
+
+    def rotation_offset(self, states: _States) -> Rotation:
+        """Mean rotation path_R_truth of the body."""
+        rows, indices = (np.array(column) for column in zip(*self._measured, strict=True))
+        truth = Rotation.from_quat(self.truth.quaternions[rows])
+        return (states.rotations[indices].inv() * truth).mean()
+
+    def path(self, states: _States) -> Trajectory:
+        """The path at all samples: integrated from each state, and led into the next one."""
+        stamps, count = self.imu.stamps_ns, len(self.imu)
+        positions, velocities = np.empty((count, 3)), np.empty((count, 3))
+        quaternions, biases = np.empty((count, 4)), np.empty((count, 6))
+        begin, end = self._rows[:-1], self._rows[1:]
+        p, v, R = states.positions[:-1], states.velocities[:-1], states.rotations[:-1]
+        bias = states.biases[:-1]
+        gravity = np.array([0.0, 0.0, -STANDARD_GRAVITY])
+        steps = [(begin, p, v, R)]
+        for step in range(int(np.max(end - begin))):
+            row = np.minimum(begin + step, end - 1)
+            live = (begin + step < end)[:, None]
+            dt = np.where(live[:, 0], self._seconds[row + 1] - self._seconds[row], 0.0)[:, None]
+            rate = 0.5 * (self._noisy.gyro[row] + self._noisy.gyro[row + 1]) - bias[:, 3:]
+            force = 0.5 * (self._noisy.accel[row] + self._noisy.accel[row + 1]) - bias[:, :3]
+            half = R * Rotation.from_rotvec(0.5 * rate * dt)
+            acceleration = half.apply(force) + gravity
+            p = p + v * dt + 0.5 * acceleration * dt**2
+            v = v + acceleration * dt
+            R = R * Rotation.from_rotvec(rate * dt)
+            steps.append((np.where(live[:, 0], begin + step + 1, end), p, v, R))
+        # what is left at the end of an interval (far below the noise) is spread evenly over it
+        missing_p, missing_v = states.positions[1:] - p, states.velocities[1:] - v
+        missing_r = (R.inv() * states.rotations[1:]).as_rotvec()
+        for rows, p, v, R in steps:
+            share = ((self._seconds[rows] - self._seconds[begin]) / self._durations())[:, None]
+            positions[rows], velocities[rows] = p + share * missing_p, v + share * missing_v
+            quaternions[rows] = (R * Rotation.from_rotvec(share * missing_r)).as_quat()
+            biases[rows] = (1.0 - share) * bias + share * states.biases[1:]
+        return Trajectory(
+            stamps,
+            positions,
+            quaternions,
+            velocities,
+            accel_biases=biases[:, :3],
+            gyro_biases=biases[:, 3:],
+        )
+
+    def _durations(self) -> FloatArray:
+        return np.diff(self._state_times())
+
+    def _state_times(self) -> FloatArray:
+        times: FloatArray = self._seconds[self._rows]
+        return times
+
+    def _initial(self) -> gtsam.Values:
+        """States from the ground truth: interpolated poses, velocities of its central parts."""
+        at = self._state_times()
+        seconds = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9
+        columns = self.truth.positions.T
+        positions = np.stack([np.interp(at, seconds, column) for column in columns], axis=1)
+        ahead, behind = at + _STATE_SPACING_S, at - _STATE_SPACING_S
+        velocities = np.stack(
+            [
+                (np.interp(ahead, seconds, column) - np.interp(behind, seconds, column))
+                / (np.clip(ahead, *seconds[[0, -1]]) - np.clip(behind, *seconds[[0, -1]]))
+                for column in columns
+            ],
+            axis=1,
+        )
+        rotations = Slerp(seconds, Rotation.from_quat(self.truth.quaternions))(at).as_matrix()
+        values = gtsam.Values()
+        for k in range(len(at)):
+            values.insert(X(k), gtsam.Pose3(gtsam.Rot3(rotations[k]), positions[k]))
+            values.insert(V(k), velocities[k])
+            values.insert(B(k), gtsam.imuBias.ConstantBias())
+        return values
+
+    def _between_states(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        zero = gtsam.imuBias.ConstantBias()
+        for k, (first, last) in enumerate(zip(self._rows[:-1], self._rows[1:], strict=True)):
+            pim = preintegrate(self._noisy[int(first) : int(last) + 1], zero, self._params)
+            keys = X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1)
+            graph.add(gtsam.CombinedImuFactor(*keys, pim))
+        return graph
+
+    def _used_rows(self) -> list[tuple[int, int]]:
+        """Poses of the ground truth that are measurements, each with the nearest state."""
+        seconds, at = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9, self._state_times()
+        wanted = np.arange(at[0], at[-1], _MEASUREMENT_SPACING_S)
+        rows = np.unique(np.searchsorted(seconds, wanted).clip(0, len(seconds) - 1))
+        after = np.searchsorted(at, seconds[rows]).clip(1, len(at) - 1)
+        nearest = after - (seconds[rows] - at[after - 1] < at[after] - seconds[rows])
+        near = np.abs(at[nearest] - seconds[rows]) <= 0.5 * _STATE_SPACING_S
+        return list(zip(rows[near].tolist(), nearest[near].tolist(), strict=True))
+
+
+def _with_noise(imu: ImuData, noise: ImuNoise) -> ImuData:
+    """The samples with white noise of the calibrated densities added."""
+    rng = np.random.default_rng(_NOISE_STREAM)
+    root_rate = 1.0 / float(np.sqrt(np.median(np.diff(imu.stamps_ns)) * 1e-9))
+    gyro = rng.normal(size=imu.gyro.shape) * noise.gyro_noise_density * root_rate
+    accel = rng.normal(size=imu.accel.shape) * noise.accel_noise_density * root_rate
+    return ImuData(imu.stamps_ns, imu.gyro + gyro, imu.accel + accel)
+
+
+def _report(
+    truth: Trajectory, path: Trajectory, imu: ImuData, noise: ImuNoise, offset: Rotation
+) -> PathReport:
+    seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
+    at = (truth.stamps_ns - path.stamps_ns[0]) * 1e-9
+    inside = (at >= seconds[0]) & (at <= seconds[-1])
+    stamps, at = truth.stamps_ns[inside], at[inside]
+    flown = np.stack([np.interp(at, seconds, column) for column in path.positions.T], axis=1)
+    difference = truth.positions[inside] - flown
+    steps = np.linalg.norm(np.diff(difference, axis=0), axis=1)
+    dense = np.diff(at) < 2.0 * np.median(np.diff(at))
+    jumps = np.flatnonzero((steps > max(JUMP_M, _JUMP_TO_NOISE * float(np.median(steps)))) & dense)
+    calm = ~_near(at, at[jumps])
+    distance = np.linalg.norm(difference, axis=1)[calm]
+    turned = Rotation.from_quat(truth.quaternions[inside]) * offset.inv()
+    rotations = Slerp(seconds, Rotation.from_quat(path.quaternions))(at)
+    wander = (turned.inv() * rotations).magnitude()[calm]
+    gyro, accel = _differences(path, imu)
+    root_rate = 1.0 / float(np.sqrt(np.median(np.diff(seconds))))
+    gaps = np.diff(at)[np.diff(at) > 0.1]
+    return PathReport(
+        stamps[jumps],
+        steps[jumps],
+        float(np.sum(gaps)),
+        float(np.sqrt(np.mean(distance**2))),
+        float(np.percentile(distance, 95)),
+        float(np.max(distance)),
+        offset.as_rotvec(),
+        float(np.sqrt(np.mean(wander**2))),
+        float(np.std(gyro)) / (noise.gyro_noise_density * root_rate),
+        float(np.std(accel)) / (noise.accel_noise_density * root_rate),
+        _neighbours(gyro),
+        _neighbours(accel),
+    )
+
+
+def _near(times: FloatArray, events: FloatArray) -> BoolArray:
+    near = np.zeros(len(times), dtype=bool)
+    for event in events:
+        near |= np.abs(times - event) < _JUMP_REACH_S
+    return near
+
+
+def _differences(path: Trajectory, imu: ImuData) -> tuple[FloatArray, FloatArray]:
+    """Recorded rates and specific forces minus those of the path and its biases, (N - 1, 3).
+
+    Between two samples the mean rate of the path is compared with the mean of the samples. As
+    neighbouring means share a sample, every second one is taken.
+    """
+    assert path.velocities is not None
+    assert path.gyro_biases is not None
+    assert path.accel_biases is not None
+    rotations, dt = Rotation.from_quat(path.quaternions), np.diff(path.stamps_ns)[:, None] * 1e-9
+    turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
+    gyro = 0.5 * (imu.gyro[1:] + imu.gyro[:-1]) - path.gyro_biases[:-1] - turn / dt
+    acceleration = np.diff(path.velocities, axis=0) / dt + [0.0, 0.0, STANDARD_GRAVITY]
+    half = rotations[:-1] * Rotation.from_rotvec(0.5 * turn)
+    force = half.inv().apply(acceleration)
+    accel = 0.5 * (imu.accel[1:] + imu.accel[:-1]) - path.accel_biases[:-1] - force
+    # the mean of two samples has half the variance of one
+    return np.sqrt(2.0) * gyro[::2], np.sqrt(2.0) * accel[::2]
+
+
+def _neighbours(values: FloatArray) -> float:
+    """Correlation of neighbouring rows of (N, 3), over the columns."""
+    centred = values - values.mean(axis=0)
+    return float(np.sum(centred[1:] * centred[:-1]) / np.sum(centred**2))

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The path of a recorded flight agrees with its IMU, and is near its ground truth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam_graph.datasets import read_groundtruth
+from slam_graph.errors import DataError
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import ImuData
+from slam_graph.simulation import simulate
+from slam_graph.simulation.imu_consistent_path import PathReport, consistent_path
+from slam_graph.simulation.simulated_sequence import Flight
+
+JUMP_AT_S, DRIFT_S, JUMP_M = 12.0, 1.5, 0.08
+OFFSET_RAD = np.deg2rad(1.0)
+
+
+def flown() -> tuple[Flight, Trajectory, ImuData]:
+    """A flight of 25 s, its exact path at 200 Hz, and its noisy IMU."""
+    sequence = simulate(trajectory="figure8", duration_s=25.0, seed=3)
+    flight = sequence.flight
+    stamps = np.arange(flight.motion.start_ns, flight.motion.end_ns, 5_000_000, dtype=np.int64)
+    path = Trajectory(
+        stamps, flight.motion.positions(stamps), flight.motion.rotations(stamps).as_quat()
+    )
+    return flight, path, ImuData.concatenate(list(sequence.imu_blocks()))
+
+
+def as_tracked(path: Trajectory) -> Trajectory:
+    """The path as a tracker reports it: noise, a drift that ends in a jump, a turned body."""
+    rng = np.random.default_rng(100)
+    seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
+    drift = np.clip((seconds - JUMP_AT_S + DRIFT_S) / DRIFT_S, 0.0, None)
+    drift[seconds >= JUMP_AT_S] = 0.0
+    positions = path.positions + rng.normal(size=path.positions.shape) * 1e-3
+    positions[:, 0] += JUMP_M * drift
+    turned = Rotation.from_quat(path.quaternions) * Rotation.from_rotvec([OFFSET_RAD, 0.0, 0.0])
+    return Trajectory(path.stamps_ns, positions, turned.as_quat())
+
+
+def distances(path: Trajectory, found: Trajectory) -> NDArray[np.float64]:
+    """Of the positions at the times of `found`, m."""
+    columns = [np.interp(found.stamps_ns, path.stamps_ns, column) for column in path.positions.T]
+    return np.asarray(np.linalg.norm(np.stack(columns, axis=1) - found.positions, axis=1))
+
+
+def imu_is_honest(report: PathReport) -> bool:
+    """Whether recorded samples minus those of the path are white and of the calibrated size."""
+    white = max(abs(report.gyro_correlation), abs(report.accel_correlation)) < 0.1
+    return white and all(0.9 < ratio < 1.1 for ratio in (report.gyro_ratio, report.accel_ratio))
+
+
+def test_drift_and_jump_of_the_truth_are_found_and_not_flown() -> None:
+    flight, path, imu = flown()
+    found, report = consistent_path(as_tracked(path), imu, flight.rig.imu)
+    seconds = (found.stamps_ns - found.stamps_ns[0]) * 1e-9
+    assert len(report.jumps_ns) == 1
+    assert report.jumps_m[0] == pytest.approx(JUMP_M, abs=5e-3)
+    assert np.rad2deg(np.linalg.norm(report.rotation_offset_rad)) == pytest.approx(1.0, abs=0.1)
+    assert imu_is_honest(report)
+    error = distances(path, found)
+    drifting = (seconds > JUMP_AT_S - DRIFT_S - 1.0) & (seconds < JUMP_AT_S + 1.0)
+    assert np.max(error[~drifting]) < 5e-3
+    assert np.max(error[drifting]) < 0.4 * JUMP_M
+    assert found.velocities is not None
+    exact = flight.motion.velocities(found.stamps_ns)
+    assert np.sqrt(np.mean((found.velocities - exact) ** 2)) < 0.02
+
+
+def test_gaps_of_the_truth_are_bridged_by_the_imu() -> None:
+    flight, path, imu = flown()
+    seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
+    rows = (seconds < 8.0) | (seconds > 10.0)
+    tracked = as_tracked(path)
+    gappy = Trajectory(tracked.stamps_ns[rows], tracked.positions[rows], tracked.quaternions[rows])
+    found, report = consistent_path(gappy, imu, flight.rig.imu)
+    assert report.bridged_s == pytest.approx(2.0, abs=0.02)
+    at = (found.stamps_ns - found.stamps_ns[0]) * 1e-9
+    assert np.max(distances(path, found)[(at > 8.0) & (at < 10.0)]) < 0.02
+
+
+def test_what_cannot_be_joined_is_an_error() -> None:
+    flight, path, imu = flown()
+    seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
+    rows = (seconds < 8.0) | (seconds > 12.0)
+    gappy = Trajectory(path.stamps_ns[rows], path.positions[rows], path.quaternions[rows])
+    with pytest.raises(DataError, match=r"a gap of 4\.\d\d s"):
+        consistent_path(gappy, imu, flight.rig.imu)
+    later = replace(path, stamps_ns=path.stamps_ns + 3600 * 10**9)
+    with pytest.raises(DataError, match="overlap for less than a second"):
+        consistent_path(later, imu, flight.rig.imu)
+
+
+@pytest.mark.data
+def test_a_machine_hall_flight_has_no_jumps(data_dir: Path) -> None:
+    """The truth of MH_04 jumps by up to 130 mm; the path that is flown does not."""
+    flight = simulate(
+        trajectory=str(data_dir / "euroc_inertial" / "MH_04_difficult"),
+        real_imu=True,
+        start_s=38.0,
+        duration_s=12.0,
+    ).flight
+    report = flight.report
+    assert report is not None
+    assert len(report.jumps_ns) == 2
+    assert np.max(report.jumps_m) == pytest.approx(0.13, abs=5e-3)
+    assert imu_is_honest(report)
+    assert report.position_p95_m < 0.02
+    raw = read_groundtruth(data_dir / "euroc_inertial" / "MH_04_difficult")
+    stamps = np.arange(flight.motion.start_ns, flight.motion.end_ns, 5_000_000, dtype=np.int64)
+    steps = np.diff(flight.motion.positions(stamps), axis=0)
+    change = np.linalg.norm(np.diff(steps, axis=0), axis=1)
+    assert np.max(change) < 30.0 * 0.005**2  # no acceleration beyond 30 m/s²
+    assert np.max(distances(raw, flight.motion.at(stamps))) < 0.2  # type: ignore[attr-defined]
