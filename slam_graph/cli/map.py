@@ -149,19 +149,12 @@ def export(
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
-    from slam_graph.results import export_ply, export_tum, load_map, refuse_to_replace
+    from slam_graph.results import export_map, load_map
 
     if ply is None and tum is None:
         raise ConfigError("nothing to write: give --ply FILE, --tum FILE, or both")
-    content = load_map(path)
-    if ply is not None and tum is not None:
-        refuse_to_replace(tum, force)
-    if ply is not None:
-        export_ply(content, ply, force)
-        typer.echo(str(ply))
-    if tum is not None:
-        for file in export_tum(content, tum, force):
-            typer.echo(str(file))
+    for file in export_map(load_map(path), ply, tum, force):
+        typer.echo(str(file))
 
 
 @app.command()

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import typer
 from pydantic import BaseModel
 
-from slam_graph.cli.console import remove_if_empty
-
 if TYPE_CHECKING:
     from slam_graph.datasets import RecordedSequence
 
@@ -156,17 +154,12 @@ def write_result(
     result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
     """Write all files into a new folder, named after the problem."""
-    from slam_graph.results import create_run_folder, link_latest, write_text
+    from slam_graph.results import ResultFolder
 
-    folder = create_run_folder(output, name)
-    try:
-        files = [*result.save(folder), folder / "run.log"]
-        write_text(files[-1], log)
-        link_latest(folder)
-    except BaseException:
-        remove_if_empty(folder)
-        raise
-    return folder, files
+    with ResultFolder.of_run(output, name) as made:
+        made.files += result.save(made.folder)
+        made.text("run.log", log)
+    return made.folder, made.files
 
 
 @contextmanager

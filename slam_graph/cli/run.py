@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.console import (
-    ProgressBar,
-    collected_log,
-    echo_json,
-    echo_table,
-    number,
-    remove_if_empty,
-)
+from slam_graph.cli.console import ProgressBar, collected_log, echo_json, echo_table, number
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -305,11 +298,10 @@ def execute(
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
     from slam_graph.pipeline import run as run_pipeline
-    from slam_graph.results import create_run_folder, link_latest, write_text
+    from slam_graph.results import ResultFolder
 
-    folder = create_run_folder(output, sequence.info().name)
-    try:
-        viewer = _viewer(rerun, folder, sequence.info().name)
+    with ResultFolder.of_run(output, sequence.info().name) as made:
+        viewer = _viewer(rerun, made.folder, sequence.info().name)
         with _progress(sequence, settings, progress) as bar:
             result = run_pipeline(
                 sequence,
@@ -319,16 +311,11 @@ def execute(
                 known_map=known_map,
                 graph_times=graph_times,
             )
-        files = result.save(folder)
+        made.files += result.save(made.folder)
         if rerun == "save":
-            files.append(folder / "recording.rrd")
-        files.append(folder / "run.log")
-        write_text(files[-1], log)
-        link_latest(folder)
-    except BaseException:
-        remove_if_empty(folder)
-        raise
-    return result, folder, files
+            made.path("recording.rrd")
+        made.text("run.log", log)
+    return result, made.folder, made.files
 
 
 def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:

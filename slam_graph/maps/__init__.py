@@ -4,7 +4,7 @@
 
 `map_building.py` (`build_map`) makes a `SlamMap` (`map_model.py`) of the keyframes of a run,
 `map_file.py` reads and writes it, `map_localization.py` (`MapLocalizer`) localizes a run in it, and
-`map_merge.py` (`merge_maps`) merges two. Settings are in `map_config.py`.
+`map_merge.py` (`merge_maps`) merges two. Settings are in `map_model.py`.
 """
 
 from typing import TYPE_CHECKING
@@ -15,10 +15,7 @@ __all__ = [
     "LocalizationConfig",
     "MapConfig",
     "MapLocalizer",
-    "MapPlaces",
-    "MapPoseFilter",
     "MapRecording",
-    "PoseSource",
     "SlamMap",
     "build_map",
     "merge_maps",
@@ -29,31 +26,25 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.maps.map_building import build_map
     from slam_graph.maps.map_file import read_map, write_map
-    from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter
+    from slam_graph.maps.map_localization import MapLocalizer
     from slam_graph.maps.map_merge import merge_maps
-    from slam_graph.maps.map_model import (
-        LocalizationConfig,
-        MapConfig,
-        MapRecording,
-        PoseSource,
-        SlamMap,
-    )
-    from slam_graph.maps.map_places import MapPlaces
+    from slam_graph.maps.map_model import LocalizationConfig, MapConfig, MapRecording, SlamMap
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "map_building": ("build_map",),
-            "map_file": ("read_map", "write_map"),
-            "map_localization": ("MapLocalizer", "MapPoseFilter"),
+            "map_file": (
+                "read_map",
+                "write_map",
+            ),
+            "map_localization": ("MapLocalizer",),
             "map_merge": ("merge_maps",),
             "map_model": (
                 "LocalizationConfig",
                 "MapConfig",
                 "MapRecording",
-                "PoseSource",
                 "SlamMap",
             ),
-            "map_places": ("MapPlaces",),
         },
     )
