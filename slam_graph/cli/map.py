@@ -28,6 +28,7 @@ from slam_graph.cli.options import (
     Sources,
     Start,
     open_recording,
+    run_settings,
 )
 from slam_graph.cli.run import execute, report
 
@@ -70,19 +71,19 @@ def localize(
     Runs like `slam-graph run`, and also writes the causal pose of every frame in the map to
     trajectory_map.tum, once the place is recognised. The exit code is 3 if it never is.
     """
-    from slam_graph.config import load_config
     from slam_graph.errors import EstimationError
     from slam_graph.results import find_map, load_map
 
-    options: dict[str, Any] = {
-        "algorithm": algorithm,
-        "cameras": cameras,
-        "start_s": start,
-        "duration_s": duration,
-    }
-    if final_ba is not None or config is None:
-        options["final_ba"] = {"enabled": bool(final_ba)}
-    settings = load_config(config, set_ or (), **options, seed=seed)
+    settings = run_settings(
+        config,
+        set_,
+        {"final_ba": bool(final_ba) if config is None else final_ba},
+        algorithm=algorithm,
+        cameras=cameras,
+        start_s=start,
+        duration_s=duration,
+        seed=seed,
+    )
     path = find_map(map_)
     known = load_map(path)
     with collected_log() as log:

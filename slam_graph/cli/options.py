@@ -14,6 +14,7 @@ import typer
 from pydantic import BaseModel
 
 if TYPE_CHECKING:
+    from slam_graph.config import RunConfig
     from slam_graph.datasets import RecordedSequence
 
 
@@ -110,6 +111,26 @@ def open_recording(
         groundtruth=groundtruth,
         sources=_sources_from(sources),
     )
+
+
+def run_settings(
+    config: Path | None,
+    overrides: list[str] | None,
+    parts: Mapping[str, bool | None],
+    **options: Any,
+) -> RunConfig:
+    """The settings of a run.
+
+    Args:
+        config: YAML file, if there is one.
+        overrides: `key=value` each.
+        parts: whether each part of a run is enabled, by its table; None changes nothing.
+        options: top-level settings; None changes nothing.
+    """
+    from slam_graph.config import load_config
+
+    tables = {name: {"enabled": on} for name, on in parts.items() if on is not None}
+    return load_config(config, overrides or (), **options, **tables)
 
 
 _Policy = TypeVar("_Policy", bound=BaseModel)

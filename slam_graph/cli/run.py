@@ -33,6 +33,7 @@ from slam_graph.cli.options import (
     Sources,
     Start,
     open_recording,
+    run_settings,
 )
 
 if TYPE_CHECKING:
@@ -232,21 +233,16 @@ def run(
 
     The newest results are also found under OUTPUT/<dataset>/latest.
     """
-    from slam_graph.config import load_config
-
-    options: dict[str, Any] = {
-        "algorithm": algorithm,
-        "cameras": cameras,
-        "start_s": start,
-        "duration_s": duration,
-    }
-    if final_ba is not None:
-        options["final_ba"] = {"enabled": final_ba}
-    if loop_closure is not None:
-        options["loop_closure"] = {"enabled": loop_closure}
-    if save_map is not None:
-        options["map"] = {"enabled": save_map}
-    settings = load_config(config, set_ or (), **options, seed=seed)
+    settings = run_settings(
+        config,
+        set_,
+        {"final_ba": final_ba, "loop_closure": loop_closure, "map": save_map},
+        algorithm=algorithm,
+        cameras=cameras,
+        start_s=start,
+        duration_s=duration,
+        seed=seed,
+    )
     with collected_log() as log:
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras

@@ -42,8 +42,8 @@ class LocalizationConfig(Settings):
         "agreeing": "is a constant now: MIN_CONSISTENT in maps/map_localization.py",
         "patience": "is a constant now: MAX_REJECTED in maps/map_localization.py",
         "memory": "is a constant now: MAX_PENDING in maps/map_localization.py",
-        "confidence": "is a constant now: CONFIDENCE in maps/pose_filter.py",
-        "tilt_sigma": "is a constant now: TILT_SIGMA in maps/pose_filter.py",
+        "confidence": "is a constant now: CONFIDENCE in maps/map_localization.py",
+        "tilt_sigma": "is a constant now: TILT_SIGMA in maps/map_localization.py",
     }
 
     period_s: float = expert(0.2, ge=0)
