@@ -16,7 +16,7 @@ grows, the weights separate into 0 and 1 at the χ² bound. There are two differ
 
 - There is one Gauss-Newton step between two updates of the weights, and edges of zero weight are
   left out of it, which keeps the problem sparse.
-- Where loop closures confirm each other (`loop_consistency.py`), the first poses are the optimum of
+- Where loop closures confirm each other, the first poses are the optimum of
   these alone, and μ starts larger. From odometry, hundreds of false loop closures would lead into
   wrong minima.
 """

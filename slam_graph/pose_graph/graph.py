@@ -146,9 +146,9 @@ class PoseGraph:
 
     @cached_property
     def precisions(self) -> tuple[FloatArray, FloatArray]:
-        """Isotropic precisions (M,) that fit the information best, as in SE-Sync (`chordal.py`).
+        """Isotropic precisions (M,) that fit the information best, as in SE-Sync.
 
-        κ of the rotations and τ of the translations.
+        κ of the rotations and τ of the translations, for `graph_initialization.py`.
         """
         d, information = self.dimension, self.angle_information
         τ = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)

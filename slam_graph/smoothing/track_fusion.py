@@ -6,8 +6,8 @@ A front end gives a point a new identity each time its track starts again, after
 platform returns. Where the point of one track is projected near the observations of another, the
 two may be the same. Descriptors are not used, so the poses must be accurate to a few pixels. Tracks
 that follow each other closely must match up to noise; tracks of an earlier visit must match up to a
-drift that is common to the features of that visit (`drift_consensus.py`). Features that are seen in
-the same frame are different points.
+drift that is common to the features of that visit (`projected_matches.py`). Features that are seen
+in the same frame are different points.
 
 Fusion alternates with a loose bundle adjustment of every second keyframe: fused features reduce the
 drift of the poses, and with better poses more features are found to be the same. Each round starts

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which features enter the cost of a step with all of their observations, and where they are.
 
-The feature policy asks for some (`feature_policies.py`). Beside them, features with long tracks and
-a well-known depth become variables of the state while there is room.
+The feature policy asks for some (`selection_policies.py`). Beside them, features with long tracks
+and a well-known depth become variables of the state while there is room.
 """
 
 from __future__ import annotations
