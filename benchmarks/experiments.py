@@ -19,7 +19,7 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.experiment.comparison_plan import Comparison, load_configs, run_tasks
 from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
-from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Source, Task
+from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Source
 
 RESULTS = Path("results/benchmarks")
 
@@ -83,6 +83,6 @@ def _bad_endings(tasks: Iterable[RunTask]) -> Iterable[str]:
             yield f"{task.name}: {metrics['status']}: {metrics['message']}"
 
 
-def _tell(task: Task, failure: str | None, count: int, total: int) -> None:
+def _tell(task: str, failure: str | None, count: int, total: int) -> None:
     ending = "" if failure is None else f": failed: {failure}"
-    print(f"  {count}/{total} {task.name}{ending}", file=sys.stderr, flush=True)
+    print(f"  {count}/{total} {task}{ending}", file=sys.stderr, flush=True)

@@ -14,7 +14,7 @@ from benchmarks.metric import QUANTISED_TOLERANCE, TIMING_TOLERANCE, Metric, inf
 from benchmarks.speed_worker import Watch, time_flow
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.evaluation.track_quality import TrackQuality, TrackSummary
+from slam_graph.experiment.track_quality import TrackQuality, TrackSummary
 from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.sensors.measurements import CameraFrame
 

@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slam_graph.config import load_config
@@ -17,12 +16,11 @@ from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.choices import PoseRelation
-from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
+from slam_graph.pipeline.observers import NullViewer
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-from slam_graph.visualization.viewer import NullViewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,4 +152,4 @@ def within(trajectory: Trajectory, span: Trajectory) -> Trajectory:
     """The part of a trajectory between the first and the last pose of another."""
     stamps = trajectory.stamps_ns
     inside = (stamps >= span.stamps_ns[0]) & (stamps <= span.stamps_ns[-1])
-    return select(trajectory, np.flatnonzero(inside))
+    return trajectory.select(inside)

@@ -26,10 +26,9 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions
-from slam_graph.pipeline.observers import NullProgress
+from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
-from slam_graph.visualization.viewer import NullViewer
 
 CAMERAS = 2
 

@@ -5,7 +5,7 @@
 import gtsam
 import numpy as np
 
-from slam_graph.loop_closure.loop_config import PlaceConfig, VerificationConfig
+from slam_graph.loop_closure.loop_config import LoopClosureConfig, PlaceConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.maps.map_building import build_map
 from slam_graph.maps.map_model import MapRecording, SlamMap
@@ -15,7 +15,7 @@ from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import euroc_rig, simulate
 
-PLACES = PlaceConfig(words=50)
+CONFIG = LoopClosureConfig(places=PlaceConfig(words=50))
 SPACING_M = 0.5
 
 
@@ -64,8 +64,7 @@ class World:
             Poses.from_gtsam([k.world_T_body for k in keyframes]),
             MapRecording("wall", "causal", self.rig),
             [],
-            PLACES,
-            VerificationConfig(),
+            CONFIG,
         )
 
 

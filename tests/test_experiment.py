@@ -310,7 +310,7 @@ def test_compare_from_python(tmp_path: Path) -> None:
         ["sim:figure8"],
         ["swf"],
         seeds=[4, 5],
-        progress=lambda task, *_: told.append(task.name),
+        progress=lambda task, *_: told.append(task),
         **arguments,
     )
     assert second.skipped == 2

@@ -17,7 +17,6 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.absolute_pose_error import ape
-from slam_graph.evaluation.truth_pairing import select
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
@@ -69,7 +68,7 @@ class Kept:
         truth = self.sequence.groundtruth()
         at = np.searchsorted(truth.stamps_ns, self.log.frames_ns)
         np.testing.assert_array_equal(truth.stamps_ns[at], self.log.frames_ns)
-        return select(truth, at)
+        return truth.select(at)
 
     def adjusted(
         self, causal: Trajectory, config: FinalBaConfig = DEFAULT, report: Any = None
@@ -135,7 +134,7 @@ def test_wide_lenses_are_solved(keep: Keep, camera: Camera, tmp_path: Path) -> N
 
 def test_the_time_before_the_start_is_covered(keep: Keep) -> None:
     kept = keep(flight())
-    late = select(disturbed(kept.truth), np.arange(len(kept.truth) // 2, len(kept.truth)))
+    late = disturbed(kept.truth).select(np.arange(len(kept.truth) // 2, len(kept.truth)))
     result = kept.adjusted(late)
     np.testing.assert_array_equal(result.trajectory.stamps_ns, kept.log.frames_ns)
     offset = result.trajectory.positions[len(kept.truth) // 2] - late.positions[0]

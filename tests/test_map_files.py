@@ -20,7 +20,7 @@ from map_flights import World
 from slam_graph.errors import DataError
 from slam_graph.maps.map_file import ARRAYS, arrays_of, read_map
 from slam_graph.maps.map_model import SlamMap
-from slam_graph.results.map_output import MAP_NAME, export_ply, export_tum, load_map, save_map
+from slam_graph.results.map_output import MAP_NAME, export_map, load_map, save_map
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +70,11 @@ def test_nothing_is_replaced_unless_it_is_said(small: SlamMap, file: Path) -> No
     assert file.read_bytes() != before
     with pytest.raises(DataError, match="folder"):
         save_map(small, file.parent, force=True)
-    for export in (export_ply, export_tum):
+    new = file.with_name("new")
+    for ply, tum in ((file, None), (None, file), (new, file)):
         with pytest.raises(DataError, match="--force"):
-            export(small, file)
+            export_map(small, ply, tum)
+    assert not new.exists()
 
 
 def test_a_crash_while_saving_leaves_the_old_map(file: Path) -> None:
@@ -289,14 +291,14 @@ def test_no_damage_does_more_than_raise(file: Path) -> None:
 
 
 def test_exports_hold_points_and_poses(small: SlamMap, tmp_path: Path) -> None:
-    export_ply(small, tmp_path / "a.ply")
+    export_map(small, ply=tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()
     header, _, body = content.partition(b"end_header\n")
     count = len(small.points) + len(small)
     assert f"element vertex {count}".encode() in header
     vertices = np.frombuffer(body, [("place", "<f8", 3), ("colour", "u1", 3)])
     np.testing.assert_array_equal(vertices["place"][: len(small.points)], small.points)
-    assert export_tum(small, tmp_path / "a.tum") == [tmp_path / "a.tum"]
+    assert export_map(small, tum=tmp_path / "a.tum") == [tmp_path / "a.tum"]
     rows = np.loadtxt(tmp_path / "a.tum")
     np.testing.assert_allclose(rows[:, 1:4], small.poses.translations, atol=1e-9)
     two = replace(
@@ -304,5 +306,5 @@ def test_exports_hold_points_and_poses(small: SlamMap, tmp_path: Path) -> None:
         recordings=small.recordings * 2,
         recording_of=np.array([0, 0, 0, 1, 1]),
     )
-    files = export_tum(two, tmp_path / "b.tum")
+    files = export_map(two, tum=tmp_path / "b.tum")
     assert [path.name for path in files] == ["b_0.tum", "b_1.tum"]

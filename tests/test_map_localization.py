@@ -10,7 +10,7 @@ import pytest
 from map_flights import World
 
 from slam_graph.errors import DataError
-from slam_graph.loop_closure.loop_config import VerificationConfig
+from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter, with_roll_and_pitch
 from slam_graph.maps.map_model import LocalizationConfig
 from slam_graph.maps.map_places import MapPlaces
@@ -96,8 +96,7 @@ def world() -> World:
 
 def localizer(world: World, **changes: float) -> MapLocalizer:
     config = CONFIG.model_copy(update={"period_s": 0.0, **changes})
-    places = MapPlaces(world.map(), world.rig, VerificationConfig(), config.neighbours)
-    return MapLocalizer(places, config)
+    return MapLocalizer(world.map(), world.rig, LoopClosureConfig(), config)
 
 
 ODOM_T_MAP = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([30.0, -7.0, 4.0]))
@@ -134,7 +133,7 @@ def test_the_calibration_of_the_map_does_not_matter(world: World) -> None:
     strange = replace(strange, rig=replace(strange.rig, cameras=(camera,)))
     poses = []
     for content in (known, replace(known, recordings=(strange,))):
-        places = MapPlaces(content, world.rig, VerificationConfig(), 10)
+        places = MapPlaces(content, world.rig, LoopClosureConfig(), 10)
         match = places.locate(world.view(2), 1, gravity=True)
         assert match is not None
         poses.append(match.world_T_body)
@@ -207,6 +206,6 @@ def test_it_is_lost_when_nothing_has_been_seen_for_long(world: World) -> None:
 
 
 def test_descriptors_of_another_kind_are_refused(world: World) -> None:
-    places = MapPlaces(world.map(), world.rig, VerificationConfig(), 10)
+    places = MapPlaces(world.map(), world.rig, LoopClosureConfig(), 10)
     with pytest.raises(DataError, match=r"flight.*512 bits.*256"):
         places.check(np.zeros((3, 64), np.uint8), "flight")

@@ -7,15 +7,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from map_flights import PLACES, World
+from map_flights import CONFIG, World
 
 from slam_graph.errors import EstimationError
-from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.maps.map_merge import MIN_LINKS, merge_maps
 from slam_graph.maps.map_model import LocalizationConfig, SlamMap
 from slam_graph.pose_graph.graph import Poses
 
-LOOPS, LOCALIZATION = LoopClosureConfig(places=PLACES), LocalizationConfig()
+LOOPS, LOCALIZATION = CONFIG, LocalizationConfig()
 MOVE = gtsam.Pose3(gtsam.Rot3.Rz(2.5), np.array([20.0, -5.0, 1.0]))
 
 

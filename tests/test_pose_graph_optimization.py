@@ -15,7 +15,7 @@ from slam_graph.pose_graph.graph import Poses
 from slam_graph.pose_graph.graph_cost import chi2_table
 from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.pose_graph.graph_initialization import along_tree, chordal_cost, initialize
-from slam_graph.pose_graph.optimize import marginal_covariances, optimize_pose_graph
+from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.pose_graph.pose_graph_policy import (
     PoseGraphCostPolicy,
     PoseGraphPolicy,
@@ -120,7 +120,7 @@ def test_parts_and_lonely_poses_are_held_where_they_are(method: str) -> None:
     solution = optimize_pose_graph(cut, by(method))
     np.testing.assert_allclose(solution.poses.translations[60], [7.0, 7.0], atol=1e-12)
     assert distance(solution.poses, lonely) < 1.0
-    covariances = marginal_covariances(solution)
+    covariances = solution.covariances()
     assert np.abs(covariances[[0, 30, 60]]).max() == 0.0
 
 
@@ -128,7 +128,7 @@ def test_parts_and_lonely_poses_are_held_where_they_are(method: str) -> None:
 def test_covariance_of_odometry_is_that_of_its_edge(dimension: int) -> None:
     graph, _ = laps(dimension, 0.05, poses=3, lap=3)
     solution = optimize_pose_graph(graph)
-    covariances = marginal_covariances(solution)
+    covariances = solution.covariances()
     np.testing.assert_allclose(covariances[1], np.linalg.inv(graph.information[0]), atol=1e-9)
     assert np.linalg.eigvalsh(covariances[2] - covariances[1]).min() > -1e-6
 

@@ -16,10 +16,11 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState, Trajectory
+from slam_graph.pipeline.tracking import Stopwatch
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, finite
-from slam_graph.results.result_files import appearing, create_run_folder, link_latest, write_text
-from slam_graph.results.run_logs import Stopwatch, TimingLog, milliseconds
+from slam_graph.results.result_files import ResultFolder, appearing, write_text
+from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_result import RunInput, RunResult
 from slam_graph.results.saved_run import load_result
 from slam_graph.sensors.rig import Rig
@@ -46,29 +47,50 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_run_folders_never_collide_and_latest_follows(tmp_path: Path) -> None:
-    first, second = (create_run_folder(tmp_path, "data", NOON) for _ in range(2))
+    link, folders = tmp_path / "data" / "latest", []
+    for _ in range(2):
+        with ResultFolder.of_run(tmp_path, "data", NOON) as made:
+            folders.append(made.folder)
+            made.text("a.txt", ["a\n"])
+        assert link.resolve() == made.folder.resolve()
+        assert not link.readlink().is_absolute()
+    first, second = folders
     assert first.name == "2026-03-04T12-00-00Z"
     assert first != second
-    for folder in (first, second):
-        link = link_latest(folder)
-        assert link.resolve() == folder.resolve()
-        assert not link.readlink().is_absolute()
     assert sorted(p.name for p in (tmp_path / "data").iterdir()) == sorted(
         [first.name, second.name, "latest"]
     )
 
 
+def test_a_run_that_fails_leaves_what_it_has_written_and_no_link(tmp_path: Path) -> None:
+    def fail(*names: str) -> None:
+        with ResultFolder.of_run(tmp_path, "data", NOON) as made:
+            for name in names:
+                made.text(name, [])
+            raise RuntimeError("crash")
+
+    with pytest.raises(RuntimeError, match="crash"):
+        fail()
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(RuntimeError, match="crash"):
+        fail("a.txt")
+    (folder,) = (tmp_path / "data").iterdir()
+    assert [file.name for file in folder.iterdir()] == ["a.txt"]
+
+
 def test_a_real_folder_called_latest_is_left_alone(tmp_path: Path) -> None:
-    folder = create_run_folder(tmp_path, "data", NOON)
-    (tmp_path / "data" / "latest").mkdir()
-    with pytest.raises(DataError, match="not a link"):
-        link_latest(folder)
+    (tmp_path / "data" / "latest").mkdir(parents=True)
+    with pytest.raises(DataError, match="not a link"), ResultFolder.of_run(tmp_path, "data", NOON):
+        pass
 
 
 def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(DataError, match="cannot make a folder"):
-        create_run_folder(tmp_path / "file", "data")
+    with (
+        pytest.raises(DataError, match="cannot make a folder"),
+        ResultFolder.of_run(tmp_path / "file", "data"),
+    ):
+        pass
 
 
 def test_timing_table_keeps_stages_that_come_late() -> None:
@@ -89,7 +111,7 @@ def test_timing_table_keeps_stages_that_come_late() -> None:
 def test_laps_of_a_stopwatch_add_up() -> None:
     watch = Stopwatch()
     watch.lap("read")
-    watch.lap("frontend", milliseconds({"detect_ms": 2.0, "tracked": 7}))
+    watch.lap("frontend", {"detect": 2.0})
     times = watch.milliseconds
     assert times["total"] == pytest.approx(times["read"] + times["frontend"])
     assert times["frontend.detect"] == 2.0
@@ -192,9 +214,9 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path) -> None:
 def test_the_latest_result_of_a_recording_is_read(tmp_path: Path) -> None:
     info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
     result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
-    folder = create_run_folder(tmp_path, "clip")
-    result.save(folder)
-    link_latest(folder)
+    with ResultFolder.of_run(tmp_path, "clip") as made:
+        result.save(made.folder)
+    folder = made.folder
     saved = load_result(tmp_path / "clip")
     assert (saved.status, len(saved.trajectory)) == ("ok", 0)
     assert saved.smoothed is None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of bundle adjustment (a row of the table of policies), and what a solution consists of.
+"""Settings of bundle adjustment (a row of the table of policies).
 
 Cost construction: all poses and features, no pose costs. Gauss-Newton: until convergence.
 Marginalization: none.
@@ -9,11 +9,9 @@ Marginalization: none.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from slam_graph.backend import RobustLoss
-from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
 from slam_graph.settings import Settings, expert
 
 Intrinsics = Literal["per_camera", "shared", "fixed"]
@@ -59,41 +57,3 @@ class BalPolicy(Settings):
     """Cost construction."""
     gauss_newton: BalStepsPolicy = BalStepsPolicy()
     """Gauss-Newton steps, damped."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BalMinimum:
-    """Where the steps ended.
-
-    Attributes:
-        estimates: of the cameras and points in the cost.
-        start_cost: half the sum of squared reprojection errors (or of their loss) at the start.
-        cost: the same at the end.
-        steps: number of steps, rejected ones included.
-        rejected: how many steps did not lower the cost.
-        converged: whether the cost stopped falling before the number of steps was used up.
-    """
-
-    estimates: BalEstimates
-    start_cost: float
-    cost: float
-    steps: int
-    rejected: int
-    converged: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BalSolution:
-    """The result of a bundle adjustment.
-
-    Attributes:
-        problem: the whole problem.
-        part: the part of it that was in the cost.
-        minimum: where the steps ended.
-        estimates: of all cameras and points; those that were not in the cost are unchanged.
-    """
-
-    problem: BalProblem
-    part: BalPart
-    minimum: BalMinimum
-    estimates: BalEstimates

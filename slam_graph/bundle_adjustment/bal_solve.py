@@ -12,12 +12,7 @@ import numpy as np
 
 from slam_graph.backend import Attempt, GainRatioDamping, StepSettings, levenberg_marquardt
 from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, initial_estimates, retract
-from slam_graph.bundle_adjustment.bal_policy import (
-    BalMinimum,
-    BalPolicy,
-    BalSolution,
-    BalStepsPolicy,
-)
+from slam_graph.bundle_adjustment.bal_policy import BalPolicy, BalStepsPolicy
 from slam_graph.bundle_adjustment.bal_problem import (
     BalEstimates,
     BalPart,
@@ -34,6 +29,7 @@ from slam_graph.bundle_adjustment.bal_schur import (
     restore_gauge,
     structure,
 )
+from slam_graph.bundle_adjustment.bal_solution import BalMinimum, BalSolution
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 

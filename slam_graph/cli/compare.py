@@ -13,7 +13,7 @@ from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
 
 if TYPE_CHECKING:
-    from slam_graph.experiment import Comparison, Task
+    from slam_graph.experiment import Comparison
 
 
 def compare(
@@ -120,17 +120,15 @@ def _truths(texts: list[str]) -> dict[str, str]:
     return {name: path for name, _, path in pairs}
 
 
-def _print_task(task: Task, failure: str | None, count: int, total: int) -> None:
+def _print_task(task: str, failure: str | None, count: int, total: int) -> None:
     """Print on stderr that a task has ended."""
     ending = "" if failure is None else f": failed: {failure}"
-    typer.echo(f"{count}/{total} {task.name}{ending}", err=True)
+    typer.echo(f"{count}/{total} {task}{ending}", err=True)
 
 
 def _echo(comparison: Comparison) -> None:
     """Print the table and the names of the files."""
-    from slam_graph.experiment import text_table
-
-    echo_table(_informative(text_table(comparison.rows)))
+    echo_table(_informative(comparison.table))
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -69,13 +68,6 @@ def collected_log() -> Iterator[list[str]]:
     finally:
         for handler in handlers:
             logger.removeHandler(handler)
-
-
-def remove_if_empty(folder: Path) -> None:
-    """Remove the folder of a run that wrote nothing, and that of its data set if it is empty."""
-    for empty in (folder, folder.parent):
-        if empty.is_dir() and not any(empty.iterdir()):
-            empty.rmdir()
 
 
 _BAR_WIDTH = 28

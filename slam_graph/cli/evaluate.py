@@ -12,13 +12,14 @@ import typer
 
 from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import Json
-from slam_graph.evaluation import ERROR_UNITS, STEP_UNITS, DeltaUnit, Pairing, PoseRelation
 
 if TYPE_CHECKING:
     from slam_graph.evaluation import ErrorSeries
     from slam_graph.geometry import AlignmentMode, Trajectory
 
 _Align = Literal["none", "yaw", "se3", "sim3"]
+_PoseRelation = Literal["full", "trans_part", "rot_part", "angle_deg", "angle_rad"]
+_StepUnit = Literal["f", "m", "d", "r"]
 
 _STATISTICS = ("max", "mean", "median", "min", "rmse", "sse", "std")
 
@@ -27,7 +28,7 @@ _Reference = Annotated[
 ]
 _Estimate = Annotated[Path, typer.Argument(help="Trajectory to evaluate: TUM file or EuRoC CSV.")]
 _Relation = Annotated[
-    PoseRelation,
+    _PoseRelation,
     typer.Option("-r", "--pose_relation", help="Part of the difference of two poses that counts."),
 ]
 _AlignFlag = Annotated[
@@ -76,7 +77,7 @@ def rpe(
     relation: _Relation = "trans_part",
     delta: Annotated[float, typer.Option("-d", "--delta", min=0.0, help="Length of a step.")] = 1.0,
     delta_unit: Annotated[
-        DeltaUnit,
+        _StepUnit,
         typer.Option("-u", "--delta_unit", help="Frames, metres, degrees or radians."),
     ] = "f",
     delta_tol: Annotated[
@@ -116,7 +117,7 @@ def rpe(
     )
     steps: dict[str, Any] = {
         "delta": delta,
-        "delta_unit": STEP_UNITS[delta_unit],
+        "delta_unit": result.step_unit,
         "all_pairs": all_pairs,
     }
     _report("RPE", result, relation, mode, steps, as_json)
@@ -133,7 +134,7 @@ def _alignment(align_se3: bool, correct_scale: bool, align: _Align | None) -> Al
     return "scale" if correct_scale else "none"
 
 
-def _pairing(t_max_diff: float | None) -> Pairing:
+def _pairing(t_max_diff: float | None) -> Literal["interpolate", "nearest"]:
     """How true poses are found: evo's way if its limit is given."""
     return "interpolate" if t_max_diff is None else "nearest"
 
@@ -148,14 +149,14 @@ def _read(path: Path) -> Trajectory:
 def _report(
     metric: str,
     result: ErrorSeries,
-    relation: PoseRelation,
+    relation: _PoseRelation,
     mode: AlignmentMode,
     steps: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Print statistics."""
     statistics = asdict(result.statistics)
-    unit = ERROR_UNITS[relation]
+    unit = result.unit
     if as_json:
         scale = result.similarity.scale
         about: dict[str, Any] = {

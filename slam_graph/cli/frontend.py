@@ -28,12 +28,12 @@ from slam_graph.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from slam_graph.config import RunConfig
     from slam_graph.datasets import Sequence
     from slam_graph.experiment import FrontendReport
-    from slam_graph.pipeline import TrackedPacket
+    from slam_graph.sensors import FeatureFrame, Packet
 
 _EVERYTHING = "klt,klt/harris,klt/fast,klt/dog,klt/surf,klt/orb,klt/brisk,sift,surf,orb,brisk,brief"
 
@@ -81,13 +81,13 @@ def run(
 ) -> None:
     """Track a recording, report how good the tracks are, and draw them."""
     from slam_graph.config import load_config
-    from slam_graph.experiment import track
+    from slam_graph.experiment import FrontendReport
 
     settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
     sequence = open_recording(data, format_, calibration, groundtruth, sources, settings.cameras)
     with ExitStack() as stack:
         watch = _watch(sequence, settings, picture, video, record, stack)
-        report = track(sequence, settings, settings.frontend.method, watch)
+        report = FrontendReport.of_tracks(sequence, settings, settings.frontend.method, watch)
     files = [str(path) for path in (picture, video, record) if path is not None]
     if as_json:
         echo_json({**_plain(report), "files": files})
@@ -120,25 +120,39 @@ def compare(
 ) -> None:
     """Run several front ends on one recording, and print a table."""
     from slam_graph.config import load_config
-    from slam_graph.experiment import parse_frontends, track, track_and_estimate
+    from slam_graph.experiment import FrontendReport
 
     options = {"cameras": cameras, "start_s": start, "duration_s": duration, "algorithm": algorithm}
     reports = []
     runs = {  # all at once, so that a wrong name is found before the first run
         name: load_config(config, [*(set_ or ()), *changes], **options)
-        for name, changes in parse_frontends(n for n in frontends.split(",") if n).items()
+        for name, changes in _settings_of(n for n in frontends.split(",") if n).items()
     }
     for name, settings in runs.items():
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
-        go = track if algorithm is None else track_and_estimate
+        go = FrontendReport.of_tracks if algorithm is None else FrontendReport.of_run
         reports.append(go(sequence, settings, name))
         typer.echo(f"{name}: done", err=True)
     if as_json:
         echo_json([_plain(report) for report in reports])
     else:
         echo_table([_COLUMNS, *map(_row, reports)])
+
+
+def _settings_of(names: Iterable[str]) -> dict[str, list[str]]:
+    """The settings of front ends given as METHOD or METHOD/DETECTOR.
+
+    Returns:
+        Overrides for `load_config`, which refuses unknown ones, by name.
+    """
+    settings = {}
+    for name in names:
+        method, _, detector = name.partition("/")
+        settings[name] = [f"frontend.method={method}"]
+        settings[name] += [f"frontend.detector={detector}"] if detector else []
+    return settings
 
 
 def _watch(
@@ -148,14 +162,12 @@ def _watch(
     video: Path | None,
     record: Path | None,
     stack: ExitStack,
-) -> Callable[[TrackedPacket], None]:
+) -> Callable[[Packet, FeatureFrame], None]:
     """A function that draws each frame, and records it if asked for."""
     from slam_graph.datasets import TrackRecorder
     from slam_graph.sensors import CameraFrame
-    from slam_graph.visualization import TrackPainter, TrackVideo, save_picture
+    from slam_graph.visualization import TrackPictures
 
-    painter = TrackPainter()
-    film = None if video is None else stack.enter_context(TrackVideo(video))
     recorder = None
     info = sequence.info()
     if record is not None:
@@ -166,20 +178,13 @@ def _watch(
     if settings.duration_s is not None:
         length_ns = min(length_ns, round(settings.duration_s * 1e9))
     middle_ns = info.start_ns + round(settings.start_s * 1e9) + length_ns // 2
-    saved = False
+    pictures = stack.enter_context(TrackPictures(picture, middle_ns, video))
 
-    def watch(tracked: TrackedPacket) -> None:
-        nonlocal saved
-        frame = tracked.packet.frame
-        assert isinstance(frame, CameraFrame)
-        drawn = painter.paint(frame, tracked.features)
-        if film is not None:
-            film.write(drawn)
-        if not saved and frame.stamp_ns >= middle_ns:
-            save_picture(picture, drawn)
-            saved = True
+    def watch(packet: Packet, features: FeatureFrame) -> None:
+        assert isinstance(packet.frame, CameraFrame)
+        pictures.show(packet.frame, features)
         if recorder is not None:
-            recorder.write(tracked.packet.imu, tracked.features)
+            recorder.write(packet.imu, features)
 
     return watch
 

@@ -28,6 +28,7 @@ from slam_graph.cli.options import (
     Sources,
     Start,
     open_recording,
+    run_settings,
 )
 from slam_graph.cli.run import execute, report
 
@@ -70,19 +71,19 @@ def localize(
     Runs like `slam-graph run`, and also writes the causal pose of every frame in the map to
     trajectory_map.tum, once the place is recognised. The exit code is 3 if it never is.
     """
-    from slam_graph.config import load_config
     from slam_graph.errors import EstimationError
     from slam_graph.results import find_map, load_map
 
-    options: dict[str, Any] = {
-        "algorithm": algorithm,
-        "cameras": cameras,
-        "start_s": start,
-        "duration_s": duration,
-    }
-    if final_ba is not None or config is None:
-        options["final_ba"] = {"enabled": bool(final_ba)}
-    settings = load_config(config, set_ or (), **options, seed=seed)
+    settings = run_settings(
+        config,
+        set_,
+        {"final_ba": bool(final_ba) if config is None else final_ba},
+        algorithm=algorithm,
+        cameras=cameras,
+        start_s=start,
+        duration_s=duration,
+        seed=seed,
+    )
     path = find_map(map_)
     known = load_map(path)
     with collected_log() as log:
@@ -149,19 +150,12 @@ def export(
 ) -> None:
     """Write a map in formats of other programs."""
     from slam_graph.errors import ConfigError
-    from slam_graph.results import export_ply, export_tum, load_map, refuse_to_replace
+    from slam_graph.results import export_map, load_map
 
     if ply is None and tum is None:
         raise ConfigError("nothing to write: give --ply FILE, --tum FILE, or both")
-    content = load_map(path)
-    if ply is not None and tum is not None:
-        refuse_to_replace(tum, force)
-    if ply is not None:
-        export_ply(content, ply, force)
-        typer.echo(str(ply))
-    if tum is not None:
-        for file in export_tum(content, tum, force):
-            typer.echo(str(file))
+    for file in export_map(load_map(path), ply, tum, force):
+        typer.echo(str(file))
 
 
 @app.command()

@@ -85,11 +85,12 @@ def optimize(
     """
     from slam_graph.bundle_adjustment import BalPolicy
     from slam_graph.pose_graph import PoseGraphPolicy
+    from slam_graph.results import refuse_to_replace
 
-    if save is not None and save.exists() and not force:
-        raise DataError(f"{save}: exists already; use --force to replace it")
-    if save is not None and (save.is_dir() or not save.parent.is_dir()):
-        raise DataError(f"{save}: cannot be written; name a file in an existing folder")
+    if save is not None:
+        refuse_to_replace(save, force)
+        if not save.parent.is_dir():
+            raise DataError(f"{save}: cannot be written; name a file in an existing folder")
     loss = {("cost", "robust"): robust}
     of_graphs = {("gauss_newton", "method"): method, ("cost", "initialization"): initialization}
     of_bundles = {("cost", "intrinsics"): intrinsics}

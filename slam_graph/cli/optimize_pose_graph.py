@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
@@ -16,7 +16,7 @@ from slam_graph.cli.options import timed, write_result
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy, RotationInformation
+    from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy
     from slam_graph.results import PoseGraphResult
 
 
@@ -35,7 +35,7 @@ class Wanted:
 
 def optimize_pose_graph_file(
     file: Path,
-    information: RotationInformation,
+    information: Literal["angle", "quaternion"],
     policy: PoseGraphPolicy,
     wanted: Wanted,
     save: Path | None,
@@ -44,8 +44,7 @@ def optimize_pose_graph_file(
 ) -> None:
     """Estimate all poses, write the results and print what was reached."""
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph import g2o_lines, read_pose_graph
-    from slam_graph.results import write_text
+    from slam_graph.pose_graph import read_pose_graph
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}
@@ -55,7 +54,7 @@ def optimize_pose_graph_file(
         result = _solve(graph, policy, diagnostics, seconds, wanted)
         folder, files = write_result(result, graph.name, output, log)
         if save is not None:
-            write_text(save, g2o_lines(graph, result.solution.poses))
+            result.save_problem(save)
     if as_json:
         echo_json({**result.metrics, "folder": str(folder), "files": [str(path) for path in files]})
     else:
@@ -70,7 +69,7 @@ def _solve(
     wanted: Wanted,
 ) -> PoseGraphResult:
     """Optimise, and find out what else is asked for."""
-    from slam_graph.pose_graph import certify, marginal_covariances, optimize_pose_graph
+    from slam_graph.pose_graph import certify, optimize_pose_graph
     from slam_graph.results import PoseGraphResult
 
     with timed(seconds, "optimize"):
@@ -81,7 +80,7 @@ def _solve(
             certificate = certify(solution.weighted_graph(), solution.poses)
     if wanted.covariances:
         with timed(seconds, "covariances"):
-            covariances = marginal_covariances(solution)
+            covariances = solution.covariances()
     return PoseGraphResult(policy, solution, certificate, covariances, seconds, diagnostics.counts)
 
 

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import typer
 from pydantic import BaseModel
 
-from slam_graph.cli.console import remove_if_empty
-
 if TYPE_CHECKING:
+    from slam_graph.config import RunConfig
     from slam_graph.datasets import RecordedSequence
 
 
@@ -114,6 +113,26 @@ def open_recording(
     )
 
 
+def run_settings(
+    config: Path | None,
+    overrides: list[str] | None,
+    parts: Mapping[str, bool | None],
+    **options: Any,
+) -> RunConfig:
+    """The settings of a run.
+
+    Args:
+        config: YAML file, if there is one.
+        overrides: `key=value` each.
+        parts: whether each part of a run is enabled, by its table; None changes nothing.
+        options: top-level settings; None changes nothing.
+    """
+    from slam_graph.config import load_config
+
+    tables = {name: {"enabled": on} for name, on in parts.items() if on is not None}
+    return load_config(config, overrides or (), **options, **tables)
+
+
 _Policy = TypeVar("_Policy", bound=BaseModel)
 
 
@@ -156,17 +175,12 @@ def write_result(
     result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
     """Write all files into a new folder, named after the problem."""
-    from slam_graph.results import create_run_folder, link_latest, write_text
+    from slam_graph.results import ResultFolder
 
-    folder = create_run_folder(output, name)
-    try:
-        files = [*result.save(folder), folder / "run.log"]
-        write_text(files[-1], log)
-        link_latest(folder)
-    except BaseException:
-        remove_if_empty(folder)
-        raise
-    return folder, files
+    with ResultFolder.of_run(output, name) as made:
+        made.files += result.save(made.folder)
+        made.text("run.log", log)
+    return made.folder, made.files
 
 
 @contextmanager

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.console import (
-    ProgressBar,
-    collected_log,
-    echo_json,
-    echo_table,
-    number,
-    remove_if_empty,
-)
+from slam_graph.cli.console import ProgressBar, collected_log, echo_json, echo_table, number
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -40,6 +33,7 @@ from slam_graph.cli.options import (
     Sources,
     Start,
     open_recording,
+    run_settings,
 )
 
 if TYPE_CHECKING:
@@ -239,21 +233,16 @@ def run(
 
     The newest results are also found under OUTPUT/<dataset>/latest.
     """
-    from slam_graph.config import load_config
-
-    options: dict[str, Any] = {
-        "algorithm": algorithm,
-        "cameras": cameras,
-        "start_s": start,
-        "duration_s": duration,
-    }
-    if final_ba is not None:
-        options["final_ba"] = {"enabled": final_ba}
-    if loop_closure is not None:
-        options["loop_closure"] = {"enabled": loop_closure}
-    if save_map is not None:
-        options["map"] = {"enabled": save_map}
-    settings = load_config(config, set_ or (), **options, seed=seed)
+    settings = run_settings(
+        config,
+        set_,
+        {"final_ba": final_ba, "loop_closure": loop_closure, "map": save_map},
+        algorithm=algorithm,
+        cameras=cameras,
+        start_s=start,
+        duration_s=duration,
+        seed=seed,
+    )
     with collected_log() as log:
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
@@ -305,11 +294,10 @@ def execute(
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
     from slam_graph.pipeline import run as run_pipeline
-    from slam_graph.results import create_run_folder, link_latest, write_text
+    from slam_graph.results import ResultFolder
 
-    folder = create_run_folder(output, sequence.info().name)
-    try:
-        viewer = _viewer(rerun, folder, sequence.info().name)
+    with ResultFolder.of_run(output, sequence.info().name) as made:
+        viewer = _viewer(rerun, made.folder, sequence.info().name)
         with _progress(sequence, settings, progress) as bar:
             result = run_pipeline(
                 sequence,
@@ -319,16 +307,11 @@ def execute(
                 known_map=known_map,
                 graph_times=graph_times,
             )
-        files = result.save(folder)
+        made.files += result.save(made.folder)
         if rerun == "save":
-            files.append(folder / "recording.rrd")
-        files.append(folder / "run.log")
-        write_text(files[-1], log)
-        link_latest(folder)
-    except BaseException:
-        remove_if_empty(folder)
-        raise
-    return result, folder, files
+            made.path("recording.rrd")
+        made.text("run.log", log)
+    return result, made.folder, made.files
 
 
 def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:

@@ -78,6 +78,8 @@ class ErrorSeries:
         statistics: their summary.
         similarity: the map that was applied to the estimate.
         poses: number of poses that both trajectories share.
+        unit: of the errors; empty where they have none.
+        step_unit: of the length of a step of a relative error.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -85,6 +87,8 @@ class ErrorSeries:
     statistics: Statistics
     similarity: Similarity
     poses: int
+    unit: str = ""
+    step_unit: str = ""
 
 
 def ape(
@@ -119,7 +123,8 @@ def ape(
         guess.positions,
     )
     values = errors(*difference, relation)
-    return ErrorSeries(guess.stamps_ns, values, Statistics.of(values), similarity, len(truth))
+    statistics, unit = Statistics.of(values), ERROR_UNITS[relation]
+    return ErrorSeries(guess.stamps_ns, values, statistics, similarity, len(truth), unit)
 
 
 def aligned_pair(

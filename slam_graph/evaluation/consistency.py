@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray
-from slam_graph.evaluation.truth_pairing import paired, select
+from slam_graph.evaluation.truth_pairing import paired
 from slam_graph.geometry import Similarity, Trajectory
 
 CONFIDENCE = 0.95
@@ -76,8 +76,8 @@ def nees(
     """
     estimate = (similarity or Similarity.identity()).apply(estimate)
     known = np.flatnonzero(np.isfinite(pose_covariances).all(axis=(1, 2)))
-    true, rows = paired(truth, select(estimate, known))
-    own, P = select(estimate, known[rows]), pose_covariances[known[rows]]
+    true, rows = paired(truth, estimate.select(known))
+    own, P = estimate.select(known[rows]), pose_covariances[known[rows]]
     rotations = Rotation.from_quat(own.quaternions)
     e_rotation = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
     e_position = rotations.inv().apply(true.positions - own.positions)

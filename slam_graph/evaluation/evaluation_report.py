@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
-from slam_graph.evaluation.consistency import CONFIDENCE, mean_bounds, nees, ratio_bounds
+from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry import (
@@ -55,11 +55,9 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
         truth: the true trajectory.
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
-            given); otherwise it is aligned as `truth_from_estimate` says.
+            given); otherwise it is aligned as `nees_of_run` says.
     """
-    estimate = history.trajectory()
-    similarity, alignment = truth_from_estimate(truth, estimate, aligned)
-    result = nees(estimate, history.pose_covariances(), truth, similarity)
+    result, alignment = nees_of_run(truth, history, aligned)
     if len(result.stamps_ns) == 0:
         return None
     table: Table = {"alignment": alignment, "states": len(result.pose)}
@@ -114,10 +112,10 @@ def innovation_report(columns: Mapping[str, NDArray[np.float64]]) -> Table | Non
     }
 
 
-def truth_from_estimate(
-    truth: Trajectory, estimate: Trajectory, aligned: bool
-) -> tuple[Similarity, AlignmentMode | Literal["first_pose"]]:
-    """The map under which an estimate's consistency is judged, and its name.
+def nees_of_run(
+    truth: Trajectory, history: StateHistory, aligned: bool
+) -> tuple[Nees, AlignmentMode | Literal["first_pose"]]:
+    """NEES of the states of a run, and the alignment under which it was taken.
 
     An estimate that does not live in the world of the truth is aligned in yaw and position, which
     nothing tells it, over the whole run: the truth's own orientation at one time may be off by far
@@ -125,12 +123,21 @@ def truth_from_estimate(
 
     Args:
         truth: the true trajectory.
-        estimate: the trajectory to judge.
+        history: estimated states.
         aligned: whether the estimate lives in the world of the truth already.
 
     Raises:
         DataError: if the two share no time.
     """
+    estimate = history.trajectory()
+    similarity, alignment = _truth_from_estimate(truth, estimate, aligned)
+    return nees(estimate, history.pose_covariances(), truth, similarity), alignment
+
+
+def _truth_from_estimate(
+    truth: Trajectory, estimate: Trajectory, aligned: bool
+) -> tuple[Similarity, AlignmentMode | Literal["first_pose"]]:
+    """The map from the world of an estimate to that of the truth, and its name."""
     if aligned:
         return Similarity.identity(), "none"
     true, own = synchronize(truth, estimate)

@@ -79,8 +79,15 @@ def rpe(
         )
     difference = relative_poses(*_motions(truth, start, end), *_motions(aligned, start, end))
     values = errors(*difference, relation)
-    stamps = aligned.stamps_ns[end]
-    return ErrorSeries(stamps, values, Statistics.of(values), similarity, len(truth))
+    return ErrorSeries(
+        aligned.stamps_ns[end],
+        values,
+        Statistics.of(values),
+        similarity,
+        len(truth),
+        ERROR_UNITS[relation],
+        STEP_UNITS[unit],
+    )
 
 
 def _step_pairs(

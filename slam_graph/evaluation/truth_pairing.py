@@ -13,8 +13,6 @@ Two ways, by name:
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from slam_graph.arrays import IntArray
@@ -65,22 +63,6 @@ def associate(
     return pairs if few_is_reference else (pairs[1], pairs[0])
 
 
-def select(trajectory: Trajectory, indices: IntArray) -> Trajectory:
-    """The rows of a trajectory at `indices`."""
-    optional = {
-        name: None if values is None else values[indices]
-        for name in ("velocities", "accel_biases", "gyro_biases")
-        for values in (getattr(trajectory, name),)
-    }
-    return replace(
-        trajectory,
-        stamps_ns=trajectory.stamps_ns[indices],
-        positions=trajectory.positions[indices],
-        quaternions=trajectory.quaternions[indices],
-        **optional,
-    )
-
-
 def paired(
     reference: Trajectory,
     estimate: Trajectory,
@@ -106,7 +88,7 @@ def paired(
     limit_s = _DEFAULT_LIMITS_S[pairing] if limit_s is None else limit_s
     if pairing == "nearest":
         in_reference, rows = associate(reference.stamps_ns, estimate.stamps_ns, limit_s)
-        return select(reference, in_reference), rows
+        return reference.select(in_reference), rows
     if len(reference) == 0:
         return reference, np.zeros(0, np.int64)
     true, valid = interpolate(reference, estimate.stamps_ns, limit_s)
@@ -137,7 +119,7 @@ def synchronize(
             f"no pose of the estimate ({_span(estimate)}) has a true pose at its time in the "
             f"reference ({_span(reference)}); {_WAYS_OUT[pairing]}"
         )
-    return true, select(estimate, rows)
+    return true, estimate.select(rows)
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -13,38 +13,19 @@ from slam_graph.lazy import lazy_exports
 __all__ = [
     "Comparison",
     "FrontendReport",
-    "Task",
     "compare",
-    "parse_frontends",
-    "text_table",
-    "track",
-    "track_and_estimate",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.experiment.comparison import compare
     from slam_graph.experiment.comparison_plan import Comparison
-    from slam_graph.experiment.comparison_report import text_table
-    from slam_graph.experiment.frontend_comparison import (
-        FrontendReport,
-        parse_frontends,
-        track,
-        track_and_estimate,
-    )
-    from slam_graph.experiment.tasks import Task
+    from slam_graph.experiment.frontend_comparison import FrontendReport
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "comparison": ("compare",),
             "comparison_plan": ("Comparison",),
-            "comparison_report": ("text_table",),
-            "frontend_comparison": (
-                "FrontendReport",
-                "parse_frontends",
-                "track",
-                "track_and_estimate",
-            ),
-            "tasks": ("Task",),
+            "frontend_comparison": ("FrontendReport",),
         },
     )

@@ -19,7 +19,7 @@ from slam_graph.experiment.comparison_plan import (
 )
 from slam_graph.experiment.comparison_report import write_report
 from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesses
-from slam_graph.experiment.tasks import Task, find_sources
+from slam_graph.experiment.tasks import find_sources
 
 _DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
 
@@ -62,7 +62,8 @@ def compare(
             name NAME_no_fej.
         workers: processes at a time; the number of cores if None.
         scheduler: address of a Dask scheduler to run the tasks on instead of this machine.
-        progress: called after each task.
+        progress: called after each task with its name, why it failed or None, the number of tasks
+            done, and that of all.
         settings: top-level settings of all runs, such as `duration_s` and `cameras`.
 
     Returns:
@@ -97,5 +98,5 @@ def _executor(workers: int | None, scheduler: str | None) -> Executor:
     return DaskCluster(scheduler)
 
 
-def _ignore(task: Task, failure: str | None, count: int, total: int) -> None:
+def _ignore(task: str, failure: str | None, count: int, total: int) -> None:
     """No progress is shown."""

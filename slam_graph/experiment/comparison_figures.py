@@ -21,8 +21,8 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results import appearing
-from slam_graph.visualization import Curve, Panel, plot_panels
+from slam_graph.results import ResultFolder
+from slam_graph.visualization import Panel, plot_panels
 
 _BINS = 200
 """Number of equal bins of time or distance in which series are averaged, also over the seeds."""
@@ -53,18 +53,17 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     runs = {task.algorithm: _series(tasks, task.algorithm) for task in tasks}
     seeds = max((len(series) for series in runs.values()), default=0)
     mean = f", mean over {seeds} seeds" if seeds > 1 else ""
-    folder = comparison.folder / "figures"
-    folder.mkdir(exist_ok=True)
+    folder = ResultFolder(comparison.folder / "figures")
     for mode in ALIGNMENTS:
         panels = [
             Panel(xlabel, ylabel, _curves(runs, x, f"{part}_{mode}"))
             for part, ylabel in PARTS
             for x, xlabel in (_TIME, _DISTANCE)
         ]
-        file = folder / f"{data}_errors_{mode}.png"
-        yield from _draw_panels(file, f"{data}: errors, alignment {mode}{mean}", panels)
+        title = f"{data}: errors, alignment {mode}{mean}"
+        yield from _draw_panels(folder, f"{data}_errors_{mode}.png", title, panels)
     panels = _consistency_panels(runs, max(seeds, 1))
-    yield from _draw_panels(folder / f"{data}_nees.png", f"{data}: consistency{mean}", panels)
+    yield from _draw_panels(folder, f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
         Panel(_TIME[1], "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
         Panel(_TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
@@ -72,9 +71,8 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         Panel(_TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
         Panel(_TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
     ]
-    yield from _draw_panels(
-        folder / f"{data}_steps.png", f"{data}: work of the back end{mean}", panels
-    )
+    title = f"{data}: work of the back end{mean}"
+    yield from _draw_panels(folder, f"{data}_steps.png", title, panels)
 
 
 def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel]:
@@ -120,7 +118,9 @@ def _is_whole(task: RunTask) -> bool:
     return result is not None and result["metrics"]["status"] in ("ok", "low_coverage")
 
 
-def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
+def _curves(
+    runs: dict[str, list[Series]], x: str, y: str
+) -> dict[str, tuple[FloatArray, FloatArray]]:
     """A curve for each algorithm that has the series."""
     known = {
         name: [(series[x], series[y]) for series in all_series if x in series and y in series]
@@ -128,10 +128,10 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
     }
     end = max((xs[-1] for pairs in known.values() for xs, _ in pairs if len(xs)), default=0.0)
     if end <= 0.0:
-        return []
+        return {}
     edges = np.linspace(0.0, end, _BINS + 1)
     centres = (edges[:-1] + edges[1:]) / 2.0
-    curves = []
+    curves = {}
     for name, pairs in known.items():
         if pairs:
             means = binned_mean(
@@ -141,14 +141,16 @@ def _curves(runs: dict[str, list[Series]], x: str, y: str) -> list[Curve]:
             )
             filled = np.isfinite(means)
             if filled.any():
-                curves.append(Curve(name, centres[filled], means[filled]))
+                curves[name] = (centres[filled], means[filled])
     return curves
 
 
-def _draw_panels(file: Path, title: str, panels: Iterable[Panel]) -> Iterator[Figure]:
+def _draw_panels(
+    folder: ResultFolder, name: str, title: str, panels: Iterable[Panel]
+) -> Iterator[Figure]:
     """Draw the panels that have curves, if any."""
     shown = [panel for panel in panels if panel.curves]
     if shown:
-        with appearing(file) as partial:
+        with folder.appearing(name) as partial:
             plot_panels(partial, title, shown)
-        yield Figure(file, title)
+        yield Figure(folder.files[-1], title)

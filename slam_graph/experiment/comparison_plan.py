@@ -19,8 +19,8 @@ from slam_graph.smoothing import FinalBaConfig
 WITHOUT_FEJ = "_no_fej"
 """Suffix of the name of an algorithm without first-estimates Jacobians."""
 
-Progress = Callable[[Task, str | None, int, int], None]
-"""Called after each task: the task, why it failed or None, tasks done, tasks to do."""
+Progress = Callable[[str, str | None, int, int], None]
+"""Called after each task: its name, why it failed or None, tasks done, tasks to do."""
 
 
 @dataclass
@@ -33,6 +33,7 @@ class Comparison:
         failures: why a task could not be done, by its name; a run that diverged is not a failure.
         skipped: number of tasks that had been done before.
         rows: of the table, one for each algorithm and data set; empty before the report is written.
+        table: the same as text, under a row of titles, with the data before each row.
         files: of the report.
     """
 
@@ -41,6 +42,7 @@ class Comparison:
     failures: dict[str, str] = field(default_factory=dict)
     skipped: int = 0
     rows: list[dict[str, Any]] = field(default_factory=list)
+    table: list[tuple[str, ...]] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
 
 
@@ -173,4 +175,4 @@ def _do(
         for count, (task, failure) in enumerate(outcomes, start=1):
             if failure is not None:
                 comparison.failures[task.name] = failure
-            progress(task, failure, count, len(missing))
+            progress(task.name, failure, count, len(missing))

@@ -8,7 +8,6 @@ It is written as Markdown, as one HTML file with the figures in it, and the tabl
 from __future__ import annotations
 
 import base64
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from html import escape
@@ -26,7 +25,7 @@ from slam_graph.experiment.comparison_results import (
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
-from slam_graph.results import finite, versions, write_text
+from slam_graph.results import ResultFolder
 
 _COLUMNS = (
     "algorithm",
@@ -65,22 +64,26 @@ _STYLE = (
 
 
 def write_report(comparison: Comparison) -> None:
-    """Write the report of the tasks done so far, and fill `rows` and `files` of the comparison."""
-    rows = finite(_summarize(comparison))
+    """Write the report of the tasks done so far, and fill `rows`, `table` and `files` of it."""
+    rows = _summarize(comparison)
     names = dict.fromkeys(task.data for task in comparison.runs)
     figures = {name: list(draw(comparison, name)) for name in names}
-    folder = comparison.folder
-    files = [folder / name for name in ("report.md", "report.html", "summary.json")]
-    write_text(files[0], [_markdown(comparison, rows, figures)])
-    write_text(files[1], [_html(comparison, rows, figures)])
-    table = {"rows": rows, "failures": comparison.failures, "versions": versions()}
-    write_text(files[2], [json.dumps(table, indent=1, allow_nan=False), "\n"])
-    comparison.rows, comparison.files = rows, files
+    folder = ResultFolder(comparison.folder)
+    folder.text("report.md", [_markdown(comparison, rows, figures)])
+    folder.text("report.html", [_html(comparison, rows, figures)])
+    folder.json(
+        "summary.json",
+        {"rows": rows, "failures": comparison.failures, "versions": _versions(comparison)},
+    )
+    cells = [(str(row["data"]), *_cells(row)) for row in rows]
+    comparison.rows, comparison.table = rows, [("data", *_COLUMNS), *cells]
+    comparison.files = folder.files
 
 
-def text_table(rows: Iterable[Table]) -> list[tuple[str, ...]]:
-    """Rows of a comparison as text, the data before each, under a row of titles."""
-    return [("data", *_COLUMNS), *((str(row["data"]), *_cells(row)) for row in rows)]
+def _versions(comparison: Comparison) -> dict[str, str]:
+    """Versions of what the first run that was done depends on."""
+    found = (read_result(task.result) for task in comparison.runs if task.is_done())
+    return next((result["metrics"]["versions"] for result in found if result is not None), {})
 
 
 def _cells(row: Table) -> tuple[str, ...]:

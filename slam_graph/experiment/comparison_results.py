@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.evaluation import ape, nees, synchronize, truth_from_estimate
+from slam_graph.evaluation import ape, nees_of_run, synchronize
 from slam_graph.geometry import AlignmentMode, Trajectory
-from slam_graph.results import RunResult, appearing, write_text
+from slam_graph.results import ResultFolder, RunResult
 
 SCHEMA_VERSION = 2
 
@@ -51,9 +51,9 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
         result: the run.
         about: data, algorithm, seed and hash of the settings.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = ResultFolder(path.parent)
     path.unlink(missing_ok=True)
-    with appearing(path.with_suffix(".npz")) as partial, partial.open("wb") as file:
+    with folder.appearing(path.with_suffix(".npz").name) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **_series_of(result))  # type: ignore[arg-type]  # its last keyword
     table = {
         "schema_version": SCHEMA_VERSION,
@@ -62,7 +62,7 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
         "mean_steps": float(result.logs.steps.steps.mean()) if len(result.logs.steps) else None,
         "config": result.config.model_dump(mode="json"),
     }
-    write_text(path, [json.dumps(table, indent=1, allow_nan=False), "\n"])
+    folder.json(path.name, table)
 
 
 def read_result(path: Path) -> Table | None:
@@ -120,12 +120,10 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
 
 
 def _nees_series(truth: Trajectory, result: RunResult) -> Series:
-    estimate = result.trajectory
     try:
-        similarity, _ = truth_from_estimate(truth, estimate, result.start_was_given)
+        values, _ = nees_of_run(truth, result.history, result.start_was_given)
     except DataError:
         return {}
-    values = nees(estimate, result.history.pose_covariances(), truth, similarity)
     return {
         "nees_time_s": (values.stamps_ns - result.input.start_ns) * 1e-9,
         "nees_orientation": values.orientation,

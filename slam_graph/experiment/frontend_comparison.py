@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,10 +15,11 @@ import numpy as np
 from slam_graph.config import RunConfig
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
-from slam_graph.evaluation import TrackQuality, TrackSummary
+from slam_graph.experiment.track_quality import TrackQuality, TrackSummary
 from slam_graph.frontend import build_frontend
-from slam_graph.pipeline import TrackedPacket, Tracking, run
-from slam_graph.results import TimingLog
+from slam_graph.pipeline import Tracking, run
+from slam_graph.results import RunLogs
+from slam_graph.sensors import FeatureFrame, Packet
 
 
 @dataclass(frozen=True)
@@ -49,72 +49,71 @@ class FrontendReport:
         """As plain values, for JSON."""
         return asdict(self)
 
+    @staticmethod
+    def of_tracks(
+        sequence: Sequence,
+        config: RunConfig,
+        name: str,
+        watch: Callable[[Packet, FeatureFrame], None] = lambda packet, features: None,
+    ) -> FrontendReport:
+        """Run the front end alone, and report.
 
-def track(
-    sequence: Sequence,
-    config: RunConfig,
-    name: str,
-    watch: Callable[[TrackedPacket], None] = lambda tracked: None,
-) -> FrontendReport:
-    """Run the front end alone.
+        Args:
+            sequence: of images.
+            config: `frontend`, `seed`, `start_s` and `duration_s` matter.
+            name: for the report.
+            watch: called with every packet and what was found in its frame.
 
-    Args:
-        sequence: of images.
-        config: `frontend`, `seed`, `start_s` and `duration_s` matter.
-        name: for the report.
-        watch: called with every tracked packet.
+        Raises:
+            DataError: if the recording holds no images.
+        """
+        info = sequence.info()
+        if info.content != "images" or info.frames == 0:
+            raise DataError(f"{info.name}: holds no images; there is nothing to track")
+        quality = TrackQuality(sequence.rig, sequence.groundtruth())
+        frontend = build_frontend(
+            sequence.rig,
+            config.frontend,
+            config.seed,
+            sequence.diagnostics,
+            gravity=config.backend.noise.gravity,
+        )
+        start_ns = info.start_ns + round(config.start_s * 1e9)
+        end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
+        packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
+        logs = RunLogs()
+        with closing(Tracking(packets, frontend, overlap=False).run()) as tracking:
+            for tracked in tracking:
+                packet, features = tracked.packet, tracked.features
+                quality.write(packet.imu, features)
+                logs.count_frame(features.stamp_ns, tracked.clock.milliseconds, tracked.frame_stats)
+                watch(packet, features)
+        return _report(name, quality, logs)
 
-    Raises:
-        DataError: if the recording holds no images.
-    """
-    info = sequence.info()
-    if info.content != "images" or info.frames == 0:
-        raise DataError(f"{info.name}: holds no images; there is nothing to track")
-    quality = TrackQuality(sequence.rig, sequence.groundtruth())
-    frontend = build_frontend(
-        sequence.rig,
-        config.frontend,
-        config.seed,
-        sequence.diagnostics,
-        gravity=config.backend.noise.gravity,
-    )
-    start_ns = info.start_ns + round(config.start_s * 1e9)
-    end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
-    packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
-    counts: Counter[str] = Counter()
-    timing = TimingLog()
-    with closing(Tracking(packets, frontend, overlap=False).run()) as tracking:
-        for tracked in tracking:
-            quality.write(tracked.packet.imu, tracked.features)
-            counts.update({k: int(v) for k, v in tracked.frame_stats.items() if k[-3:] != "_ms"})
-            timing.append(tracked.features.stamp_ns, tracked.clock.milliseconds)
-            watch(tracked)
-    return _report(name, quality, counts, timing)
+    @staticmethod
+    def of_run(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
+        """Run the whole pipeline, with feedback of the back end to the front end, and report.
 
-
-def track_and_estimate(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
-    """Run the whole pipeline, with feedback of the back end to the front end.
-
-    Args:
-        sequence: of images.
-        config: all settings.
-        name: for the report.
-    """
-    quality = TrackQuality(sequence.rig, sequence.groundtruth())
-    result = run(sequence, config, recorder=quality)
-    accuracy = result.metrics.get("accuracy") or {}
-    ate_m = accuracy.get("se3", {}).get("ate", {}).get("translation_m", {}).get("rmse")
-    return _report(name, quality, result.logs.features, result.logs.timing, ate_m, result.status)
+        Args:
+            sequence: of images.
+            config: all settings.
+            name: for the report.
+        """
+        quality = TrackQuality(sequence.rig, sequence.groundtruth())
+        result = run(sequence, config, recorder=quality)
+        accuracy = result.metrics.get("accuracy") or {}
+        ate_m = accuracy.get("se3", {}).get("ate", {}).get("translation_m", {}).get("rmse")
+        return _report(name, quality, result.logs, ate_m, result.status)
 
 
 def _report(
     name: str,
     quality: TrackQuality,
-    counts: Counter[str],
-    timing: TimingLog,
+    logs: RunLogs,
     ate_m: float | None = None,
     status: str = "",
 ) -> FrontendReport:
+    counts, timing = logs.features, logs.timing
     frames = max(len(timing), 1)
     good = counts["tracked"] - counts["recovered"]
     bad = counts["rejected_ransac"] + counts["rejected_map"]
@@ -132,17 +131,3 @@ def _report(
         ate_m,
         status,
     )
-
-
-def parse_frontends(names: Iterable[str]) -> dict[str, list[str]]:
-    """The settings of front ends given as METHOD or METHOD/DETECTOR.
-
-    Returns:
-        Overrides for `load_config`, which refuses unknown ones, by name.
-    """
-    settings = {}
-    for name in names:
-        method, _, detector = name.partition("/")
-        settings[name] = [f"frontend.method={method}"]
-        settings[name] += [f"frontend.detector={detector}"] if detector else []
-    return settings

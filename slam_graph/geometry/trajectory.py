@@ -93,6 +93,16 @@ class Trajectory:
         x, y, z, w = self.quaternions[index]
         return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), self.positions[index])
 
+    def select(self, rows: IntArray | BoolArray) -> Trajectory:
+        """Some of the poses, with all that belongs to them."""
+        optional = {
+            name: None if values is None else values[rows]
+            for name in ("velocities", "accel_biases", "gyro_biases")
+            for values in (getattr(self, name),)
+        }
+        stamps_ns, quaternions = self.stamps_ns[rows], self.quaternions[rows]
+        return Trajectory(stamps_ns, self.positions[rows], quaternions, **optional)
+
     def as_dict(self) -> dict[str, FloatArray | IntArray]:
         """All columns (N,) by name with unit, as for `pandas.DataFrame(trajectory.as_dict())`."""
         columns: dict[str, FloatArray | IntArray] = {"stamp_ns": self.stamps_ns}

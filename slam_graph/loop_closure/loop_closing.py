@@ -21,10 +21,10 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
-from slam_graph.loop_closure.loop_pose_graph import body_poses, drift_sigmas, loop_graph
+from slam_graph.loop_closure.loop_pose_graph import correct_keyframes
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
-from slam_graph.pose_graph import PoseGraphCostPolicy, PoseGraphPolicy, Poses, optimize_pose_graph
+from slam_graph.pose_graph import Poses
 from slam_graph.sensors import Rig
 
 _MAX_PASSES = 3
@@ -129,19 +129,14 @@ def correct_by(
         return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal)
     stamps = np.array([k.stamp_ns for k in keyframes])
     level = config.degrees_of_freedom == 4
-    policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc"))
     accepted = np.ones(len(loops), np.bool_)
     for _ in range(_MAX_PASSES):
         held = np.flatnonzero(accepted)
         kept = [loops[k] for k in held]
-        drift = drift_sigmas(stamps, causal, kept, config)
-        graph = loop_graph(stamps, causal, kept, drift, level)
-        solution = optimize_pose_graph(graph, policy, diagnostics)
-        inliers = solution.weights[len(solution.weights) - len(held) :] > 0.5
+        poses, inliers = correct_keyframes(stamps, causal, kept, config, level, diagnostics)
         accepted[held[~inliers]] = False
         if inliers.all():
             break
-    poses = body_poses(solution.poses, causal, level)
     return LoopClosures(keyframes, loops, accepted, poses)
 
 
@@ -153,9 +148,7 @@ def _find_loops(
         return []
     places = config.places
     vocabulary = Vocabulary.train(
-        [k.descriptors for k in keyframes],
-        places.words,
-        np.random.default_rng(seed),
+        [k.descriptors for k in keyframes], places.words, np.random.default_rng(seed)
     )
     recognition = PlaceRecognition(vocabulary, places)
     verifier = LoopVerifier(rig.cameras[0], config.verification)

@@ -179,6 +179,14 @@ class KeyframeLog:
         self.keyframes.append(keyframe)
         return keyframe
 
+    def at(self, trajectory: Trajectory) -> list[Keyframe]:
+        """The keyframes at the poses of a trajectory; those outside of it keep their poses."""
+        found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in self.keyframes]))
+        keyframes = list(self.keyframes)
+        for row, number in enumerate(np.flatnonzero(valid).tolist()):
+            keyframes[number] = replace(keyframes[number], world_T_body=found.pose(row))
+        return keyframes
+
     def _is_keyframe(self, frame: FeatureFrame, world_T_body: gtsam.Pose3) -> bool:
         if not self.keyframes:
             return True
@@ -215,12 +223,3 @@ class KeyframeLog:
         known = good[place] & (obs.ids[place] == ids)
         points[known] = found.points[place[known]]
         return points
-
-
-def reposed(keyframes: list[Keyframe], trajectory: Trajectory) -> list[Keyframe]:
-    """Keyframes at the poses of a trajectory; those outside of it keep their poses."""
-    found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in keyframes]))
-    keyframes = list(keyframes)
-    for row, number in enumerate(np.flatnonzero(valid).tolist()):
-        keyframes[number] = replace(keyframes[number], world_T_body=found.pose(row))
-    return keyframes

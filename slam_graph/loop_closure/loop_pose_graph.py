@@ -23,10 +23,11 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.pose_graph import ROTATION_FIRST, PoseGraph, Poses
+from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy, Poses, optimize_pose_graph
 
 _MIN_LOOPS = 10
 """With fewer loop closures drift is not learned."""
@@ -34,6 +35,39 @@ _MIN_DRIFT, _MAX_DRIFT = 0.03, 10.0
 """Bounds of the learned drift relative to the configured one."""
 _LEVEL_SIGMA_RAD = 1e-4
 """Standard deviation of roll and pitch in a level graph, which keeps it well conditioned."""
+
+
+def correct_keyframes(
+    stamps_ns: IntArray,
+    poses: Poses,
+    loops: list[Loop],
+    config: LoopClosureConfig,
+    level: bool,
+    diagnostics: Diagnostics | None = None,
+    recording_of: IntArray | None = None,
+) -> tuple[Poses, BoolArray]:
+    """Poses of keyframes without their drift, by loop closures some of which may be false.
+
+    Args:
+        stamps_ns: (N,) times of the keyframes.
+        poses: drifting estimates world_T_body.
+        loops: L, between them.
+        config: the drift of odometry; it is learned in one recording only, because several have no
+            common clock.
+        level: whether gravity determines roll and pitch.
+        diagnostics: counts what went wrong.
+        recording_of: (N,) number of the recording of each keyframe; all are of one if not given.
+
+    Returns:
+        The corrected world_T_body, and (L,) whether the pose graph kept the loop closure.
+    """
+    one = recording_of is None
+    drift = drift_sigmas(stamps_ns, poses, loops, config) if one else _configured_drift(config)
+    graph = loop_graph(stamps_ns, poses, loops, drift, level, recording_of)
+    policy = PoseGraphPolicy.with_gnc("auto" if one else "file")
+    solution = optimize_pose_graph(graph, policy, diagnostics)
+    kept = solution.weights[len(solution.weights) - len(loops) :] > 0.5
+    return body_poses(solution.poses, poses, level), kept
 
 
 def loop_graph(
@@ -69,12 +103,13 @@ def loop_graph(
     sigmas = [shift] * 3 + [yaw] * 3
     edges = np.column_stack([before, before + 1])
     covariances = seconds[:, None, None] * np.diag(np.square(sigmas))
+    name = "loop closures" if recording_of is None else "merged maps"
     graph = PoseGraph(
-        np.arange(count), poses, edges, odometry, np.linalg.inv(covariances), name="loop closures"
+        np.arange(count), poses, edges, odometry, np.linalg.inv(covariances), name=name
     )
     if loops:
-        back = np.argsort(ROTATION_FIRST)
-        covariances = np.array([x.covariance[back[:, None], back] for x in loops])
+        # GTSAM has the rotation first, a pose graph the translation
+        covariances = np.roll([x.covariance for x in loops], 3, axis=(1, 2))
         ends = np.array([(x.first, x.second) for x in loops], dtype=np.int64)
         graph = graph.add_edges(ends, closures, np.linalg.inv(covariances))
     return level_graph(graph) if level else graph
@@ -153,7 +188,7 @@ def drift_sigmas(
         loops: between them.
         config: the drift if there are few loops, or it is not to be learned.
     """
-    configured = config.odometry_rotation_sigma, config.odometry_position_sigma
+    configured = _configured_drift(config)
     if len(loops) < _MIN_LOOPS or not config.learn_drift:
         return configured
     measured = Poses.from_gtsam([x.first_T_second for x in loops])
@@ -172,6 +207,11 @@ def drift_sigmas(
         _sigma(yaw**2, of_yaw, seconds, 1, configured[0]),
         _sigma(np.sum(shift**2, axis=1), of_shift, seconds, 3, configured[1]),
     )
+
+
+def _configured_drift(config: LoopClosureConfig) -> tuple[float, float]:
+    """The drift of odometry that is set."""
+    return config.odometry_rotation_sigma, config.odometry_position_sigma
 
 
 def _sigma(

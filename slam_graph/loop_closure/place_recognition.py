@@ -11,6 +11,7 @@ inverted index reaches the keyframes that share a word without visiting the othe
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -71,6 +72,13 @@ class Vocabulary:
         words, counts = np.unique(self.quantize(descriptors), return_counts=True)
         weights = counts * self.idf[words]
         return WordVector(words, weights / max(float(np.linalg.norm(weights)), 1e-12))
+
+    def index(self, documents: Iterable[Descriptors]) -> PlaceDatabase:
+        """An index of keyframes with these descriptors (N, B) each."""
+        database = PlaceDatabase(len(self.words))
+        for descriptors in documents:
+            database.add(self.words_of(descriptors))
+        return database
 
     @staticmethod
     def train(
@@ -145,6 +153,10 @@ class PlaceDatabase:
         weights = [np.array(self._weights[word], dtype=np.float64) for word in words]
         products = np.concatenate(weights) * np.repeat(bag.weights, [len(x) for x in shared])
         return np.bincount(np.concatenate(shared), products, self._count).astype(np.float64)
+
+    def similar(self, bag: WordVector, count: int) -> IntArray:
+        """The `count` most similar keyframes of different places, best first."""
+        return best_places(self.query(bag), 0.0, count)
 
 
 def best_places(scores: FloatArray, least: float, count: int, apart: int = SAME_PLACE) -> IntArray:

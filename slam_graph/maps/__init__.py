@@ -15,10 +15,7 @@ __all__ = [
     "LocalizationConfig",
     "MapConfig",
     "MapLocalizer",
-    "MapPlaces",
-    "MapPoseFilter",
     "MapRecording",
-    "PoseSource",
     "SlamMap",
     "build_map",
     "merge_maps",
@@ -29,31 +26,25 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.maps.map_building import build_map
     from slam_graph.maps.map_file import read_map, write_map
-    from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter
+    from slam_graph.maps.map_localization import MapLocalizer
     from slam_graph.maps.map_merge import merge_maps
-    from slam_graph.maps.map_model import (
-        LocalizationConfig,
-        MapConfig,
-        MapRecording,
-        PoseSource,
-        SlamMap,
-    )
-    from slam_graph.maps.map_places import MapPlaces
+    from slam_graph.maps.map_model import LocalizationConfig, MapConfig, MapRecording, SlamMap
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "map_building": ("build_map",),
-            "map_file": ("read_map", "write_map"),
-            "map_localization": ("MapLocalizer", "MapPoseFilter"),
+            "map_file": (
+                "read_map",
+                "write_map",
+            ),
+            "map_localization": ("MapLocalizer",),
             "map_merge": ("merge_maps",),
             "map_model": (
                 "LocalizationConfig",
                 "MapConfig",
                 "MapRecording",
-                "PoseSource",
                 "SlamMap",
             ),
-            "map_places": ("MapPlaces",),
         },
     )

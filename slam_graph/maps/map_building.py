@@ -12,12 +12,11 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.loop_closure import Keyframe, Loop, PlaceConfig, VerificationConfig, Vocabulary
+from slam_graph.loop_closure import Keyframe, Loop, LoopClosureConfig, Vocabulary
 from slam_graph.maps.map_model import (
     NO_FEATURE,
     Links,
@@ -35,9 +34,7 @@ def build_map(
     poses: Poses,
     recording: MapRecording,
     loops: list[Loop],
-    places: PlaceConfig,
-    verification: VerificationConfig,
-    gravity_aligned: bool = True,
+    config: LoopClosureConfig,
     seed: int = 0,
 ) -> SlamMap:
     """The map of one recording.
@@ -47,9 +44,8 @@ def build_map(
         poses: K best estimates world_T_body.
         recording: the recording.
         loops: accepted loop closures, whose matches become one feature.
-        places: size of the vocabulary.
-        verification: largest reprojection error of an observation.
-        gravity_aligned: whether the z axis of the world is up.
+        config: size of the vocabulary, largest reprojection error of an observation, and whether
+            the z axis of the world is up (4 degrees of freedom).
         seed: of the training.
     """
     offsets = np.cumsum([0, *(len(k.descriptors) for k in keyframes)])
@@ -59,7 +55,7 @@ def build_map(
         (recording,),
         datetime.now(UTC).isoformat(timespec="seconds"),
         __version__,
-        gravity_aligned,
+        config.degrees_of_freedom == 4,
         np.zeros(len(keyframes), np.int64),
         np.array([k.stamp_ns for k in keyframes], np.int64),
         poses,
@@ -70,21 +66,12 @@ def build_map(
         np.concatenate([k.normalized for k in keyframes]),
         np.concatenate([k.descriptors for k in keyframes]),
         links_of(loops),
-        train_vocabulary([k.descriptors for k in keyframes], places, seed),
+        Vocabulary.train(
+            [k.descriptors for k in keyframes], config.places.words, np.random.default_rng(seed)
+        ),
     )
     body_points = np.concatenate([k.points for k in keyframes])
-    return with_points(whole, features, body_points, verification.max_error_px)
-
-
-def train_vocabulary(
-    documents: list[NDArray[np.uint8]], places: PlaceConfig, seed: int
-) -> Vocabulary:
-    """A vocabulary of the descriptors (N, B) of all keyframes."""
-    return Vocabulary.train(
-        documents,
-        places.words,
-        np.random.default_rng(seed),
-    )
+    return with_points(whole, features, body_points, config.verification.max_error_px)
 
 
 def links_of(loops: list[Loop]) -> Links:

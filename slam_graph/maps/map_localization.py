@@ -25,9 +25,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
-from slam_graph.loop_closure import Keyframe
-from slam_graph.maps.map_model import LocalizationConfig
+from slam_graph.loop_closure import Keyframe, LoopClosureConfig
+from slam_graph.maps.map_model import LocalizationConfig, SlamMap
 from slam_graph.maps.map_places import MapPlaces, PlaceMatch
+from slam_graph.sensors import Rig
 
 CONFIDENCE = 0.999
 """χ² quantile of consistent matches: so high because a rejected true match costs little."""
@@ -174,10 +175,13 @@ class MapLocalizer:
     """Estimates the pose of a run in a map.
 
     Args:
-        places: of the map.
-        config: settings.
+        content: the map.
+        rig: of the run; only its first camera is used.
+        loops: settings of verification.
+        config: settings of localization.
 
     Attributes:
+        places: of the map.
         filter: the pose in the map at the last frame; None where it is unknown.
         queries: number of frames that were compared with the map.
         matches: number of these that matched a place.
@@ -185,11 +189,14 @@ class MapLocalizer:
         starts: how often the filter started.
     """
 
-    def __init__(self, places: MapPlaces, config: LocalizationConfig) -> None:
+    def __init__(
+        self, content: SlamMap, rig: Rig, loops: LoopClosureConfig, config: LocalizationConfig
+    ) -> None:
+        self.places = MapPlaces(content, rig, loops, config.neighbours)
         self.filter: MapPoseFilter | None = None
         self.queries = self.matches = self.accepted = self.starts = 0
-        self._places, self._config = places, config
-        self._level = places.map.gravity_aligned
+        self._config = config
+        self._level = content.gravity_aligned
         self._pending: list[_Measurement] = []
         self._rejected = 0
         self._queried_ns: int | None = None
@@ -240,12 +247,11 @@ class MapLocalizer:
 
     def _place_match(self, view: Keyframe) -> PlaceMatch | None:
         """The match of a view: with the nearest place, or else with the best of similar ones."""
-        places, config = self._places, self._config
+        places, config = self.places, self._config
         if self.located and self.filter is not None:
-            for number in places.nearest(self.filter.pose, 1).tolist():
-                match = places.locate(view, number, self._level)
-                if match is not None:
-                    return match
+            match = places.locate(view, places.nearest(self.filter.pose), self._level)
+            if match is not None:
+                return match
         found = [
             match
             for number in places.similar(view.descriptors, config.candidates).tolist()

@@ -20,13 +20,11 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.loop_closure import Loop, LoopClosureConfig, body_poses, loop_graph
+from slam_graph.loop_closure import Loop, LoopClosureConfig, Vocabulary, correct_keyframes
 from slam_graph.maps.map_building import (
     links_of,
     merged_groups,
-    train_vocabulary,
     with_points,
 )
 from slam_graph.maps.map_localization import (
@@ -36,7 +34,7 @@ from slam_graph.maps.map_localization import (
 )
 from slam_graph.maps.map_model import NO_FEATURE, LocalizationConfig, SlamMap
 from slam_graph.maps.map_places import MapPlaces, PlaceMatch
-from slam_graph.pose_graph import PoseGraphCostPolicy, PoseGraphPolicy, Poses, optimize_pose_graph
+from slam_graph.pose_graph import Poses
 from slam_graph.version import __version__
 
 MIN_LINKS = 5
@@ -123,8 +121,10 @@ def merge_maps(
         joined,
         poses=poses,
         links=joined.links.concatenated(links_of([_link(one, len(first)) for one in accepted])),
-        vocabulary=train_vocabulary(
-            [joined.descriptors_of(n) for n in range(len(joined))], loops.places, seed
+        vocabulary=Vocabulary.train(
+            [joined.descriptors_of(n) for n in range(len(joined))],
+            loops.places.words,
+            np.random.default_rng(seed),
         ),
     )
     error_px = 2.0 * loops.verification.max_error_px  # two maps do not fit as well as one
@@ -198,14 +198,11 @@ def _solved(
     # an edge between consecutive numbers would count as odometry, which is never rejected
     usable = [abs(loop.first - loop.second) > 1 for loop in between]
     loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
-    # two recordings have no common clock, so that their drift cannot be learned
-    drift = (config.odometry_rotation_sigma, config.odometry_position_sigma)
-    graph = loop_graph(joined.stamps_ns, joined.poses, loops, drift, level, joined.recording_of)
-    policy = PoseGraphPolicy(cost=PoseGraphCostPolicy(robust="gnc", initialization="file"))
-    solution = optimize_pose_graph(replace(graph, name="merged maps"), policy, Diagnostics())
-    poses = body_poses(solution.poses, joined.poses, level)
-    weights = iter(solution.weights[len(solution.weights) - sum(usable) :].tolist())
-    return poses, [good and next(weights) > 0.5 for good in usable]
+    poses, inliers = correct_keyframes(
+        joined.stamps_ns, joined.poses, loops, config, level, recording_of=joined.recording_of
+    )
+    kept = iter(inliers[len(inner) :].tolist())
+    return poses, [good and next(kept) for good in usable]
 
 
 def _body_points(content: SlamMap) -> FloatArray:
@@ -285,7 +282,7 @@ def _matched(
         DataError: if the maps have different kinds of descriptors.
     """
     for number, recording in enumerate(second.recordings):
-        places = MapPlaces(first, recording.rig, loops.verification, localization.neighbours)
+        places = MapPlaces(first, recording.rig, loops, localization.neighbours)
         places.check(second.descriptors, _names(second))
         for row in np.flatnonzero(second.recording_of == number).tolist():
             view = second.keyframe(row)

@@ -15,12 +15,13 @@ from typing import Any, ClassVar, Literal
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry import Trajectory
-from slam_graph.loop_closure import Descriptors, Keyframe, Vocabulary, majority
+from slam_graph.loop_closure import Keyframe, Vocabulary
 from slam_graph.pose_graph import Poses
 from slam_graph.sensors import Rig
 from slam_graph.settings import Settings, expert
@@ -147,11 +148,11 @@ class SlamMap:
     stamps_ns: IntArray
     poses: Poses
     points: FloatArray
-    feature_descriptors: Descriptors
+    feature_descriptors: NDArray[np.uint8]
     offsets: IntArray
     features: IntArray
     normalized: FloatArray
-    descriptors: Descriptors
+    descriptors: NDArray[np.uint8]
     links: Links
     vocabulary: Vocabulary
 
@@ -175,7 +176,7 @@ class SlamMap:
         """world_T_body of a keyframe."""
         return self.poses.pose3(number)
 
-    def descriptors_of(self, number: int) -> Descriptors:
+    def descriptors_of(self, number: int) -> NDArray[np.uint8]:
         """(n, B) descriptors of a keyframe."""
         return self.descriptors[self.offsets[number] : self.offsets[number + 1]]
 
@@ -233,7 +234,9 @@ def in_body(pose: gtsam.Pose3, points: FloatArray) -> FloatArray:
     return np.asarray((points - pose.translation()) @ rotation)
 
 
-def majority_descriptors(descriptors: Descriptors, features: IntArray, count: int) -> Descriptors:
+def majority_descriptors(
+    descriptors: NDArray[np.uint8], features: IntArray, count: int
+) -> NDArray[np.uint8]:
     """(P, B) majority of the descriptors of each feature, bit by bit; zeros without observations.
 
     Args:
@@ -241,14 +244,13 @@ def majority_descriptors(descriptors: Descriptors, features: IntArray, count: in
         features: (N,) the observed features; negative ones are left out.
         count: P.
     """
-    known = features >= 0
+    rows = np.flatnonzero(features >= 0)
+    shape = (count, len(descriptors))
+    observed = csr_matrix((np.ones(len(rows), np.int32), (features[rows], rows)), shape=shape)
+    half = 0.5 * np.bincount(features[rows], minlength=count)[:, None]
     found = np.zeros((count, descriptors.shape[1]), np.uint8)
-    if not known.any():
-        return found
-    for byte in range(
-        descriptors.shape[1]
-    ):  # all bits of a long recording at once would take gigabytes
-        column = slice(byte, byte + 1)
-        bits = np.unpackbits(descriptors[known, column], axis=1).astype(np.int32)
-        found[:, column] = majority(bits, features[known], found[:, column])
+    # all bits of a long recording at once would take gigabytes
+    for byte in range(descriptors.shape[1]):
+        bits = np.unpackbits(descriptors[:, byte : byte + 1], axis=1).astype(np.int32)
+        found[:, byte : byte + 1] = np.packbits(observed @ bits > half, axis=1)
     return found

@@ -8,18 +8,11 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.loop_closure import (
-    Descriptors,
-    Keyframe,
-    Loop,
-    LoopVerifier,
-    PlaceDatabase,
-    VerificationConfig,
-    best_places,
-)
+from slam_graph.loop_closure import Keyframe, Loop, LoopClosureConfig, LoopVerifier
 from slam_graph.maps.map_model import SlamMap, in_body
 from slam_graph.sensors import Rig
 
@@ -56,7 +49,7 @@ class MapPlaces:
     Args:
         content: the map.
         rig: of the views; only its first camera is used.
-        verification: thresholds.
+        config: thresholds of verification.
         neighbours: number of covisible keyframes of a place.
     """
 
@@ -64,19 +57,17 @@ class MapPlaces:
         self,
         content: SlamMap,
         rig: Rig,
-        verification: VerificationConfig,
+        config: LoopClosureConfig,
         neighbours: int,
     ) -> None:
         self.map = content
         self._neighbours = neighbours
-        self._verifier = LoopVerifier(rig.cameras[0], verification)
-        self._database = PlaceDatabase(len(content.vocabulary.words))
-        for number in range(len(content)):
-            self._database.add(content.vocabulary.words_of(content.descriptors_of(number)))
+        self._verifier = LoopVerifier(rig.cameras[0], config.verification)
+        self._database = content.vocabulary.index(map(content.descriptors_of, range(len(content))))
         self._shared = content.seen_by.minimum(1)
         self._places: dict[int, Keyframe] = {}
 
-    def check(self, descriptors: Descriptors, name: str) -> None:
+    def check(self, descriptors: NDArray[np.uint8], name: str) -> None:
         """Check that descriptors are of the kind of the map.
 
         Raises:
@@ -89,19 +80,17 @@ class MapPlaces:
                 "the same ones"
             )
 
-    def similar(self, descriptors: Descriptors, count: int) -> IntArray:
+    def similar(self, descriptors: NDArray[np.uint8], count: int) -> IntArray:
         """The keyframes most similar to a view with descriptors (N, B), best first."""
-        scores = self._database.query(self.map.vocabulary.words_of(descriptors))
-        return best_places(scores, 0.0, count)
+        return self._database.similar(self.map.vocabulary.words_of(descriptors), count)
 
-    def nearest(self, world_T_body: gtsam.Pose3, count: int) -> IntArray:
-        """The keyframes nearest to a pose, in position and orientation, best first."""
+    def nearest(self, world_T_body: gtsam.Pose3) -> int:
+        """The keyframe nearest to a pose, in position and orientation."""
         poses = self.map.poses
         away = np.linalg.norm(poses.translations - world_T_body.translation(), axis=1)
         # |R - S|² = 8 for a half turn
         turned = np.linalg.norm(poses.rotations - world_T_body.rotation().matrix(), axis=(1, 2))
-        near = 1.0 / (1.0 + away + turned * _HALF_TURN_M / np.sqrt(8.0))
-        return best_places(near, 0.0, count)
+        return int(np.argmin(away + turned * _HALF_TURN_M / np.sqrt(8.0)))
 
     def locate(self, view: Keyframe, number: int, gravity: bool) -> PlaceMatch | None:
         """Localize a view at a keyframe of the map; None if verification fails.

@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "TrackedPacket",
     "Tracking",
     "run",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.pipeline.run_recording import run
-    from slam_graph.pipeline.tracking import TrackedPacket, Tracking
+    from slam_graph.pipeline.tracking import Tracking
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "run_recording": ("run",),
-            "tracking": ("TrackedPacket", "Tracking"),
+            "tracking": ("Tracking",),
         },
     )

@@ -13,21 +13,15 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry import NavState
-from slam_graph.loop_closure import (
-    Keyframe,
-    KeyframeDescriber,
-    KeyframeLog,
-    Loop,
-    close_loops,
-    reposed,
-)
-from slam_graph.maps import MapLocalizer, MapPlaces, MapRecording, PoseSource, SlamMap, build_map
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.loop_closure import Keyframe, KeyframeDescriber, KeyframeLog, Loop, close_loops
+from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
 from slam_graph.results import LocalizationLog, RunResult
@@ -68,6 +62,10 @@ class Keyframes(Stage):
         """All keyframes so far, with causal poses."""
         return self._log.keyframes
 
+    def at(self, trajectory: Trajectory) -> list[Keyframe]:
+        """All keyframes so far, with the poses of a trajectory where it has them."""
+        return self._log.at(trajectory)
+
 
 class LoopClosing(Stage):
     """Closes the loops of a run; the causal and the smoothed trajectory stay as they are.
@@ -92,7 +90,7 @@ class LoopClosing(Stage):
         began = time.perf_counter()
         with warn_on_failure(self._diagnostics, "loop_closure_failed", "no loops are closed"):
             closures = close_loops(
-                reposed(self._keyframes.found, result.best_trajectory),
+                self._keyframes.at(result.best_trajectory),
                 result.input.rig,
                 result.config.loop_closure,
                 result.config.seed,
@@ -128,25 +126,31 @@ class MapBuilding(Stage):
             self._diagnostics.warn("map_impossible", NOT_RECOGNISABLE)
             return
         with warn_on_failure(self._diagnostics, "map_failed", "no map is built"):
-            self._result.slam_map = made = _build(self._result, self._keyframes.found)
+            self._result.slam_map = made = _build(self._result, self._keyframes)
             logger.info("map: %d keyframes, %d features", len(made), len(made.points))
 
 
-def _build(result: RunResult, keyframes: list[Keyframe]) -> SlamMap:
-    """The map of the keyframes at their best poses."""
-    config = result.config.loop_closure
-    loops = _accepted_loops(result)
-    source, poses = _best_poses(result, keyframes, loops)
-    return build_map(
-        keyframes,
-        poses,
-        MapRecording(result.input.info.name, source, result.input.rig),
-        loops,
-        config.places,
-        config.verification,
-        config.degrees_of_freedom == 4,
-        result.config.seed,
-    )
+def _build(result: RunResult, keyframes: Keyframes) -> SlamMap:
+    """The map of the keyframes at their best poses.
+
+    After accepted loop closures these are the corrected poses, else the smoothed ones, else the
+    causal ones.
+    """
+    config, loops = result.config, _accepted_loops(result)
+    recording = MapRecording(result.input.info.name, "causal", result.input.rig)
+    if loops and result.loops is not None:
+        recording, poses = replace(recording, poses="loop_closed"), result.loops.poses
+    elif result.final_ba is not None:
+        recording = replace(recording, poses="smoothed")
+        poses = _poses(keyframes.at(result.final_ba.trajectory))
+    else:
+        poses = _poses(keyframes.found)
+    return build_map(keyframes.found, poses, recording, loops, config.loop_closure, config.seed)
+
+
+def _poses(keyframes: list[Keyframe]) -> Poses:
+    """(K,) world_T_body of keyframes."""
+    return Poses.from_gtsam([k.world_T_body for k in keyframes])
 
 
 def _accepted_loops(result: RunResult) -> list[Loop]:
@@ -154,22 +158,6 @@ def _accepted_loops(result: RunResult) -> list[Loop]:
         return []
     pairs = zip(result.loops.loops, result.loops.accepted.tolist(), strict=True)
     return [loop for loop, accepted in pairs if accepted]
-
-
-def _best_poses(
-    result: RunResult, keyframes: list[Keyframe], loops: list[Loop]
-) -> tuple[PoseSource, Poses]:
-    """The best world_T_body of all keyframes, and where they come from.
-
-    After accepted loop closures these are the corrected poses, else the smoothed ones, else the
-    causal ones.
-    """
-    if loops and result.loops is not None:
-        return "loop_closed", result.loops.poses
-    if result.final_ba is not None:
-        smoothed = reposed(keyframes, result.final_ba.trajectory)
-        return "smoothed", Poses.from_gtsam([k.world_T_body for k in smoothed])
-    return "causal", Poses.from_gtsam([k.world_T_body for k in keyframes])
 
 
 class Localization(Stage):
@@ -182,10 +170,8 @@ class Localization(Stage):
     """
 
     def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
-        rig, config = result.input.rig, result.config
-        loops, settings = config.loop_closure, config.localization
-        self._places = MapPlaces(known, rig, loops.verification, settings.neighbours)
-        self._localizer = MapLocalizer(self._places, settings)
+        rig, loops = result.input.rig, result.config.loop_closure
+        self._localizer = MapLocalizer(known, rig, loops, result.config.localization)
         self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.localization = LocalizationLog(known)
@@ -205,13 +191,17 @@ class Localization(Stage):
         if localizer.wants(state.stamp_ns):
             view = self._view(frame, state)
             if view is not None:
-                self._places.check(view.descriptors, self._name)
+                localizer.places.check(view.descriptors, self._name)
                 try:
                     localizer.match(view)
                 except (cv2.error, np.linalg.LinAlgError) as error:
                     reason = " ".join(str(error).split())[:200]
                     self._diagnostics.warn("localization_query_failed", reason)
-        self._log.append(state.stamp_ns, localizer.filter, localizer.located)
+        known = localizer.filter
+        if known is None:
+            self._log.append(state.stamp_ns, localizer.located)
+        else:
+            self._log.append(state.stamp_ns, localizer.located, known.pose, known.position_sigma)
         self._log.seconds += time.perf_counter() - began
 
     def _view(self, frame: EstimatedFrame, state: NavState) -> Keyframe | None:

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Protocol, TypeGuard
 
+from slam_graph.arrays import FloatArray
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry import NavState, Trajectory
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame, ImuData
-from slam_graph.visualization import Viewer
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 _FIRST_STAMP = 1_000_000_000
 """Whole numbers from here on are stamps in nanoseconds."""
@@ -65,6 +66,35 @@ def _is_stamp(time: int | float) -> TypeGuard[int]:
     return isinstance(time, int) and time >= _FIRST_STAMP
 
 
+class Viewer(Protocol):
+    """Watches a run."""
+
+    def open(self, rig: Rig, truth: Trajectory | None) -> None:
+        """Called once, before the first frame."""
+        ...
+
+    def show(
+        self,
+        frame: CameraFrame | FeatureFrame,
+        features: FeatureFrame,
+        state: NavState | None,
+        points: FloatArray,
+    ) -> None:
+        """Called after each frame.
+
+        Args:
+            frame: images, or recorded features.
+            features: what the front end found in the frame.
+            state: the causal estimate, or None before initialisation.
+            points: (N, 3) positions of the features that are estimated now, in the world, m.
+        """
+        ...
+
+    def close(self) -> None:
+        """Called once, after the last frame, however the run ended."""
+        ...
+
+
 class Progress(Protocol):
     """Reports how far a run is."""
 
@@ -94,6 +124,25 @@ class Recorder(Protocol):
             frame: what the front end found.
         """
         ...
+
+
+class NullViewer:
+    """Shows nothing."""
+
+    def open(self, rig: Rig, truth: Trajectory | None) -> None:
+        """Show nothing."""
+
+    def show(
+        self,
+        frame: CameraFrame | FeatureFrame,
+        features: FeatureFrame,
+        state: NavState | None,
+        points: FloatArray,
+    ) -> None:
+        """Show nothing."""
+
+    def close(self) -> None:
+        """Show nothing."""
 
 
 class NullProgress:

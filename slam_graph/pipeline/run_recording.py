@@ -21,16 +21,17 @@ from slam_graph.pipeline.observers import (
     GraphKeeping,
     NullProgress,
     NullRecorder,
+    NullViewer,
     Observers,
     Progress,
     Recorder,
+    Viewer,
 )
 from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
 from slam_graph.pipeline.supervision import interrupts_between_frames, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
 from slam_graph.results import RunInput, RunResult
-from slam_graph.visualization import NullViewer, Viewer
 
 
 def run(

@@ -8,15 +8,46 @@ frame k reaches the front end before frame k + 2, in either mode: results are th
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+import time
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 from slam_graph.datasets import Sequence
 from slam_graph.frontend import Feedback, Frontend
-from slam_graph.results import RunInput, Stopwatch, milliseconds
+from slam_graph.results import RunInput
 from slam_graph.sensors import CameraFrame, FeatureFrame, Packet
+
+
+class Stopwatch:
+    """Times the stages of one frame.
+
+    Attributes:
+        milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
+    """
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {"total": 0.0}
+        self._since = time.perf_counter()
+
+    def restart(self) -> None:
+        """Do not count the time since the last stage ended."""
+        self._since = time.perf_counter()
+
+    def lap(self, stage: str, parts: Mapping[str, float] | None = None) -> None:
+        """End a stage, which began when the stage before it ended.
+
+        Args:
+            stage: its name.
+            parts: milliseconds of its parts, by name; they were timed elsewhere.
+        """
+        now = time.perf_counter()
+        elapsed_ms = 1e3 * (now - self._since)
+        self.milliseconds[stage] = elapsed_ms
+        self.milliseconds["total"] += elapsed_ms
+        self.milliseconds |= {f"{stage}.{part}": value for part, value in (parts or {}).items()}
+        self._since = now
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +119,15 @@ class Tracking:
         clock.lap("read")
         features = self._frontend.track(packet.frame, packet.imu)
         stats = dict(self._frontend.frame_stats)
-        clock.lap("frontend", milliseconds(stats))
+        clock.lap("frontend", _milliseconds(stats))
         return TrackedPacket(packet, features, stats, clock)
+
+
+def _milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:
+    """The stages among what a front end counts: the keys that end in `_ms`, without that end."""
+    return {
+        key.removesuffix("_ms"): value for key, value in frame_stats.items() if key.endswith("_ms")
+    }
 
 
 def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:

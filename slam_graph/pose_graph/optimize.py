@@ -9,14 +9,13 @@ Leonard and Dellaert 2012), and ends with Gauss-Newton. Orderings are COLAMD's: 
 default elsewhere, crashes on poses without edges.
 
 Cost construction takes all poses and no features, Gauss-Newton goes on until convergence, and
-nothing is marginalised, so that one pass of the loop is the whole algorithm. `marginal_covariances`
-gives the uncertainty of the optimum.
+nothing is marginalised, so that one pass of the loop is the whole algorithm.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from heapq import heappop, heappush
 from typing import Any
@@ -32,21 +31,17 @@ from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_cost import PoseGraphCost, construct, loss_weights
 from slam_graph.pose_graph.graph_initialization import initialize
 from slam_graph.pose_graph.gtsam_graph import (
-    ROTATION_FIRST,
-    anchor_factors,
-    edge_factors,
     factor_graph,
     gtsam_poses,
     poses_of,
     values_of,
 )
 from slam_graph.pose_graph.pose_graph_policy import (
-    Minimum,
     PoseGraphCostPolicy,
     PoseGraphPolicy,
-    PoseGraphSolution,
     PoseGraphStepsPolicy,
 )
+from slam_graph.pose_graph.pose_graph_solution import Minimum, PoseGraphSolution
 
 _NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each edge is rounding: all edges agree."""
@@ -308,34 +303,3 @@ def _weights(cost: PoseGraphCost, poses: Poses, weights: FloatArray) -> FloatArr
     final = weights.copy()
     final[cost.rows] *= loss_weights(cost, poses)
     return final
-
-
-def marginal_covariances(
-    solution: PoseGraphSolution, rows: Sequence[int] | None = None
-) -> FloatArray:
-    """(K, k, k) marginal covariances of some poses, or of all.
-
-    In the tangent at each pose, T exp(δ), in the order of files: translation (m), then rotation
-    (rad), both in the frame of the pose. The first pose of each connected component is fixed: its
-    covariance is zero.
-
-    Args:
-        solution: the optimum and the weights of its edges.
-        rows: of the poses; all if not given.
-
-    Raises:
-        EstimationError: if a pose is not determined.
-    """
-    weighted = solution.weighted_graph()
-    factors = edge_factors(weighted, range(len(weighted.edges)))
-    held = factor_graph([*factors, *anchor_factors(weighted, held=True)])
-    rows = range(len(solution.poses)) if rows is None else rows
-    try:
-        marginals = gtsam.Marginals(held, values_of(solution.poses))
-        found = np.array([marginals.marginalCovariance(row) for row in rows])
-    except RuntimeError as error:
-        raise EstimationError(f"{solution.graph.name}: a pose is not determined") from error
-    if solution.graph.dimension == 3:
-        translation_first = np.argsort(ROTATION_FIRST)
-        found = found[:, translation_first[:, None], translation_first]
-    return found

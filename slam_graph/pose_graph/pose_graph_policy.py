@@ -1,27 +1,25 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pose-graph optimisation (a row of the table of policies), and its solution.
+"""Settings of pose-graph optimisation (a row of the table of policies).
 
 Cost construction: all poses, no features. Gauss-Newton: until convergence. Marginalization: none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
-from slam_graph.arrays import FloatArray
-from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.settings import Settings, expert
+
+Initialization = Literal["auto", "chordal", "lago", "odometry", "file"]
 
 
 class PoseGraphCostPolicy(Settings):
     """Module 1: all poses and all edges, and how outliers among the edges are handled."""
 
-    initialization: Literal["auto", "chordal", "lago", "odometry", "file"] = "auto"
+    initialization: Initialization = "auto"
     """Initial estimates. auto: chordal, or odometry with a robust loss. Choose file to stay in the
     basin of the estimates that the file has, or another one where --certify refuses the result."""
     robust: Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"] = "none"
@@ -60,46 +58,9 @@ class PoseGraphPolicy(Settings):
     gauss_newton: PoseGraphStepsPolicy = PoseGraphStepsPolicy()
     """Gauss-Newton steps."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Minimum:
-    """Where the steps ended.
-
-    Attributes:
-        poses: all poses.
-        cost: their cost.
-        steps: number of steps.
-        converged: whether the cost stopped falling before the number of steps was used up.
-    """
-
-    poses: Poses
-    cost: float
-    steps: int
-    converged: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseGraphSolution:
-    """The result of an optimisation.
-
-    Attributes:
-        graph: the problem.
-        start: initial estimates.
-        minimum: where the steps ended.
-        weights: (M,) of the edges, from 0 (rejected) to 1.
-    """
-
-    graph: PoseGraph
-    start: Poses
-    minimum: Minimum
-    weights: FloatArray
-
-    @property
-    def poses(self) -> Poses:
-        """The estimates."""
-        return self.minimum.poses
-
-    def weighted_graph(self) -> PoseGraph:
-        """The problem with the final weights, without rejected edges."""
-        rows = np.flatnonzero(self.weights > 0)
-        return self.graph.keep_edges(rows).weighted(self.weights[rows])
+    @staticmethod
+    def with_gnc(initialization: Initialization = "auto") -> PoseGraphPolicy:
+        """The defaults, with false loop closures found by graduated non-convexity."""
+        return PoseGraphPolicy(
+            cost=PoseGraphCostPolicy(robust="gnc", initialization=initialization)
+        )

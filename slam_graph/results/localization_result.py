@@ -8,13 +8,14 @@ from array import array
 from collections.abc import Iterator
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import accuracy_report, ape, synchronize
 from slam_graph.geometry import Similarity, Trajectory, align_yaw, umeyama
-from slam_graph.maps import MapPoseFilter, SlamMap
+from slam_graph.maps import SlamMap
 
 _POSE_WIDTH = 7
 _LEAST_SHARED = 3
@@ -42,23 +43,29 @@ class LocalizationLog:
         self._sigmas = array("d")
         self._poses = array("d")
 
-    def append(self, stamp_ns: int, estimate: MapPoseFilter | None, located: bool) -> None:
+    def append(
+        self,
+        stamp_ns: int,
+        located: bool,
+        world_T_body: gtsam.Pose3 | None = None,
+        position_sigma: float = np.nan,
+    ) -> None:
         """Add a frame.
 
         Args:
             stamp_ns: its time.
-            estimate: of the pose in the map, if there is one.
             located: whether the estimate is certain enough to count as located.
+            world_T_body: estimate of the pose in the map, if there is one.
+            position_sigma: its standard deviation on the axis where it is largest, m.
         """
         self._stamps_ns.append(stamp_ns)
         self._located.append(located)
-        if estimate is None:
-            self._sigmas.append(np.nan)
+        self._sigmas.append(position_sigma)
+        if world_T_body is None:
             self._poses.extend([np.nan] * _POSE_WIDTH)
             return
-        self._sigmas.append(estimate.position_sigma)
-        quaternion: Any = estimate.pose.rotation().toQuaternion()  # unknown to the stubs
-        self._poses.extend([*estimate.pose.translation(), *quaternion.coeffs()])
+        quaternion: Any = world_T_body.rotation().toQuaternion()  # unknown to the stubs
+        self._poses.extend([*world_T_body.translation(), *quaternion.coeffs()])
 
     def count(self, **counts: int) -> None:
         """Set counts, by name."""

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -128,11 +130,8 @@ def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
     """
     path = Path(path)
     refuse_to_replace(path, force)
-    try:
-        with appearing(path) as partial:
-            write_map(partial, content)
-    except OSError as error:
-        raise DataError(f"{path}: map cannot be written ({error.strerror or error})") from error
+    with _writable(path, "map "), appearing(path) as partial:
+        write_map(partial, content)
 
 
 def load_map(path: Path | str) -> SlamMap:
@@ -165,37 +164,51 @@ def find_map(path: Path | str) -> Path:
     )
 
 
-def export_ply(content: SlamMap, path: Path | str, force: bool = False) -> None:
-    """Write the points of a map, and its keyframes in red, as a PLY point cloud.
+def export_map(
+    content: SlamMap, ply: Path | None = None, tum: Path | None = None, force: bool = False
+) -> list[Path]:
+    """Write a map in formats of other programs; nothing is written if one of the files exists.
 
-    Raises:
-        DataError: if the file exists or cannot be written.
-    """
-    path = Path(path)
-    refuse_to_replace(path, force)
-    try:
-        write_ply(path, content.points, content.poses.translations)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
-def export_tum(content: SlamMap, path: Path | str, force: bool = False) -> list[Path]:
-    """Write the keyframes of a map as TUM trajectories, one for each recording.
+    Args:
+        content: the map.
+        ply: the points, and the keyframes in red, as a point cloud.
+        tum: the keyframes as TUM trajectories, one for each recording: this file, or several with
+            the number of the recording before the suffix.
+        force: whether existing files may be replaced.
 
     Returns:
-        The files: `path`, or several with the number of the recording before the suffix.
+        The files.
 
     Raises:
         DataError: if a file exists or cannot be written.
     """
-    path = Path(path)
-    count = len(content.recordings)
-    paths = [path.with_stem(f"{path.stem}_{n}") if count > 1 else path for n in range(count)]
-    for file in paths:
+    clouds = [] if ply is None else [ply]
+    tracks = [] if tum is None else _numbered(tum, len(content.recordings))
+    for file in (*clouds, *tracks):
         refuse_to_replace(file, force)
-    for file, trajectory in zip(paths, content.trajectories(), strict=True):
-        try:
+    for file in clouds:
+        with _writable(file):
+            write_ply(file, content.points, content.poses.translations)
+    for file, trajectory in zip(tracks, content.trajectories(), strict=False):
+        with _writable(file):
             write_text(file, tum_lines(trajectory))
-        except OSError as error:
-            raise DataError(f"{file}: cannot be written ({error.strerror or error})") from error
-    return paths
+    return [*clouds, *tracks]
+
+
+def _numbered(path: Path, count: int) -> list[Path]:
+    """Paths of `count` files: the path itself if it is only one."""
+    return [path.with_stem(f"{path.stem}_{n}") if count > 1 else path for n in range(count)]
+
+
+@contextmanager
+def _writable(path: Path, what: str = "") -> Iterator[None]:
+    """Say which file cannot be written.
+
+    Raises:
+        DataError: if the block raises an error of the system (a full disk, no permission).
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"{path}: {what}cannot be written ({reason})") from error

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import bz2
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,25 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.bundle_adjustment import (
-    BalEstimates,
-    BalPolicy,
-    BalSolution,
-    bal_lines,
-    reprojection_errors,
-)
+from slam_graph.bundle_adjustment import BalPolicy, BalSolution
 from slam_graph.config import dump_yaml
 from slam_graph.geometry import tum_lines
-from slam_graph.pose_graph import (
-    Certificate,
-    PoseGraphPolicy,
-    PoseGraphSolution,
-    Poses,
-    along_tree,
-    chi2_of_edges,
-    chi2_table,
-    g2o_lines,
-)
+from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder, appearing, write_text
@@ -67,20 +52,6 @@ class BalResult:
         return self.solution.problem.name
 
     @cached_property
-    def after(self) -> BalEstimates:
-        """The estimates of the cameras and points that were in the cost."""
-        return self.solution.estimates.select(self.solution.part.cameras, self.solution.part.points)
-
-    @cached_property
-    def errors_px(self) -> dict[str, FloatArray]:
-        """Reprojection errors of the observations in the cost: (N,) before and after."""
-        problem = self.solution.part.problem
-        return {
-            "before": reprojection_errors(problem, problem.estimates),
-            "after": reprojection_errors(problem, self.after),
-        }
-
-    @cached_property
     def metrics(self) -> Table:
         """The content of `metrics.json`; JSON can hold every value of it."""
         problem, part, minimum = self.solution.problem, self.solution.part, self.solution.minimum
@@ -106,7 +77,7 @@ class BalResult:
                         "median": float(np.median(errors)),
                         "max": float(np.max(errors)),
                     }
-                    for stage, errors in self.errors_px.items()
+                    for stage, errors in self.solution.errors_px.items()
                 },
                 "steps": minimum.steps,
                 "rejected_steps": minimum.rejected,
@@ -128,33 +99,32 @@ class BalResult:
             The files, in the order in which they were written.
         """
         files = ResultFolder(folder)
-        files.text("optimized.txt", self.lines())
+        files.text("optimized.txt", self.solution.lines())
         files.text("config.yaml", [dump_yaml(self.policy)])
         files.json("metrics.json", self.metrics)
-        write_ply(files.path("scene.ply"), self.after.points, self.after.centres())
-        self._draw(files.path("bundle_adjustment.png"))
+        adjusted = self.solution.adjusted
+        write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
+        self._draw(files)
         return files.files
-
-    def lines(self) -> Iterable[str]:
-        """The whole problem with its estimates, in BAL's format."""
-        return bal_lines(self.solution.problem, self.solution.estimates)
 
     def save_problem(self, path: Path | str) -> None:
         """Write the whole problem with its estimates, compressed if the name ends with `.bz2`."""
         path = Path(path)
         if path.suffix != ".bz2":
-            write_text(path, self.lines())
+            write_text(path, self.solution.lines())
             return
         with appearing(path) as partial:
-            partial.write_bytes(bz2.compress("".join(self.lines()).encode("ascii")))
+            partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
-    def _draw(self, path: Path) -> None:
+    def _draw(self, files: ResultFolder) -> None:
         from slam_graph.visualization import plot_bundle
 
-        part = self.solution.part.problem
+        part, adjusted = self.solution.part.problem, self.solution.adjusted
         title = f"{self.name}: {part.cameras} cameras, {part.points} points"
-        with appearing(path) as partial:
-            plot_bundle(partial, title, self.after.points, self.after.centres(), self.errors_px)
+        with files.appearing("bundle_adjustment.png") as partial:
+            plot_bundle(
+                partial, title, adjusted.points, adjusted.centres(), self.solution.errors_px
+            )
 
 
 @dataclass(eq=False, repr=False)
@@ -185,20 +155,9 @@ class PoseGraphResult:
         )
 
     @cached_property
-    def before(self) -> Poses:
-        """The poses before the optimisation: those of the file, or odometry."""
-        graph = self.solution.graph
-        return along_tree(graph) if graph.estimates is None else graph.estimates
-
-    @cached_property
     def metrics(self) -> Table:
         """The content of `metrics.json`; JSON can hold every value of it."""
         solution, graph = self.solution, self.solution.graph
-        chi2 = {
-            "before": chi2_table(graph, self.before),
-            "start": chi2_table(graph, solution.start, solution.weights),
-            "after": chi2_table(graph, solution.poses, solution.weights),
-        }
         table: Table = finite(
             {
                 "schema_version": SCHEMA_VERSION,
@@ -216,7 +175,7 @@ class PoseGraphResult:
                 "steps": solution.minimum.steps,
                 "converged": solution.minimum.converged,
                 "rejected_edges": int(np.count_nonzero(solution.weights < 0.5)),
-                "chi2": chi2,
+                "chi2": solution.chi2(),
                 "certificate": self._certificate(),
                 "timing_s": self.seconds,
                 "warnings": dict(sorted(self.warnings.items())),
@@ -243,7 +202,7 @@ class PoseGraphResult:
         """
         solution, graph = self.solution, self.solution.graph
         files = ResultFolder(folder)
-        files.text("optimized.g2o", g2o_lines(graph, solution.poses))
+        files.text("optimized.g2o", solution.g2o_lines())
         files.text("trajectory.tum", tum_lines(graph.trajectory(solution.poses)))
         files.text("edges.csv", self._edge_lines())
         files.text("config.yaml", [dump_yaml(self.policy)])
@@ -251,14 +210,18 @@ class PoseGraphResult:
         if self.covariances is not None:
             files.text("covariances.csv", self._covariance_lines(self.covariances))
         if self.certificate is not None:
-            files.text("certified.g2o", g2o_lines(graph, self.certificate.poses))
-        self._draw(files.path("pose_graph.png"))
+            files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
+        self._draw(files)
         return files.files
+
+    def save_problem(self, path: Path | str) -> None:
+        """Write the graph with its estimates as a g2o file."""
+        write_text(Path(path), self.solution.g2o_lines())
 
     def _edge_lines(self) -> Iterator[str]:
         """Edges as CSV: ids, χ² in GTSAM's convention, weight."""
         graph, solution = self.solution.graph, self.solution
-        squared = chi2_of_edges(graph, solution.poses)
+        squared = solution.chi2_of_edges()
         yield "from,to,chi2,weight\n"
         rows = zip(
             graph.keys[graph.edges].tolist(),
@@ -283,16 +246,16 @@ class PoseGraphResult:
         for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
-    def _draw(self, path: Path) -> None:
+    def _draw(self, files: ResultFolder) -> None:
         from slam_graph.visualization import plot_pose_graph
 
         graph, weights = self.solution.graph, self.solution.weights
         title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"
-        with appearing(path) as partial:
+        with files.appearing("pose_graph.png") as partial:
             plot_pose_graph(
                 partial,
                 title,
-                self.before.translations,
+                self.solution.before.translations,
                 self.solution.poses.translations,
                 graph.edges,
                 weights < 0.5,

@@ -65,18 +65,50 @@ class ResultFolder:
         folder: made if it is missing.
 
     Attributes:
+        folder: of all files.
         files: written so far, in order.
     """
 
     def __init__(self, folder: Path | str) -> None:
-        self._folder = Path(folder)
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
         self.files: list[Path] = []
+
+    @staticmethod
+    @contextmanager
+    def of_run(root: Path, dataset: str, now: datetime | None = None) -> Iterator[ResultFolder]:
+        """A new folder `root/dataset/<UTC time>`, to which `latest` beside it links at the end.
+
+        If the block raises an error before it has written anything, the folder is removed.
+
+        Args:
+            root: of all results.
+            dataset: name of what was worked on.
+            now: the time; that of the clock if not given.
+
+        Raises:
+            DataError: if the folder cannot be made, or `latest` is not a link.
+        """
+        made = ResultFolder(_new_folder(root, dataset, now))
+        try:
+            yield made
+            _link_latest(made.folder)
+        except BaseException:
+            for empty in (made.folder, made.folder.parent):
+                if empty.is_dir() and not any(empty.iterdir()):
+                    empty.rmdir()
+            raise
 
     def path(self, name: str) -> Path:
         """The path of the next file, for a writer that makes it appear whole."""
-        self.files.append(self._folder / name)
+        self.files.append(self.folder / name)
         return self.files[-1]
+
+    @contextmanager
+    def appearing(self, name: str) -> Iterator[Path]:
+        """A path to write the next file to, which appears when the block ends well."""
+        with appearing(self.path(name)) as partial:
+            yield partial
 
     def text(self, name: str, lines: Iterable[str]) -> None:
         """Write lines (with their line ends)."""
@@ -87,7 +119,7 @@ class ResultFolder:
         self.text(name, [json.dumps(table, indent=2, allow_nan=False), "\n"])
 
 
-def create_run_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
+def _new_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
     """Make a new folder `root/dataset/<UTC time>`; a number is added where that exists already.
 
     Raises:
@@ -109,7 +141,7 @@ def create_run_folder(root: Path, dataset: str, now: datetime | None = None) -> 
     raise DataError(f"{root / dataset}: too many runs at {name}")
 
 
-def link_latest(folder: Path) -> Path:
+def _link_latest(folder: Path) -> Path:
     """Make `latest` beside a folder point at it, replacing an older link in one step.
 
     The link is relative, so that the results can be moved.

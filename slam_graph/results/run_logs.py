@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -213,36 +212,6 @@ class TimingLog:
             yield ",".join([str(stamp_ns), *text]) + "\n"
 
 
-class Stopwatch:
-    """Times the stages of one frame.
-
-    Attributes:
-        milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
-    """
-
-    def __init__(self) -> None:
-        self.milliseconds: dict[str, float] = {"total": 0.0}
-        self._since = time.perf_counter()
-
-    def restart(self) -> None:
-        """Do not count the time since the last stage ended."""
-        self._since = time.perf_counter()
-
-    def lap(self, stage: str, parts: Mapping[str, float] | None = None) -> None:
-        """End a stage, which began when the stage before it ended.
-
-        Args:
-            stage: its name.
-            parts: milliseconds of its parts, by name; they were timed elsewhere.
-        """
-        now = time.perf_counter()
-        elapsed_ms = 1e3 * (now - self._since)
-        self.milliseconds[stage] = elapsed_ms
-        self.milliseconds["total"] += elapsed_ms
-        self.milliseconds |= {f"{stage}.{part}": value for part, value in (parts or {}).items()}
-        self._since = now
-
-
 @dataclass(eq=False, repr=False)
 class RunLogs:
     """All logs of a run.
@@ -281,10 +250,3 @@ class RunLogs:
         for name, count in frame_stats.items():
             if not name.endswith("_ms"):
                 self.features[name] += int(count)
-
-
-def milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:
-    """The stages among what a front end counts: the keys that end in `_ms`, without that end."""
-    return {
-        key.removesuffix("_ms"): value for key, value in frame_stats.items() if key.endswith("_ms")
-    }

@@ -10,14 +10,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import WindowGraph
 from slam_graph.config import RunConfig, dump_yaml
 from slam_graph.datasets import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.evaluation import ape, innovation_report, select
+from slam_graph.evaluation import ape, innovation_report
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory, tum_lines
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
@@ -25,7 +23,7 @@ from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
-from slam_graph.results.result_files import ResultFolder, appearing
+from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.sensors import Rig, write_kalibr
 from slam_graph.smoothing import FinalBa
@@ -182,7 +180,7 @@ class RunResult:
             return None
         first, last = self.input.start_ns - _TRUTH_MARGIN_NS, self.input.end_ns + _TRUTH_MARGIN_NS
         near = (truth.stamps_ns >= first) & (truth.stamps_ns <= last)
-        return select(truth, np.flatnonzero(near)) if near.any() else None
+        return truth.select(near) if near.any() else None
 
     @property
     def coverage(self) -> float:
@@ -298,7 +296,7 @@ class RunResult:
             return
         title = f"{self.input.info.name}, {self.config.algorithm.name}, alignment: {alignment}"
         aligned = position.similarity.apply(estimate)
-        with appearing(files.path("trajectory.png")) as partial:
+        with files.appearing("trajectory.png") as partial:
             plot_errors(
                 partial, title, truth, aligned, position.values, rotation.values, position.stamps_ns
             )

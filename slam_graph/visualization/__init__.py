@@ -7,23 +7,17 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "Curve",
-    "NullViewer",
     "Panel",
     "RerunViewer",
-    "TrackPainter",
-    "TrackVideo",
-    "Viewer",
+    "TrackPictures",
     "plot_bundle",
     "plot_errors",
     "plot_panels",
     "plot_pose_graph",
-    "save_picture",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.visualization.plots import (
-        Curve,
         Panel,
         plot_bundle,
         plot_errors,
@@ -31,14 +25,12 @@ if TYPE_CHECKING:
         plot_pose_graph,
     )
     from slam_graph.visualization.rerun_viewer import RerunViewer
-    from slam_graph.visualization.track_picture import TrackPainter, TrackVideo, save_picture
-    from slam_graph.visualization.viewer import NullViewer, Viewer
+    from slam_graph.visualization.track_picture import TrackPictures
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "plots": (
-                "Curve",
                 "Panel",
                 "plot_bundle",
                 "plot_errors",
@@ -46,7 +38,6 @@ else:
                 "plot_pose_graph",
             ),
             "rerun_viewer": ("RerunViewer",),
-            "track_picture": ("TrackPainter", "TrackVideo", "save_picture"),
-            "viewer": ("NullViewer", "Viewer"),
+            "track_picture": ("TrackPictures",),
         },
     )

@@ -23,28 +23,20 @@ _LOGARITHMIC_RANGE = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
-    """One line: N points, NaN where there is a gap."""
-
-    label: str
-    x: FloatArray
-    y: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Panel:
     """One diagram.
 
     Attributes:
         xlabel, ylabel: labels of its axes.
-        curves: its lines; one label has one colour in all panels of a picture.
+        curves: its lines by their labels: x and y (N,) each, NaN where there is a gap; one label
+            has one colour in all panels of a picture.
         band: lower and upper bound of a shaded band, if there is one.
         band_label: label of the band.
     """
 
     xlabel: str
     ylabel: str
-    curves: Sequence[Curve]
+    curves: Mapping[str, tuple[FloatArray, FloatArray]]
     band: tuple[float, float] | None = None
     band_label: str = ""
 
@@ -66,7 +58,7 @@ def plot_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
     figure = Figure(figsize=size, dpi=_PANELS_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
-    labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
+    labels = list(dict.fromkeys(label for panel in panels for label in panel.curves))
     colours = {label: f"C{index % 10}" for index, label in enumerate(labels)}
     for index, panel in enumerate(panels):
         _plot_panel(figure.add_subplot(rows, columns, index + 1), panel, colours)
@@ -76,9 +68,9 @@ def plot_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
 def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
     if panel.band is not None:
         axes.axhspan(*panel.band, color="0.85", label=panel.band_label)
-    for curve in panel.curves:
-        axes.plot(curve.x, curve.y, color=colours[curve.label], linewidth=1.2, label=curve.label)
-    if _spread(panel.curves) > _LOGARITHMIC_RANGE:
+    for label, (x, y) in panel.curves.items():
+        axes.plot(x, y, color=colours[label], linewidth=1.2, label=label)
+    if _spread([y for _, y in panel.curves.values()]) > _LOGARITHMIC_RANGE:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0.0)
@@ -87,9 +79,9 @@ def _plot_panel(axes: Any, panel: Panel, colours: dict[str, str]) -> None:
     axes.legend(loc="best", fontsize="small")
 
 
-def _spread(curves: Sequence[Curve]) -> float:
+def _spread(curves: Sequence[FloatArray]) -> float:
     """Ratio of the largest to the smallest median."""
-    known = [curve.y[np.isfinite(curve.y)] for curve in curves]
+    known = [y[np.isfinite(y)] for y in curves]
     medians = [float(np.median(values)) for values in known if len(values)]
     if not medians or min(medians) <= 0.0:
         return 1.0

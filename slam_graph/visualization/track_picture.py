@@ -24,7 +24,7 @@ _TAIL_FRAMES = 15
 _FRAMES_PER_S = 20.0
 
 
-class TrackPainter:
+class _TrackPainter:
     """Draws the tracks of each frame on its images, the cameras side by side.
 
     Young features are blue and old ones red; one that is also seen by another camera has a ring.
@@ -72,18 +72,19 @@ class TrackPainter:
             cv2.circle(picture, tail[-1], 36, colour, 1, cv2.LINE_AA, 3)
 
 
-class TrackVideo:
-    """Writes pictures to a video; a context manager.
+class TrackPictures:
+    """A picture of one frame with its tracks, and a video of all; a context manager.
 
     Args:
-        path: of the file; its ending names the container, e.g. .mp4.
-
-    Raises:
-        DataError: at the first picture, if it cannot be written.
+        picture: PNG to write.
+        middle_ns: the picture is of the first frame at or after this time.
+        video: file to write, if one is wanted; its ending names the container, e.g. .mp4.
     """
 
-    def __init__(self, path: Path | str) -> None:
-        self._path = Path(path)
+    def __init__(self, picture: Path, middle_ns: int, video: Path | None = None) -> None:
+        self._painter = _TrackPainter()
+        self._picture, self._middle_ns, self._video = picture, middle_ns, video
+        self._saved = False
         self._writer: cv2.VideoWriter | None = None
 
     def __enter__(self) -> Self:
@@ -98,25 +99,37 @@ class TrackVideo:
         if self._writer is not None:
             self._writer.release()
 
-    def write(self, picture: Picture) -> None:
-        """Append a picture."""
+    def show(self, frame: CameraFrame, features: FeatureFrame) -> None:
+        """Draw the next frame.
+
+        Raises:
+            DataError: if picture or video cannot be written.
+        """
+        drawn = self._painter.paint(frame, features)
+        if self._video is not None:
+            self._film(self._video, drawn)
+        if not self._saved and frame.stamp_ns >= self._middle_ns:
+            _save(self._picture, drawn)
+            self._saved = True
+
+    def _film(self, path: Path, drawn: Picture) -> None:
+        """Append a picture to the video."""
         if self._writer is None:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             code = cv2.VideoWriter.fourcc(*"mp4v")
-            size = (picture.shape[1], picture.shape[0])
-            self._writer = cv2.VideoWriter(str(self._path), code, _FRAMES_PER_S, size)
+            size = (drawn.shape[1], drawn.shape[0])
+            self._writer = cv2.VideoWriter(str(path), code, _FRAMES_PER_S, size)
             if not self._writer.isOpened():
-                raise DataError(f"{self._path}: cannot be written as a video; use .mp4")
-        self._writer.write(picture)
+                raise DataError(f"{path}: cannot be written as a video; use .mp4")
+        self._writer.write(drawn)
 
 
-def save_picture(path: Path | str, picture: Picture) -> None:
+def _save(path: Path, picture: Picture) -> None:
     """Write a picture as PNG.
 
     Raises:
         DataError: if it cannot be written.
     """
-    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     good, data = cv2.imencode(".png", picture)
     if not good:

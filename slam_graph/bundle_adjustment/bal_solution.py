@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The solution of a bundle adjustment: the estimates, and how well they fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+from slam_graph.arrays import FloatArray
+from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
+from slam_graph.bundle_adjustment.bal_file import bal_lines
+from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BalMinimum:
+    """Where the steps ended.
+
+    Attributes:
+        estimates: of the cameras and points in the cost.
+        start_cost: half the sum of squared reprojection errors (or of their loss) at the start.
+        cost: the same at the end.
+        steps: number of steps, rejected ones included.
+        rejected: how many steps did not lower the cost.
+        converged: whether the cost stopped falling before the number of steps was used up.
+    """
+
+    estimates: BalEstimates
+    start_cost: float
+    cost: float
+    steps: int
+    rejected: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class BalSolution:
+    """The result of a bundle adjustment.
+
+    Attributes:
+        problem: the whole problem.
+        part: the part of it that was in the cost.
+        minimum: where the steps ended.
+        estimates: of all cameras and points; those that were not in the cost are unchanged.
+    """
+
+    problem: BalProblem
+    part: BalPart
+    minimum: BalMinimum
+    estimates: BalEstimates
+
+    @cached_property
+    def adjusted(self) -> BalEstimates:
+        """The estimates of the cameras and points that were in the cost."""
+        return self.estimates.select(self.part.cameras, self.part.points)
+
+    @cached_property
+    def errors_px(self) -> dict[str, FloatArray]:
+        """Reprojection errors of the observations in the cost: (N,) before and after."""
+        problem = self.part.problem
+        return {
+            "before": reprojection_errors(problem, problem.estimates),
+            "after": reprojection_errors(problem, self.adjusted),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The whole problem with its estimates, in BAL's format."""
+        return bal_lines(self.problem, self.estimates)

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The solution of a pose graph: the estimates, how well they fit, and how certain they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.errors import EstimationError
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_cost import chi2_of_edges, chi2_table
+from slam_graph.pose_graph.graph_files import g2o_lines
+from slam_graph.pose_graph.graph_initialization import along_tree
+from slam_graph.pose_graph.gtsam_graph import (
+    ROTATION_FIRST,
+    anchor_factors,
+    edge_factors,
+    factor_graph,
+    values_of,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """Where the steps ended.
+
+    Attributes:
+        poses: all poses.
+        cost: their cost.
+        steps: number of steps.
+        converged: whether the cost stopped falling before the number of steps was used up.
+    """
+
+    poses: Poses
+    cost: float
+    steps: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraphSolution:
+    """The result of an optimisation.
+
+    Attributes:
+        graph: the problem.
+        start: initial estimates.
+        minimum: where the steps ended.
+        weights: (M,) of the edges, from 0 (rejected) to 1.
+    """
+
+    graph: PoseGraph
+    start: Poses
+    minimum: Minimum
+    weights: FloatArray
+
+    @property
+    def poses(self) -> Poses:
+        """The estimates."""
+        return self.minimum.poses
+
+    def weighted_graph(self) -> PoseGraph:
+        """The problem with the final weights, without rejected edges."""
+        rows = np.flatnonzero(self.weights > 0)
+        return self.graph.keep_edges(rows).weighted(self.weights[rows])
+
+    @cached_property
+    def before(self) -> Poses:
+        """The poses before the optimisation: those of the file, or odometry."""
+        graph = self.graph
+        return along_tree(graph) if graph.estimates is None else graph.estimates
+
+    def chi2_of_edges(self) -> FloatArray:
+        """(M,) squared whitened residual of each edge, without weights."""
+        return chi2_of_edges(self.graph, self.poses)
+
+    def chi2(self) -> dict[str, dict[str, float]]:
+        """χ² before (without weights), at the start and after, as three programs count it.
+
+        Returns:
+            For each stage what `chi2_table` says.
+        """
+        return {
+            "before": chi2_table(self.graph, self.before),
+            "start": chi2_table(self.graph, self.start, self.weights),
+            "after": chi2_table(self.graph, self.poses, self.weights),
+        }
+
+    def g2o_lines(self, poses: Poses | None = None) -> Iterator[str]:
+        """The problem as a g2o file, with the estimates or with other poses."""
+        return g2o_lines(self.graph, self.poses if poses is None else poses)
+
+    def covariances(self, rows: Sequence[int] | None = None) -> FloatArray:
+        """(K, k, k) marginal covariances of some poses, or of all.
+
+        In the tangent at each pose, T exp(δ), in the order of files: translation (m), then rotation
+        (rad), both in the frame of the pose. The first pose of each connected component is fixed:
+        its covariance is zero.
+
+        Args:
+            rows: of the poses; all if not given.
+
+        Raises:
+            EstimationError: if a pose is not determined.
+        """
+        weighted = self.weighted_graph()
+        factors = edge_factors(weighted, range(len(weighted.edges)))
+        held = factor_graph([*factors, *anchor_factors(weighted, held=True)])
+        rows = range(len(self.poses)) if rows is None else rows
+        try:
+            marginals = gtsam.Marginals(held, values_of(self.poses))
+            found = np.array([marginals.marginalCovariance(row) for row in rows])
+        except RuntimeError as error:
+            raise EstimationError(f"{self.graph.name}: a pose is not determined") from error
+        if self.graph.dimension == 3:
+            translation_first = np.argsort(ROTATION_FIRST)
+            found = found[:, translation_first[:, None], translation_first]
+        return found
