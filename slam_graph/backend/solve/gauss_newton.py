@@ -21,7 +21,6 @@ from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.damped_steps import (
     Attempt,
-    StepSettings,
     TenfoldDamping,
     levenberg_marquardt,
 )
@@ -130,8 +129,8 @@ def _levenberg_marquardt(
         undamped = 0.0 if attempt.damping else attempt.predicted
         return max(gain, undamped) < policy.tolerance * attempt.after
 
-    settings = StepSettings(policy.max_steps, converged)
-    steps = levenberg_marquardt(problem, settings, TenfoldDamping(INITIAL_DAMPING, MAX_DAMPING))
+    damping = TenfoldDamping(INITIAL_DAMPING, MAX_DAMPING)
+    steps = levenberg_marquardt(problem, policy.max_steps, converged, damping)
     return Minimum(problem.posterior(), steps.costs)
 
 

@@ -19,16 +19,16 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
+from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 from slam_graph.sensors import Rig, preintegration_params
-from slam_graph.smoothing.frame_log import FrameLog
-from slam_graph.smoothing.keyframe_states import states_at
-from slam_graph.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
-from slam_graph.smoothing.recording_segment import RecordingSegment, read_segment
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.smoothing.track_fusion import with_fused_features
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ Report = Callable[[int, int, int], None]
 """Is given after each step: keyframes that are done, all keyframes, steps so far."""
 
 
-class UndeterminedError(EstimationError):
+class _UndeterminedError(EstimationError):
     """There are too few observations to improve on the causal estimate."""
 
 
@@ -105,7 +105,7 @@ def adjust_recording(
     backend: BackendConfig,
     config: FinalBaConfig,
     report: Report,
-) -> FinalBa:
+) -> FinalBa | None:
     """Solve a recording as a whole.
 
     Args:
@@ -117,14 +117,33 @@ def adjust_recording(
         config: settings.
         report: is given the progress after each step.
 
+    Returns:
+        The smoothed trajectory; None if there are too few observations to improve on the causal
+        estimate, which is logged.
+
     Raises:
-        UndeterminedError: if there are too few observations.
         EstimationError: if the minimum does not fit the observations.
     """
+    try:
+        return _smoothed(log, causal, rig, backend, config, report)
+    except _UndeterminedError as reason:
+        logger.info("no final bundle adjustment: %s", reason)
+        return None
+
+
+def _smoothed(
+    log: FrameLog,
+    causal: Trajectory,
+    rig: Rig,
+    backend: BackendConfig,
+    config: FinalBaConfig,
+    report: Report,
+) -> FinalBa:
+    """What `adjust_recording` returns where there are enough observations."""
     began = (time.perf_counter(), time.process_time())
     keyframes = log.keyframes
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
-        raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
+        raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     params = preintegration_params(rig.imu, backend.noise.gravity)
     causal = _extended_backward(log, causal, rig, backend, config, report)
     parts: list[Trajectory] = []  # final, as compact arrays
@@ -176,7 +195,7 @@ def _adjusted(
             solved = further.solve()
             _check(solved)
             return replace(solved, iterations=solved.iterations + steps)
-        except UndeterminedError:
+        except _UndeterminedError:
             raise
         except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
             logger.warning("features are not fused: %s", " ".join(str(error).split())[:200])
@@ -273,7 +292,7 @@ def _overlaps(causal: Trajectory, stamps_ns: IntArray) -> bool:
 def _check(solved: AdjustedSegment) -> None:
     """Refuse a minimum that does not fit the observations."""
     if solved.observations < _MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
-        raise UndeterminedError(
+        raise _UndeterminedError(
             f"{solved.observations} observations in {solved.keyframes} keyframes are too few"
         )
     if not solved.pixel_residual < MAX_PIXEL_RESIDUAL:

@@ -6,8 +6,8 @@ A front end gives a point a new identity each time its track starts again, after
 platform returns. Where the point of one track is projected near the observations of another, the
 two may be the same. Descriptors are not used, so the poses must be accurate to a few pixels. Tracks
 that follow each other closely must match up to noise; tracks of an earlier visit must match up to a
-drift that is common to the features of that visit (`drift_consensus.py`). Features that are seen in
-the same frame are different points.
+drift that is common to the features of that visit (`projected_matches.py`). Features that are seen
+in the same frame are different points.
 
 Fusion alternates with a loose bundle adjustment of every second keyframe: fused features reduce the
 drift of the poses, and with better poses more features are found to be the same. Each round starts
@@ -22,24 +22,26 @@ from dataclasses import replace
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection
-from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig
-from slam_graph.smoothing.projected_matches import (
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.projected_matches import (
     REACH_PX,
     Matches,
     Scene,
     consistent_matches,
     projected_matches,
 )
-from slam_graph.smoothing.recording_problem import BundleAdjustment
-from slam_graph.smoothing.recording_segment import (
+from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
+from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     triangulated,
     views,
     with_gtsam_cameras,
 )
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.geometry import NavState
+from slam_graph.sensors import Rig
 
 _VISIT_S = 6.0
 """Length of a visit: the drift within it is negligible."""

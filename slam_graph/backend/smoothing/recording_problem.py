@@ -18,27 +18,27 @@ import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.backend import (
-    BackendConfig,
-    Geometry,
-    Observations,
-    RigProjection,
-    stacked_points,
-    stacked_poses,
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.keyframe_states import fill_in
+from slam_graph.backend.smoothing.recording_factors import (
+    RecordingFactors,
+    averaged,
+    nearest_keyframe,
 )
-from slam_graph.errors import EstimationError
-from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig, preintegration_params
-from slam_graph.smoothing.keyframe_states import fill_in
-from slam_graph.smoothing.recording_factors import RecordingFactors, averaged, nearest_keyframe
-from slam_graph.smoothing.recording_segment import (
+from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     longest_tracks,
     triangulated,
     views,
     with_gtsam_cameras,
 )
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.solve.state import stacked_points, stacked_poses
+from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState
+from slam_graph.sensors import Rig, preintegration_params
 
 OUTLIER_WIDTH = 3.7
 """Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
