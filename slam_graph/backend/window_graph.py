@@ -28,7 +28,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_features import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 
-CALIBRATION_KINDS = frozenset("ekdt")
+_CALIBRATION_KINDS = frozenset("ekdt")
 """Symbols of the parameters of the rig, which are always linearised at their estimates."""
 
 
@@ -62,7 +62,7 @@ class WindowGraph:
             if kind == "e":  # increments are added to the offset from the first estimate
                 first, pose = points.atPose3(key), self.values.atPose3(key)
                 tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(pose))
-            if kind in CALIBRATION_KINDS:
+            if kind in _CALIBRATION_KINDS:
                 _copy_calibration(self.values, points, key)
         linear = gtsam.GaussianFactorGraph()
         for number, loss in enumerate(self.losses):
