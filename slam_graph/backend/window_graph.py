@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cost of a step as a factor graph of GTSAM, to be held, drawn, solved and saved.
 
-The engine works on stacked arrays, because building hundreds of factor objects for each frame costs
-more than eliminating them (docs/engine.md has the figures). This module says the same cost in
-GTSAM's words: the marginal prior is a `LinearContainerFactor`, the dynamics are the factors that
-the engine has anyway, and each observation is a projection factor with the camera's distortion and
-place on the body, σ and loss as used.
+The engine works on stacked arrays, as its gate and its first-estimates Jacobians need them
+(docs/engine.md compares the two). This module says the same cost in GTSAM's words: the marginal
+prior is a `LinearContainerFactor`, the dynamics are the factors that the engine has anyway, and
+each observation is a projection factor with the camera's distortion and place on the body, σ and
+loss as used.
 """
 
 from __future__ import annotations
