@@ -10,6 +10,7 @@ from __future__ import annotations
 from benchmarks import (
     bal,
     cost_over_time,
+    elimination,
     final_ba,
     frontend,
     held_out,
@@ -42,6 +43,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **memory.BENCHMARKS,
     **frontend.BENCHMARKS,
     **speed.BENCHMARKS,
+    **elimination.BENCHMARKS,
     **posegraphs.BENCHMARKS,
     **bal.BENCHMARKS,
     **loop_closure.BENCHMARKS,

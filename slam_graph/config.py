@@ -15,13 +15,12 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from slam_graph.backend import AlgorithmConfig, BackendConfig
+from slam_graph.backend import AlgorithmConfig, BackendConfig, FinalBaConfig
 from slam_graph.errors import ConfigError, closest
 from slam_graph.frontend import FrontendConfig
 from slam_graph.loop_closure import LoopClosureConfig
 from slam_graph.maps import LocalizationConfig, MapConfig
 from slam_graph.settings import ConfigTree, Settings, expert, override_trees, read_tree, validate
-from slam_graph.smoothing import FinalBaConfig
 
 __all__ = [
     "LimitsConfig",

@@ -12,7 +12,7 @@ import slam_graph
 PACKAGE = Path(slam_graph.__file__).parent
 PAGE = Path(__file__).parent.parent / "docs" / "architecture.md"
 
-SOLVERS = ("pose_graph", "bundle_adjustment", "smoothing", "loop_closure", "maps")
+SOLVERS = ("pose_graph", "bundle_adjustment", "loop_closure", "maps")
 """Packages that return objects; their callers write and draw."""
 
 CALLERS = {"results", "config", "visualization"}

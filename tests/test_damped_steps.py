@@ -12,7 +12,6 @@ from slam_graph.backend.solve.damped_steps import (
     Attempt,
     Damping,
     GainRatioDamping,
-    StepSettings,
     TenfoldDamping,
     levenberg_marquardt,
 )
@@ -74,7 +73,7 @@ def small_cost(attempt: Attempt) -> bool:
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_it_descends_to_the_minimum(damping: str) -> None:
     problem = rosenbrock(np.array([-1.2, 1.0]))
-    steps = levenberg_marquardt(problem, StepSettings(200, small_cost), DAMPINGS[damping]())
+    steps = levenberg_marquardt(problem, 200, small_cost, DAMPINGS[damping]())
     assert steps.converged
     assert np.all(np.diff(steps.costs) < 0)
     assert steps.costs[-1] == problem.value()
@@ -88,8 +87,8 @@ def test_a_linear_problem_takes_one_step_without_damping() -> None:
     A, b = rng.standard_normal((8, 3)), rng.standard_normal(8)
     problem = Residuals(lambda x: A @ x - b, lambda x: A, np.zeros(3))
     attempts: list[Attempt] = []
-    settings = StepSettings(1, lambda attempt: False)
-    levenberg_marquardt(problem, settings, TenfoldDamping(1e-4, 1e6), attempts.append)
+    damping = TenfoldDamping(1e-4, 1e6)
+    levenberg_marquardt(problem, 1, lambda _: False, damping, attempts.append)
     np.testing.assert_allclose(problem.x, np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-12)
     (attempt,) = attempts
     assert attempt.before - attempt.after == pytest.approx(attempt.predicted)
@@ -99,7 +98,7 @@ def test_a_linear_problem_takes_one_step_without_damping() -> None:
 def test_a_step_that_does_not_lower_the_cost_is_undone(damping: str) -> None:
     start = np.array([0.7, -0.3])
     problem = Residuals(lambda x: np.array([1.0, *(x - start)]), lambda x: np.eye(3, 2), start)
-    steps = levenberg_marquardt(problem, StepSettings(1000, lambda _: False), DAMPINGS[damping]())
+    steps = levenberg_marquardt(problem, 1000, lambda _: False, DAMPINGS[damping]())
     assert steps.accepted == 0
     assert not steps.converged
     assert steps.rejected < 1000  # the damping is exhausted before
@@ -109,6 +108,6 @@ def test_a_step_that_does_not_lower_the_cost_is_undone(damping: str) -> None:
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_a_singular_problem_is_left_where_it_is(damping: str) -> None:
     problem = Residuals(lambda x: x[:1] ** 2 + 1.0, lambda x: np.zeros((1, 2)), np.ones(2))
-    steps = levenberg_marquardt(problem, StepSettings(100, lambda _: False), DAMPINGS[damping]())
+    steps = levenberg_marquardt(problem, 100, lambda _: False, DAMPINGS[damping]())
     assert steps.accepted == 0
     assert np.array_equal(problem.x, np.ones(2))

@@ -13,6 +13,11 @@ import pytest
 from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing import final_adjustment
+from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
+from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
@@ -31,11 +36,6 @@ from slam_graph.simulation.simulation_config import (
     TrackConfig,
 )
 from slam_graph.simulation.simulator import simulate
-from slam_graph.smoothing import final_adjustment
-from slam_graph.smoothing.final_adjustment import FinalBa, adjust_recording, segments
-from slam_graph.smoothing.frame_log import FrameLog
-from slam_graph.smoothing.recording_factors import nearest_keyframe
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 LENGTH_S = 8.0
 DOUBLE_SPHERE = Camera(160.0, 160.0, 254.0, 256.0, "double_sphere", (-0.2, 0.55), 512, 512)

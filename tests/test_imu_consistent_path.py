@@ -15,7 +15,8 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData
 from slam_graph.simulation import simulate
-from slam_graph.simulation.imu_consistent_path import PathReport, consistent_path
+from slam_graph.simulation.imu_consistent_path import consistent_path
+from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulated_sequence import Flight
 
 JUMP_AT_S, DRIFT_S, JUMP_M = 12.0, 1.5, 0.08

@@ -16,8 +16,9 @@ LAYERS = (
     {"plugins"},
     {"settings", "geometry"},
     {"sensors"},
-    {"datasets", "frontend", "backend"},
-    {"pose_graph", "bundle_adjustment", "smoothing", "simulation"},
+    {"datasets", "frontend"},
+    {"backend"},
+    {"pose_graph", "bundle_adjustment", "simulation"},
     {"loop_closure"},
     {"maps"},
     {"evaluation", "visualization", "config"},
@@ -99,6 +100,24 @@ def test_imports_point_downwards() -> None:
         for path in SOURCES
         for line, module in imports(path)
         if module.startswith("slam_graph.") and not allowed(part_of(path), module.split(".")[1])
+    ]
+    assert not offenders
+
+
+def test_causal_estimation_knows_nothing_of_the_recording_as_a_whole() -> None:
+    """Within the back end, only `smoothing/` reads recordings, and the rest does not use it."""
+    backend = PACKAGE / "backend"
+    causal = [
+        path
+        for path in backend.rglob("*.py")
+        if backend / "smoothing" not in path.parents and path != backend / "__init__.py"
+    ]
+    assert causal
+    offenders = [
+        f"{path}:{line}: {module}"
+        for path in causal
+        for line, module in imports(path)
+        if module.startswith(("slam_graph.datasets", "slam_graph.backend.smoothing"))
     ]
     assert not offenders
 

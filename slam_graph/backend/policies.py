@@ -3,8 +3,7 @@
 """The policy table: what makes one algorithm differ from another, module by module.
 
 An algorithm is a YAML file in `configs/algorithms/` with one section for each module of the loop.
-How poses are selected is in `cost/selection_policies.py`, what becomes of features in
-`cost/selection_policies.py`.
+How poses are selected, and what becomes of features, is in `cost/selection_policies.py`.
 
 Every combination of policies that is accepted counts each measurement exactly once. What one policy
 would make of no effect in another is refused when the file is loaded.
@@ -29,8 +28,10 @@ from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES, POSE_SE
 from slam_graph.plugins import Choice
 from slam_graph.settings import Settings, expert
 
-STATE_FEATURE_FRAMES = 10
+_STATE_FEATURE_FRAMES = 10
 """Features seen in fewer frames are worth more when they are used once, with all observations."""
+_BOUNDED = ("most_recent", "evenly_spaced", "keyframes")
+"""Pose selections that are known to keep no more than `max_past_poses`."""
 
 
 class CostPolicy(Settings):
@@ -92,26 +93,28 @@ class CostPolicy(Settings):
     @model_validator(mode="after")
     def _has_effect(self) -> CostPolicy:
         """Refuse what another choice makes of no effect."""
+        features = FEATURE_POLICIES[self.features]
         holds_none = self.max_state_features == 0
-        if self.features == "state" and holds_none:
+        if holds_none and not features.uses_tracks:
             raise ValueError(
-                "features: state measures only features of the state, and max_state_features: 0 "
-                "allows none; raise it, or use features: once"
+                f"features: {self.features} measures only features of the state, and "
+                "max_state_features: 0 allows none; raise it, or use features: once"
             )
-        if holds_none and (self.past_poses, self.features) == ("evenly_spaced", "every_step"):
+        if holds_none and features.relinearized and self.past_poses == "evenly_spaced":
             raise ValueError(
-                "features: every_step makes a feature part of the prior when a pose that saw it "
-                "leaves, and past_poses: evenly_spaced drops its observations, so none would be; "
-                "use most_recent or keyframes, or max_state_features above 0"
+                f"features: {self.features} makes a feature part of the prior when a pose that saw "
+                "it leaves, and past_poses: evenly_spaced drops its observations, so none would "
+                "be; use most_recent or keyframes, or max_state_features above 0"
             )
         if holds_none:
             self._refuse(
                 ("keep_lost_features", "state_feature_frames", "state_feature_depth_error"),
                 "max_state_features: 0 holds no features in the state",
             )
-        if self.features == "state":
+        if not features.uses_tracks:
             self._refuse(
-                ("max_features_per_step",), "features: state uses no features outside the state"
+                ("max_features_per_step",),
+                f"features: {self.features} uses no features outside the state",
             )
         if self.past_poses in ("most_recent", "evenly_spaced"):
             self._refuse(
@@ -129,7 +132,8 @@ class CostPolicy(Settings):
                     f"max_past_poses: {self.max_past_poses} and the current one"
                 )
         asked = self.state_feature_frames
-        if asked is not None and asked > self._most_frames:
+        bounded = self.past_poses in _BOUNDED  # what others keep is not known here
+        if bounded and asked is not None and asked > self._most_frames:
             raise ValueError(
                 f"a feature waits over {self._most_frames} frames at most under max_past_poses: "
                 f"{self.max_past_poses}, so none would be seen in state_feature_frames: "
@@ -140,11 +144,14 @@ class CostPolicy(Settings):
     @property
     def frames_before_state(self) -> int:
         """In how many frames a feature must have been seen before it may be held in the state."""
-        return self.state_feature_frames or min(STATE_FEATURE_FRAMES, self._most_frames)
+        return self.state_feature_frames or min(_STATE_FEATURE_FRAMES, self._most_frames)
 
     @property
     def _most_frames(self) -> int:
-        """The longest track, in frames: past poses, the one that is to leave, and the current."""
+        """The longest track, in frames: past poses, the one that is to leave, and the current.
+
+        A pose selection from outside may keep more than `max_past_poses`, not knowing it.
+        """
         recent = self.recent_frames - 1 if self.past_poses == "keyframes" else 0
         return self.max_past_poses + recent + 2
 
@@ -219,11 +226,11 @@ class SmootherPolicy(Settings):
     """Smallest angle between two rays to such a feature."""
 
 
-OWN_SECTIONS = ("cost", "gauss_newton", "marginalization")
+_OWN_SECTIONS = ("cost", "gauss_newton", "marginalization")
 """Sections that this package's own engine uses."""
-SMOOTHER_SECTIONS = ("smoother",)
+_SMOOTHER_SECTIONS = ("smoother",)
 """Sections that GTSAM's smoothers use."""
-UNUSED_KEYS = {
+_UNUSED_KEYS = {
     "isam2": {"max_iterations"},
     "fixed_lag_isam2": {"max_iterations"},
     "fixed_lag_batch": {"relinearize_threshold", "relinearize_skip"},
@@ -233,12 +240,12 @@ UNUSED_KEYS = {
 
 def _sections_of(engine: str) -> tuple[str, ...]:
     """The sections of an algorithm's table that an engine uses."""
-    return OWN_SECTIONS if engine == "square_root" else SMOOTHER_SECTIONS
+    return _OWN_SECTIONS if engine == "square_root" else _SMOOTHER_SECTIONS
 
 
 def _unused_keys(engine: str, section: str) -> set[str]:
     """Keys of a section that an engine does not use although it uses the section."""
-    return UNUSED_KEYS.get(engine, set()) if section in SMOOTHER_SECTIONS else set()
+    return _UNUSED_KEYS.get(engine, set()) if section in _SMOOTHER_SECTIONS else set()
 
 
 class AlgorithmConfig(Settings):
@@ -270,7 +277,7 @@ class AlgorithmConfig(Settings):
         engine, section = str(info.data.get("engine", "square_root")), str(info.field_name)
         sections = _sections_of(engine)
         if section not in sections:
-            others = "square_root" if section in OWN_SECTIONS else "one of GTSAM's smoothers"
+            others = "square_root" if section in _OWN_SECTIONS else "one of GTSAM's smoothers"
             reason = (
                 f"is not used by engine '{engine}', whose settings are in {', '.join(sections)}; "
                 f"remove it, or set algorithm.engine to {others}"
@@ -288,7 +295,7 @@ class AlgorithmConfig(Settings):
         """The table without what the engine does not use, so that it can be read back."""
         table: dict[str, Any] = handler(self)
         sections = _sections_of(self.engine)
-        for section in {*OWN_SECTIONS, *SMOOTHER_SECTIONS}.intersection(table):
+        for section in {*_OWN_SECTIONS, *_SMOOTHER_SECTIONS}.intersection(table):
             if section not in sections:
                 del table[section]
             elif isinstance(table[section], dict):

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cost of a step as a factor graph of GTSAM, to be held, drawn, solved and saved.
 
-The engine works on stacked arrays, because building hundreds of factor objects for each frame costs
-more than eliminating them (docs/engine.md has the figures). This module says the same cost in
-GTSAM's words: the marginal prior is a `LinearContainerFactor`, the dynamics are the factors that
-the engine has anyway, and each observation is a projection factor with the camera's distortion and
-place on the body, σ and loss as used.
+The engine works on stacked arrays, as its gate and its first-estimates Jacobians need them
+(docs/engine.md compares the two). This module says the same cost in GTSAM's words: the marginal
+prior is a `LinearContainerFactor`, the dynamics are the factors that the engine has anyway, and
+each observation is a projection factor with the camera's distortion and place on the body, σ and
+loss as used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_features import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
 
-CALIBRATION_KINDS = frozenset("ekdt")
+_CALIBRATION_KINDS = frozenset("ekdt")
 """Symbols of the parameters of the rig, which are always linearised at their estimates."""
 
 
@@ -62,7 +62,7 @@ class WindowGraph:
             if kind == "e":  # increments are added to the offset from the first estimate
                 first, pose = points.atPose3(key), self.values.atPose3(key)
                 tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(pose))
-            if kind in CALIBRATION_KINDS:
+            if kind in _CALIBRATION_KINDS:
                 _copy_calibration(self.values, points, key)
         linear = gtsam.GaussianFactorGraph()
         for number, loss in enumerate(self.losses):

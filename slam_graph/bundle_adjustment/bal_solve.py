@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.backend import Attempt, GainRatioDamping, StepSettings, levenberg_marquardt
+from slam_graph.backend import Attempt, GainRatioDamping, levenberg_marquardt
 from slam_graph.bundle_adjustment.bal_cost import BalCost, construct, initial_estimates, retract
 from slam_graph.bundle_adjustment.bal_policy import BalPolicy, BalStepsPolicy
 from slam_graph.bundle_adjustment.bal_problem import (
@@ -101,7 +101,7 @@ def _minimize(
             and decrease <= policy.tolerance * attempt.before
         )
 
-    steps = levenberg_marquardt(problem, StepSettings(policy.max_steps, converged), damping)
+    steps = levenberg_marquardt(problem, policy.max_steps, converged, damping)
     count = steps.accepted + steps.rejected
     if not steps.converged:
         still = "no step lowers the cost" if damping.exhausted else "the cost still falls"

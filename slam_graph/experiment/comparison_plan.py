@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from slam_graph.backend import FinalBaConfig
 from slam_graph.config import RunConfig
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.tasks import RecordTask, RunTask, Source, Task
-from slam_graph.smoothing import FinalBaConfig
 
 WITHOUT_FEJ = "_no_fej"
 """Suffix of the name of an algorithm without first-estimates Jacobians."""

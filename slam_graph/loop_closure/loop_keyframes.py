@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import FeatureTracks, RigProjection, TriangulationConfig, triangulate
+from slam_graph.backend import triangulate_frames
 from slam_graph.frontend import Image, Keypoints, Orb
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.loop_closure.loop_config import KeyframeConfig
@@ -30,7 +30,6 @@ MAX_REPROJECTION_PX = 3.0
 """Points of a larger root-mean-square reprojection error are left out."""
 MAX_DEPTH_ERROR = 0.1
 """Points of a larger relative standard deviation of the inverse depth are left out."""
-TRIANGULATION = TriangulationConfig()
 _CORNER_QUALITY, _CORNER_DISTANCE_PX = 0.01, 8
 _PATCH_PX = 31.0
 _NOT_TRACKED = -1
@@ -142,7 +141,7 @@ class KeyframeLog:
     def __init__(self, rig: Rig, config: KeyframeConfig) -> None:
         self.keyframes: list[Keyframe] = []
         self._config = config
-        self._projection = RigProjection(rig)
+        self._rig = rig
         camera = rig.cameras[0].camera
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
@@ -206,20 +205,13 @@ class KeyframeLog:
 
     def _points(self, ids: IntArray) -> FloatArray:
         """(N, 3) world points of features (N,); NaN where not triangulated."""
-        window = FeatureTracks()
-        for index, view in enumerate(self._recent):
-            window.add(index, view.frame)
-        obs = window.observations(np.unique(ids))
-        obs = obs.subset(obs.counts >= 2)
-        points = np.full((len(ids), 3), np.nan)
-        if len(obs) == 0:
-            return points
-        rotations = np.array([self._recent[i].rotation for i in obs.frames])
-        positions = np.array([self._recent[i].position for i in obs.frames])
-        found = triangulate(obs, self._projection, rotations, positions, TRIANGULATION)
+        found = triangulate_frames(
+            ids,
+            [view.frame for view in self._recent],
+            np.array([view.rotation for view in self._recent]),
+            np.array([view.position for view in self._recent]),
+            self._rig,
+        )
         good = found.good & (found.reprojection_px < MAX_REPROJECTION_PX)
         good &= found.depth_error < MAX_DEPTH_ERROR * self._focal_px
-        place = np.minimum(np.searchsorted(obs.ids, ids), len(obs.ids) - 1)
-        known = good[place] & (obs.ids[place] == ids)
-        points[known] = found.points[place[known]]
-        return points
+        return np.where(good[:, None], found.points, np.nan)

@@ -9,12 +9,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from slam_graph.backend import FrameLog, adjust_recording
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.smoothing import FrameLog, UndeterminedError, adjust_recording
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
@@ -69,10 +69,7 @@ class Smoothing(Stage):
             return
         with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             self._recording.close()
-            try:
-                self._solve(self._log)
-            except UndeterminedError as reason:
-                logger.info("no final bundle adjustment: %s", reason)
+            self._solve(self._log)
 
     def _solve(self, log: FrameLog) -> None:
         result = self._result
@@ -85,6 +82,8 @@ class Smoothing(Stage):
             result.config.final_ba,
             self._progress.adjusting,
         )
+        if result.final_ba is None:
+            return
         summary = result.final_ba.summary
         logger.info(
             "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import Attempt, StepSettings, TenfoldDamping, levenberg_marquardt
+from slam_graph.backend import Attempt, TenfoldDamping, levenberg_marquardt
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_initialization import (
@@ -136,7 +136,7 @@ def _refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
     damping = TenfoldDamping(
         _FIRST_DAMPING, _MAX_DAMPING, relief=0.01, negligible=10.0 * _FIRST_DAMPING
     )
-    steps = levenberg_marquardt(problem, StepSettings(_MAX_ATTEMPTS, converged), damping)
+    steps = levenberg_marquardt(problem, _MAX_ATTEMPTS, converged, damping)
     return problem.poses, steps.accepted
 
 

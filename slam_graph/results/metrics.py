@@ -17,12 +17,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from slam_graph.backend import FinalBa
 from slam_graph.errors import DataError
 from slam_graph.evaluation import accuracy_report, consistency_report
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.results.run_logs import RunLogs
-from slam_graph.smoothing import FinalBa
 from slam_graph.version import __version__
 
 SCHEMA_VERSION = 2

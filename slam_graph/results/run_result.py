@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend import WindowGraph
+from slam_graph.backend import FinalBa, WindowGraph
 from slam_graph.config import RunConfig, dump_yaml
 from slam_graph.datasets import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
@@ -26,7 +26,6 @@ from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_pl
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.sensors import Rig, write_kalibr
-from slam_graph.smoothing import FinalBa
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 

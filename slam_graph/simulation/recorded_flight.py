@@ -19,8 +19,9 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData, Rig
-from slam_graph.simulation.imu_consistent_path import PathReport, consistent_path
+from slam_graph.simulation.imu_consistent_path import consistent_path
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
+from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
 
 _MARGIN_NS = 3_000_000_000

@@ -29,10 +29,10 @@ from slam_graph.datasets import (
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
-from slam_graph.simulation.imu_consistent_path import PathReport
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks, MovingBoard
 from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.rendering import Renderer, paint
 from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
 from slam_graph.simulation.track_simulation import TrackSimulator

@@ -42,7 +42,7 @@ from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 
-MAX_FAILURES = 3
+_MAX_FAILURES = 3
 """Features that are outliers in this many consecutive frames are treated as dynamic."""
 
 
@@ -250,7 +250,7 @@ class CostConstruction:
     @property
     def _dynamic(self) -> IntArray:
         """Ids (N,) of the features that were outliers too often, ascending."""
-        ids = [j for j, n in self._failures.items() if n >= MAX_FAILURES]
+        ids = [j for j, n in self._failures.items() if n >= _MAX_FAILURES]
         return np.array(sorted(ids), np.int64)
 
     # --- the gate --------------------------------------------------------------------------------

@@ -67,10 +67,11 @@ class Linearization:
     tracks: ReducedFeatures | SummedFeatures | None
 
     def subset(self, landmarks: BoolArray, tracks: BoolArray) -> Linearization:
-        """Some of the landmark observations (N,) and, unless summed up, of the tracks (J,)."""
+        """Some of the landmark observations (N,) and of the tracks (J,), not summed up."""
+        assert not isinstance(self.tracks, SummedFeatures)
         return Linearization(
             self.landmarks.subset(landmarks) if self.landmarks is not None else None,
-            self.tracks.subset(tracks) if isinstance(self.tracks, ReducedFeatures) else self.tracks,
+            self.tracks.subset(tracks) if self.tracks is not None else None,
         )
 
 
@@ -255,10 +256,8 @@ class Cost:
     def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
-        New features that are summed up all pass: they are not told apart before the steps.
-
         Args:
-            linear: of this cost.
+            linear: of this cost, not summed up.
             predicted: what is known of the variables before these measurements.
         """
         landmarks = np.zeros(0, np.bool_)
@@ -276,10 +275,8 @@ class Cost:
             near = linear.landmarks.depths < self.config.triangulation.min_depth_m
             landmarks = (distance < largest) & ~near
             innovations += Innovations.of(distance, dof, largest, landmarks)
-        if isinstance(linear.tracks, SummedFeatures) and self.tracks is not None:
-            tracks = np.ones(len(self.tracks.points), np.bool_)
-            innovations += Innovations.untested(2 * self.tracks.obs.counts - POINT_DIM)
-        elif isinstance(linear.tracks, ReducedFeatures) and self.tracks is not None:
+        if linear.tracks is not None and self.tracks is not None:
+            assert isinstance(linear.tracks, ReducedFeatures), "summed up, they are not told apart"
             P = predicted.covariance_of(self.rig.keys_of(self.tracks.obs))
             distance = squared_mahalanobis(linear.tracks.r_2, linear.tracks.N, P)
             largest = threshold(linear.tracks.dof, confidence)

@@ -40,7 +40,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.state import POSE_DIM
 
-REGULARISATION = 1e-15
+_REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
 
 
@@ -130,7 +130,7 @@ def _orthonormal(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
     for _ in range(2):
         squares = Q.transpose(0, 2, 1) @ Q
         trace = np.trace(squares, axis1=1, axis2=2)
-        squares += REGULARISATION * trace[:, None, None] * np.eye(3)
+        squares += _REGULARISATION * trace[:, None, None] * np.eye(3)
         R = np.linalg.cholesky(squares).transpose(0, 2, 1)
         Q, R_f = Q @ np.linalg.inv(R), R @ R_f
     return Q, R_f

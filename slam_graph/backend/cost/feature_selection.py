@@ -35,9 +35,9 @@ from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
-RETRY_FRAMES = 4
+_RETRY_FRAMES = 4
 """Candidates for the state beyond those with the longest tracks are tried one frame in so many."""
-MIN_FRAMES = 2
+_MIN_FRAMES = 2
 """A feature must be seen in this many frames to be used."""
 
 
@@ -63,21 +63,14 @@ class _Candidates:
         return _longest(self.lasting[rows], self.lengths[rows], room)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class FeatureSelection:
     """Selects and triangulates the features of a step by the policy of an algorithm."""
 
-    def __init__(
-        self,
-        policy: CostPolicy,
-        rig: RigProjection,
-        config: BackendConfig,
-        diagnostics: Diagnostics,
-    ) -> None:
-        self._policy = policy
-        self._rig = rig
-        self._config = config
-        self._diagnostics = diagnostics
-        self._features = FEATURE_POLICIES[policy.features]
+    policy: CostPolicy
+    rig: RigProjection
+    config: BackendConfig
+    diagnostics: Diagnostics
 
     def new_features(
         self,
@@ -96,7 +89,7 @@ class FeatureSelection:
             dynamic: ids (N,) of features that must not be used, ascending.
             removals: gets the observations that go without being in the cost.
         """
-        bound = self._policy.max_state_features
+        bound = self.policy.max_state_features
         room = len(window.tracks.seen) if bound is None else bound - in_state
         choice = self._candidates(window, poses, room, dynamic, removals)
         ids = np.union1d(choice.used, choice.lasting)
@@ -109,8 +102,8 @@ class FeatureSelection:
         # a lasting one that is not good may yet become so
         used = is_in(ids, choice.used) & ~entering & (~lasting | good)
         lost = used & ~good
-        self._diagnostics.counts["feature_not_triangulated"] += int(np.sum(lost))
-        if not self._features.relinearized:
+        self.diagnostics.counts["feature_not_triangulated"] += int(np.sum(lost))
+        if not FEATURE_POLICIES[self.policy.features].relinearized:
             removals.add_features(Outcome.NOT_TRIANGULATED, ids[lost])
         return TrackFeatures(obs, points, entering).subset(good & (entering | used))
 
@@ -123,7 +116,7 @@ class FeatureSelection:
         removals: Removals,
     ) -> _Candidates:
         """The features that may be in the cost, where `room` more may be held in the state."""
-        tracks, policy = window.tracks, self._policy
+        tracks, policy = window.tracks, self.policy
         ids, lengths = tracks.lengths()
         removals.add_features(Outcome.DYNAMIC, dynamic)
         outside = ~is_in(ids, window.state_features) & ~is_in(ids, dynamic)
@@ -131,12 +124,13 @@ class FeatureSelection:
         live = is_in(ids, tracks.seen)
         lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
         lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
-            (ids + window.frame) % RETRY_FRAMES == 0
+            (ids + window.frame) % _RETRY_FRAMES == 0
         )
         leaving = is_in(ids, seen_by_leaving(tracks, window.past, poses))
-        due = self._features.due(WaitingTracks(ids, lengths, live, leaving))
-        due = due & (lengths >= MIN_FRAMES)
-        if self._features.drops_ended:
+        choice = FEATURE_POLICIES[policy.features]
+        due = choice.due(WaitingTracks(ids, lengths, live, leaving))
+        due = due & (lengths >= _MIN_FRAMES)
+        if choice.drops_ended:
             removals.add_features(Outcome.ENDED, ids[~live & ~due])
         used = _longest(ids[due], lengths[due], policy.max_features_per_step)
         return _Candidates(used, ids[lasting], lengths[lasting])
@@ -151,14 +145,14 @@ class FeatureSelection:
         points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
         here = window.state.estimate.atPose3(X(window.frame)).translation()
         # steps may have sent a feature with little parallax to infinity
-        good &= np.linalg.norm(points - here, axis=1) < self._config.triangulation.max_depth_m
+        good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
         if not good.all():
-            new, rig = ~good, self._rig.at(window.state)
+            new, rig = ~good, self.rig.at(window.state)
             poses = rig.poses(window.state.estimate, obs.frames)
             observed = rig.renormalized(obs.subset(new))
-            result = triangulate(observed, rig, *poses, self._config.triangulation)
-            noise = self._config.noise.pixel_sigma / rig.cameras[0].fx
-            known = noise * result.depth_error < self._policy.state_feature_depth_error
+            result = triangulate(observed, rig, *poses, self.config.triangulation)
+            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
+            known = noise * result.depth_error < self.policy.state_feature_depth_error
             points[new], good[new] = result.points, result.good & (known | ~lasting[new])
         return points, good
 

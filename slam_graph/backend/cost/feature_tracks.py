@@ -96,8 +96,9 @@ class Observations:
 class Outcome(StrEnum):
     """What became of an observation."""
 
-    USED = "used"
-    """Part of the prior: its information is kept, the observation itself never enters again."""
+    ABSORBED = "absorbed"
+    """Its information is in the prior now (or it is a factor of GTSAM's smoother), and the
+    observation itself never enters again."""
     GATED = "gated"
     """It failed the χ² test before the steps: all observations of a feature outside the state
     together, those of a feature of the state one by one."""

@@ -42,7 +42,7 @@ RESPONSE_TIME_S = 1.0
 """Time in which the variance grows by a factor of e if squares are twice as large as expected."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
-MAX_SQUARE = 4.0
+_MAX_SQUARE = 4.0
 """Mean squares are clipped here, which limits how fast the noise grows."""
 IMU_GAP_SCALE = 1000.0
 """Factor on the noise densities between two frames where samples are missing: the IMU then hardly
@@ -81,7 +81,7 @@ class DensityScale:
         memory = np.exp(-dt_s / SIZE_TIME_S)
         self._size = memory * self._size + (1.0 - memory) * float(white @ white) / 3.0
         persistence = float(self._direction @ self._direction) / 3.0
-        surprise = min(persistence, self._size, MAX_SQUARE) - 1.0
+        surprise = min(persistence, self._size, _MAX_SQUARE) - 1.0
         factor = self.factor * np.exp(0.5 * surprise * dt_s / RESPONSE_TIME_S)
         self.factor = float(np.clip(factor, 1.0, MAX_FACTOR))
 
@@ -125,7 +125,7 @@ class DynamicsNoise:
         self._accel.observe(velocity, gained[_VELOCITY, _VELOCITY], dt_s)
 
 
-def predicted_covariance(
+def _predicted_covariance(
     factor: gtsam.NonlinearFactor, values: gtsam.Values, covariance: FloatArray
 ) -> FloatArray:
     """The covariance (15, 15) of the state that a dynamics factor predicts.
@@ -196,7 +196,7 @@ class Propagation:
         last = self._last
         if last is None or last.covariance is None:
             return None
-        covariance = predicted_covariance(factor, window.state.estimate, last.covariance)
+        covariance = _predicted_covariance(factor, window.state.estimate, last.covariance)
         return replace(predicted, covariance=covariance)
 
     def learn(self, state: NavState) -> None:

@@ -34,7 +34,7 @@ from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of, distortion_key, stacked_poses
 from slam_graph.sensors import Rig
 
-MIN_DEPTH = 1e-3
+_MIN_DEPTH = 1e-3
 """Points nearer than this (m) are projected as if at this depth; depth checks reject them."""
 
 
@@ -110,7 +110,7 @@ class RigProjection:
 
     def pixels(self, obs: Observations, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""
-        depth = np.maximum(in_camera[:, 2:3], MIN_DEPTH)
+        depth = np.maximum(in_camera[:, 2:3], _MIN_DEPTH)
         normalized = in_camera[:, :2] / depth
         if len(self.cameras) == 1:
             return self.cameras[0].distort(normalized)
@@ -146,7 +146,7 @@ class RigProjection:
 
     def by_camera_point(self, obs: Observations, in_camera: FloatArray) -> FloatArray:
         """Derivatives (N, 2, 3) of the pixels of points (N, 3) by these, in the camera frame."""
-        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
+        depth = np.maximum(in_camera[:, 2], _MIN_DEPTH)
         _, slope = self.pixels(obs, in_camera)
         derivative = np.empty((len(obs), 2, 3))
         derivative[:, :, :2] = slope / depth[:, None, None]
@@ -231,7 +231,7 @@ class CalibratedProjection(RigProjection):
         by_calibration = np.zeros((len(obs), 2, sum(dims_of(self.calibration_keys).values())))
         in_camera = self.in_camera(obs, self.in_body(obs, at))
         by_camera_point = self.by_camera_point(obs, in_camera)
-        normalized = in_camera[:, :2] / np.maximum(in_camera[:, 2:3], MIN_DEPTH)
+        normalized = in_camera[:, :2] / np.maximum(in_camera[:, 2:3], _MIN_DEPTH)
         for c, camera in enumerate(self.cameras):
             rows = obs.camera == c
             if E(c) in self._columns:

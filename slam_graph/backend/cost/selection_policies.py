@@ -134,11 +134,14 @@ class FeaturePolicy:
         relinearized: whether these stay in the cost, linearised anew in every step, until a pose
             that saw them leaves; else they are marginalised in the step that uses them.
         drops_ended: whether the observations of a track that has ended are dropped unused.
+        uses_tracks: whether tracks are ever due; without, only features of the state are measured,
+            and settings of all others have no effect.
     """
 
     due: Callable[[WaitingTracks], BoolArray]
     relinearized: bool = False
     drops_ended: bool = False
+    uses_tracks: bool = True
 
 
 FEATURE_POLICIES: Registry[FeaturePolicy] = Registry(
@@ -163,5 +166,5 @@ def _all(tracks: WaitingTracks) -> BoolArray:
 
 
 FEATURE_POLICIES.register("once")(FeaturePolicy(_ended_or_leaving))
-FEATURE_POLICIES.register("state")(FeaturePolicy(_none, drops_ended=True))
+FEATURE_POLICIES.register("state")(FeaturePolicy(_none, drops_ended=True, uses_tracks=False))
 FEATURE_POLICIES.register("every_step")(FeaturePolicy(_all, relinearized=True))

@@ -9,14 +9,16 @@ the reprojection error is nearly linear also for far points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
-from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.sensors import FeatureFrame, Rig
 
 STEPS = 5
 """Damped Gauss-Newton steps that refine the linear solution, at most."""
@@ -90,6 +92,47 @@ def triangulate(
         & (parallax > max(config.min_parallax_rad, min_parallax_rad))
     )
     return Triangulation(points, good, np.sqrt(squares / count), depth_error)
+
+
+def triangulate_frames(
+    ids: IntArray,
+    frames: Sequence[FeatureFrame],
+    rotations: FloatArray,
+    positions: FloatArray,
+    rig: Rig,
+) -> Triangulation:
+    """Triangulate features from frames at known poses, with the default thresholds.
+
+    Args:
+        ids: (J,) features, in any order, seen or not.
+        frames: F of them, in the order of time.
+        rotations: (F, 3, 3) world_R_body of the frames.
+        positions: (F, 3) of the body in the world.
+        rig: the cameras.
+
+    Returns:
+        One row for each id; features with fewer than two observations are not good, and their
+        point is NaN.
+    """
+    window = FeatureTracks()
+    for index, frame in enumerate(frames):
+        window.add(index, frame)
+    ascending = np.unique(ids)
+    obs = window.observations(ascending)
+    seen = obs.counts >= 2
+    obs = obs.subset(seen)
+    points = np.full((len(ascending), 3), np.nan)
+    good = np.zeros(len(ascending), np.bool_)
+    reprojection_px, depth_error = np.full((2, len(ascending)), np.inf)
+    if len(obs):
+        used = list(obs.frames)
+        found = triangulate(
+            obs, RigProjection(rig), rotations[used], positions[used], TriangulationConfig()
+        )
+        points[seen], good[seen] = found.points, found.good
+        reprojection_px[seen], depth_error[seen] = found.reprojection_px, found.depth_error
+    place = np.searchsorted(ascending, ids)
+    return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
 
 
 def _rays(

@@ -21,18 +21,18 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer
 
-DYNAMIC_RATIO = 3.0
+_DYNAMIC_RATIO = 3.0
 """Disparity over the standstill limit above which a feature is dynamic while the platform is
 static; and by which the static features must be below the limit if most features are dynamic."""
 
-STATIC_SHARE = 1.0 / 3.0
+_STATIC_SHARE = 1.0 / 3.0
 """Smallest share of the features that must be static; the others may be on moving objects."""
 
 VELOCITY_SIGMA = 0.01
 """Standard deviation of the velocity at a standstill, m/s."""
 POSITION_SIGMA = 1e-3
 """Standard deviation of the motion between two frames at a standstill, m."""
-ROTATION_SIGMA = 1e-3
+_ROTATION_SIGMA = 1e-3
 """Standard deviation of the rotation between two frames at a standstill, rad."""
 
 MIN_FEATURES = 5
@@ -116,9 +116,9 @@ class StandstillDetector:
         ids, motion = _common_motion_px(before, now)
         if len(ids) < MIN_FEATURES:
             return False
-        least, median = np.quantile(np.linalg.norm(motion, axis=1), [STATIC_SHARE, 0.5])
+        least, median = np.quantile(np.linalg.norm(motion, axis=1), [_STATIC_SHARE, 0.5])
         limit_px = self._max_disparity_px
-        return bool(median < limit_px or least < limit_px / DYNAMIC_RATIO)
+        return bool(median < limit_px or least < limit_px / _DYNAMIC_RATIO)
 
     def _find_dynamic(self) -> None:
         """Add the features that move although the platform stands still."""
@@ -126,7 +126,7 @@ class StandstillDetector:
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
             disparity_px = np.linalg.norm(motion, axis=1)
-            limit_px = DYNAMIC_RATIO * self._max_disparity_px
+            limit_px = _DYNAMIC_RATIO * self._max_disparity_px
             self.dynamic = np.union1d(self.dynamic, ids[disparity_px > limit_px])
 
     def _imu_is_still(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
@@ -150,7 +150,7 @@ def _common_motion_px(
 
 def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:
     """The pose of frame j equals that of frame i, and its velocity is zero."""
-    between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3))
+    between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_ROTATION_SIGMA, POSITION_SIGMA], 3))
     still = gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)
     return [
         gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(), between),

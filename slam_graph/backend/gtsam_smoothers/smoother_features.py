@@ -164,7 +164,7 @@ class SmootherFeatures:
         new = NewObservations()
         seen = np.intersect1d(self.active, tracks.ids_in(frame), True)
         again = tracks.observations(seen, [frame])
-        tracks.remove(Outcome.USED, self.active)
+        tracks.remove(Outcome.ABSORBED, self.active)
         again = again.rows(self._gate(again, estimate, covariance))
         ids = np.unique(again.ids[again.feature])
         self._add(new, again, ids)
@@ -173,7 +173,7 @@ class SmootherFeatures:
         for j, point in zip(entering.ids.tolist(), points, strict=True):
             new.points.insert(L(j), point)
         self._add(new, entering, entering.ids)
-        tracks.remove(Outcome.USED, entering.ids)
+        tracks.remove(Outcome.ABSORBED, entering.ids)
         self.active = np.union1d(self.active, entering.ids)
         return new
 

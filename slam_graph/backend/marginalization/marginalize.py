@@ -128,8 +128,8 @@ def _settle_observations(window: Window, constructed: ConstructedCost) -> None:
     """Take away the observations that no longer wait."""
     cost, removals = constructed.cost, constructed.removals
     if cost.landmarks is not None:
-        removals.add_features(Outcome.USED, cost.landmarks.ids)
-    removals.add_features(Outcome.USED, cost.ids_of(constructed.absorbed))
+        removals.add_features(Outcome.ABSORBED, cost.landmarks.ids)
+    removals.add_features(Outcome.ABSORBED, cost.ids_of(constructed.absorbed))
     removals.apply(window.tracks)
     window.tracks.keep_frames([*constructed.poses.kept, window.frame])
 

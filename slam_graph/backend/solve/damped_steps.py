@@ -149,26 +149,13 @@ class TenfoldDamping:
 
 
 @dataclass(frozen=True, slots=True)
-class StepSettings:
-    """When to stop.
-
-    Attributes:
-        max_attempts: number of steps at most, rejected ones included.
-        converged: whether a step, kept or rejected, is the last one.
-    """
-
-    max_attempts: int
-    converged: Callable[[Attempt], bool]
-
-
-@dataclass(frozen=True, slots=True)
 class Steps:
     """What the steps came to.
 
     Attributes:
         costs: the cost before the first step, and after each step that was kept.
         rejected: how many steps did not lower the cost.
-        converged: whether the steps ended by `StepSettings.converged`.
+        converged: whether the steps ended because of what `levenberg_marquardt` was told.
     """
 
     costs: tuple[float, ...]
@@ -183,7 +170,8 @@ class Steps:
 
 def levenberg_marquardt(
     problem: DampedProblem,
-    settings: StepSettings,
+    max_attempts: int,
+    converged: Callable[[Attempt], bool],
     damping: Damping,
     report: Callable[[Attempt], None] | None = None,
 ) -> Steps:
@@ -191,13 +179,14 @@ def levenberg_marquardt(
 
     Args:
         problem: moved in place to the last estimates that lowered its cost.
-        settings: when to stop.
+        max_attempts: number of steps at most, rejected ones included.
+        converged: whether a step, kept or rejected, is the last one.
         damping: λ, and how it follows the steps.
         report: is given each attempt.
     """
     costs, rejected = [problem.value()], 0
     linear = False
-    while len(costs) - 1 + rejected < settings.max_attempts and not damping.exhausted:
+    while len(costs) - 1 + rejected < max_attempts and not damping.exhausted:
         if not linear:
             problem.linearize()
             linear = True
@@ -216,6 +205,6 @@ def levenberg_marquardt(
         damping.update(attempt)
         if report is not None:
             report(attempt)
-        if settings.converged(attempt):
+        if converged(attempt):
             return Steps(tuple(costs), rejected, True)
     return Steps(tuple(costs), rejected, False)

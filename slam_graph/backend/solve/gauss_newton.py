@@ -21,15 +21,14 @@ from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.damped_steps import (
     Attempt,
-    StepSettings,
     TenfoldDamping,
     levenberg_marquardt,
 )
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 
-INITIAL_DAMPING = 1e-4
-MAX_DAMPING = 1e6
-MAX_REPEATED_STEPS = 4
+_INITIAL_DAMPING = 1e-4
+_MAX_DAMPING = 1e6
+_MAX_REPEATED_STEPS = 4
 """Steps in all, at most, where the calibration moves too far for the first to be linear."""
 
 
@@ -64,7 +63,7 @@ def minimize(
         cost: moved in place: its state, and its new features.
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
-        again: asks for more steps than the policy has, up to `MAX_REPEATED_STEPS` in all.
+        again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
@@ -93,7 +92,7 @@ def _another(
     steps = len(minimum.costs) - 1
     if steps < policy.max_steps:
         return bool(np.max(np.abs(delta), initial=0.0) >= policy.tolerance)
-    return again is not None and steps < MAX_REPEATED_STEPS and again(minimum.posterior, delta)
+    return again is not None and steps < _MAX_REPEATED_STEPS and again(minimum.posterior, delta)
 
 
 def _step(
@@ -130,8 +129,8 @@ def _levenberg_marquardt(
         undamped = 0.0 if attempt.damping else attempt.predicted
         return max(gain, undamped) < policy.tolerance * attempt.after
 
-    settings = StepSettings(policy.max_steps, converged)
-    steps = levenberg_marquardt(problem, settings, TenfoldDamping(INITIAL_DAMPING, MAX_DAMPING))
+    damping = TenfoldDamping(_INITIAL_DAMPING, _MAX_DAMPING)
+    steps = levenberg_marquardt(problem, policy.max_steps, converged, damping)
     return Minimum(problem.posterior(), steps.costs)
 
 

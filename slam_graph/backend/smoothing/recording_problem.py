@@ -11,34 +11,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.backend import (
-    BackendConfig,
-    Geometry,
-    Observations,
-    RigProjection,
-    stacked_points,
-    stacked_poses,
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.keyframe_states import fill_in
+from slam_graph.backend.smoothing.recording_factors import (
+    RecordingFactors,
+    averaged,
+    nearest_keyframe,
 )
-from slam_graph.errors import EstimationError
-from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig, preintegration_params
-from slam_graph.smoothing.keyframe_states import fill_in
-from slam_graph.smoothing.recording_factors import RecordingFactors, averaged, nearest_keyframe
-from slam_graph.smoothing.recording_segment import (
+from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     longest_tracks,
     triangulated,
     views,
     with_gtsam_cameras,
 )
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.solve.state import stacked_points, stacked_poses
+from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState
+from slam_graph.sensors import Rig, preintegration_params
 
 OUTLIER_WIDTH = 3.7
 """Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
@@ -57,12 +57,46 @@ Report = Callable[[int], None]
 """Is given the number of steps after each."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustedSegment:
-    """The minimum of the cost of a segment.
+@dataclass(frozen=True, slots=True)
+class SmoothingTask:
+    """What does not change from segment to segment of a recording.
 
     Attributes:
-        states: of every frame.
+        rig: the best calibration available.
+        backend: noise and triangulation.
+        config: settings of the bundle adjustment.
+    """
+
+    rig: Rig
+    backend: BackendConfig
+    config: FinalBaConfig
+
+    @property
+    def preintegration(self) -> gtsam.PreintegrationCombinedParams:
+        """Noise of the IMU by the calibration."""
+        return preintegration_params(self.rig.imu, self.backend.noise.gravity)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentStart:
+    """A segment of a recording, and where its bundle adjustment starts.
+
+    Attributes:
+        segment: times, observations, IMU samples.
+        states: initial states of the keyframes.
+        anchor: number of the keyframe whose position and yaw are fixed.
+    """
+
+    segment: RecordingSegment
+    states: list[NavState]
+    anchor: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustmentFigures:
+    """Figures of the minimum of one segment or of several together.
+
+    Attributes:
         keyframes: number of keyframes.
         features: number of features in the cost.
         observations: number of observations in the cost.
@@ -74,7 +108,6 @@ class AdjustedSegment:
         pixel_sigma: assumed standard deviation of the observations at the end, pixels.
     """
 
-    states: list[NavState]
     keyframes: int
     features: int
     observations: int
@@ -86,39 +119,38 @@ class AdjustedSegment:
     pixel_sigma: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedSegment:
+    """The minimum of the cost of a segment.
+
+    Attributes:
+        states: of every frame.
+        figures: of the minimum.
+    """
+
+    states: list[NavState]
+    figures: AdjustmentFigures
+
+
 class BundleAdjustment:
     """The bundle adjustment of a segment of a recording.
 
     Args:
-        segment: times, observations, IMU samples.
-        states: initial states of the keyframes.
-        anchor: number of the keyframe whose position and yaw are fixed.
-        rig: calibrated sensors.
-        backend: noise and triangulation.
-        config: settings.
+        start: segment, initial states and anchor.
+        task: calibration and settings.
         report: is given the number of steps after each.
 
     Attributes:
         iterations: Levenberg-Marquardt steps so far.
     """
 
-    def __init__(
-        self,
-        segment: RecordingSegment,
-        states: list[NavState],
-        anchor: int,
-        rig: Rig,
-        backend: BackendConfig,
-        config: FinalBaConfig,
-        report: Report,
-    ) -> None:
-        self._segment = segment
-        self._rig = with_gtsam_cameras(rig)
-        self._projection = RigProjection(self._rig)
-        self._backend = backend
-        self._config = config
+    def __init__(self, start: SegmentStart, task: SmoothingTask, report: Report) -> None:
+        self._segment = segment = start.segment
+        self._task = replace(task, rig=with_gtsam_cameras(task.rig))
+        self._backend, self._config = backend, config = task.backend, task.config
+        self._projection = RigProjection(self._task.rig)
         self._report = report
-        self._factors = RecordingFactors(segment, anchor, self._rig, backend, config)
+        self._factors = RecordingFactors(segment, start.anchor, self._task.rig, backend, config)
         seen = segment.seen_by_keyframes()
         chosen = longest_tracks(seen, config.features, _MIN_KEYFRAMES)
         self._candidates = seen.subset(chosen)
@@ -126,7 +158,7 @@ class BundleAdjustment:
         self.iterations = 0
         self._sigma_px = backend.noise.pixel_sigma
         self._values = gtsam.Values()
-        for k, state in enumerate(states):
+        for k, state in enumerate(start.states):
             self._values.insert(X(k), state.world_T_body)
             self._values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
@@ -146,18 +178,18 @@ class BundleAdjustment:
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
         dynamics = 15 * max(len(self._segment.keyframes) - 1, 1)
-        return AdjustedSegment(
-            self._states(),
-            len(self._segment.keyframes),
-            len(obs.ids),
-            len(obs),
-            self.iterations,
-            before,
-            cost,
-            float(np.sqrt(2.0 * imu_cost / dynamics)),
-            float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
-            self._sigma_px,
+        figures = AdjustmentFigures(
+            keyframes=len(self._segment.keyframes),
+            features=len(obs.ids),
+            observations=len(obs),
+            iterations=self.iterations,
+            cost_before=before,
+            cost_after=cost,
+            imu_residual=float(np.sqrt(2.0 * imu_cost / dynamics)),
+            pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
+            pixel_sigma=self._sigma_px,
         )
+        return AdjustedSegment(self._states(), figures)
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -284,5 +316,5 @@ class BundleAdjustment:
                     gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
-        params = preintegration_params(self._rig.imu, self._backend.noise.gravity)
-        return fill_in(keyframes, self._segment.stamps_ns, self._segment.imu, params)
+        stamps_ns, imu = self._segment.stamps_ns, self._segment.imu
+        return fill_in(keyframes, stamps_ns, imu, self._task.preintegration)

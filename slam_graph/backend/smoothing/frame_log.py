@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import ReaderOptions, TrackRecorder, TrackRecordingSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Packet, Rig
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 _MAX_BEYOND_NS = 100_000_000
 """Frames farther outside of the IMU samples than this are left out."""

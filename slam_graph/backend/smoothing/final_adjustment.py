@@ -19,16 +19,22 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.recording_problem import (
+    AdjustedSegment,
+    AdjustmentFigures,
+    BundleAdjustment,
+    SegmentStart,
+    SmoothingTask,
+)
+from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.sensors import Rig, preintegration_params
-from slam_graph.smoothing.frame_log import FrameLog
-from slam_graph.smoothing.keyframe_states import states_at
-from slam_graph.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
-from slam_graph.smoothing.recording_segment import RecordingSegment, read_segment
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.smoothing.track_fusion import with_fused_features
+from slam_graph.sensors import Rig
 
 logger = logging.getLogger(__name__)
 
@@ -46,41 +52,23 @@ Report = Callable[[int, int, int], None]
 """Is given after each step: keyframes that are done, all keyframes, steps so far."""
 
 
-class UndeterminedError(EstimationError):
+class _UndeterminedError(EstimationError):
     """There are too few observations to improve on the causal estimate."""
 
 
-@dataclass(frozen=True, slots=True)
-class FinalBaSummary:
-    """Figures of the bundle adjustment over a whole recording.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinalBaSummary(AdjustmentFigures):
+    """Figures of the bundle adjustment over a whole recording, summed over its segments.
 
     Attributes:
         segments: number of segments.
         frames: number of poses.
-        keyframes: number of keyframes, summed over the segments.
-        features: number of features, likewise.
-        observations: number of observations, likewise.
-        iterations: Levenberg-Marquardt steps.
-        cost_before: initial cost, of all observations.
-        cost_after: cost at the minimum, without outliers.
-        imu_residual: root mean square of the whitened IMU residuals.
-        pixel_residual: root mean square of the whitened reprojection residuals.
-        pixel_sigma: assumed standard deviation of the observations at the end, pixels.
         seconds: wall time.
         cpu_seconds: processor time.
     """
 
     segments: int
     frames: int
-    keyframes: int
-    features: int
-    observations: int
-    iterations: int
-    cost_before: float
-    cost_after: float
-    imu_residual: float
-    pixel_residual: float
-    pixel_sigma: float
     seconds: float
     cpu_seconds: float
 
@@ -105,7 +93,7 @@ def adjust_recording(
     backend: BackendConfig,
     config: FinalBaConfig,
     report: Report,
-) -> FinalBa:
+) -> FinalBa | None:
     """Solve a recording as a whole.
 
     Args:
@@ -117,101 +105,102 @@ def adjust_recording(
         config: settings.
         report: is given the progress after each step.
 
+    Returns:
+        The smoothed trajectory; None if there are too few observations to improve on the causal
+        estimate, which is logged.
+
     Raises:
-        UndeterminedError: if there are too few observations.
         EstimationError: if the minimum does not fit the observations.
     """
+    try:
+        return _smoothed(log, causal, SmoothingTask(rig, backend, config), report)
+    except _UndeterminedError as reason:
+        logger.info("no final bundle adjustment: %s", reason)
+        return None
+
+
+def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Report) -> FinalBa:
+    """What `adjust_recording` returns where there are enough observations."""
     began = (time.perf_counter(), time.process_time())
     keyframes = log.keyframes
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
-        raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
-    params = preintegration_params(rig.imu, backend.noise.gravity)
-    causal = _extended_backward(log, causal, rig, backend, config, report)
+        raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
+    longest = task.config.max_keyframes
+    causal = _extended_backward(log, causal, task, report)
     parts: list[Trajectory] = []  # final, as compact arrays
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
-    for first, stop in segments(len(keyframes), config.max_keyframes):
-        segment = read_segment(log, keyframes[first:stop], rig, backend.zero_velocity)
+    for first, stop in segments(len(keyframes), longest):
+        segment = _read(log, keyframes[first:stop], task)
         stamps_ns = segment.keyframe_stamps_ns
         if not _overlaps(causal, stamps_ns):
             continue
-        start = states_at(causal, stamps_ns, segment.imu, params)
+        start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
         begin = 0
         if states:
-            anchor = min(_overlap(config.max_keyframes) // 2, len(stamps_ns) - 1)
+            anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
             begin = int(segment.keyframes[anchor])
             joint = bisect_left(states, stamps_ns[anchor], key=_stamp_ns)
             parts.append(_trajectory(states[:joint]))
             start = _aligned(start, start[anchor], states[joint])
-        steps = sum(part.iterations for part in solved)
+        steps = sum(part.figures.iterations for part in solved)
         progress = _progress(report, first, len(keyframes), steps)
-        adjusted = _adjusted(segment, start, anchor, rig, backend, config, progress)
+        adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
         states = adjusted.states[begin:]
         solved.append(replace(adjusted, states=[]))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")
     trajectory = _concatenated([*parts, _trajectory(states)])
-    return FinalBa(trajectory, _summary(solved, len(trajectory), began))
+    figures = [part.figures for part in solved]
+    return FinalBa(trajectory, _summary(figures, len(trajectory), began))
+
+
+def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:
+    """The segment from the first of some keyframes to the last."""
+    return read_segment(log, keyframes, task.rig, task.backend.zero_velocity)
 
 
 def _adjusted(
-    segment: RecordingSegment,
-    start: list[NavState],
-    anchor: int,
-    rig: Rig,
-    backend: BackendConfig,
-    config: FinalBaConfig,
-    report: Callable[[int], None],
+    start: SegmentStart, task: SmoothingTask, report: Callable[[int], None]
 ) -> AdjustedSegment:
     """The minimum of a segment with fused features; if fusion fails, with the original tracks."""
-    if config.fuse_features:
+    if task.config.fuse_features:
         try:
-            fused, states, steps = with_fused_features(
-                segment, start, anchor, rig, backend, config, report
-            )
-            further = BundleAdjustment(
-                fused, states, anchor, rig, backend, config, lambda step: report(steps + step)
-            )
-            solved = further.solve()
+            fused, steps = with_fused_features(start, task, report)
+            solved = BundleAdjustment(fused, task, lambda step: report(steps + step)).solve()
             _check(solved)
-            return replace(solved, iterations=solved.iterations + steps)
-        except UndeterminedError:
+            figures = solved.figures
+            return replace(solved, figures=replace(figures, iterations=figures.iterations + steps))
+        except _UndeterminedError:
             raise
         except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
             logger.warning("features are not fused: %s", " ".join(str(error).split())[:200])
-    solved = BundleAdjustment(segment, start, anchor, rig, backend, config, report).solve()
+    solved = BundleAdjustment(start, task, report).solve()
     _check(solved)
     return solved
 
 
 def _extended_backward(
-    log: FrameLog,
-    causal: Trajectory,
-    rig: Rig,
-    backend: BackendConfig,
-    config: FinalBaConfig,
-    report: Report,
+    log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Report
 ) -> Trajectory:
     """A trajectory extended backward to (less than a stride after) the first frame.
 
     Backward IMU prediction alone holds for a few seconds only. So it is done in strides, each
     followed by a bundle adjustment of the frames around it.
     """
-    keyframes, params = log.keyframes, preintegration_params(rig.imu, backend.noise.gravity)
-    stamps_ns = log.frames_ns[keyframes] + round(rig.cameras[0].time_offset_s * 1e9)
+    keyframes = log.keyframes
+    stamps_ns = log.frames_ns[keyframes] + round(task.rig.cameras[0].time_offset_s * 1e9)
     while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > _STRIDE:
         first = before - _STRIDE
-        segment = read_segment(
-            log, keyframes[first : before + _CONTEXT], rig, backend.zero_velocity
-        )
+        segment = _read(log, keyframes[first : before + _CONTEXT], task)
         known = segment.keyframe_stamps_ns
         if not _overlaps(causal, known):
             break
-        start = states_at(causal, known, segment.imu, params)
-        anchor = min(_STRIDE, len(known) - 1)
+        states = states_at(causal, known, segment.imu, task.preintegration)
+        start = SegmentStart(segment, states, min(_STRIDE, len(known) - 1))
         progress = _progress(report, 0, len(keyframes), 0)
-        solved = BundleAdjustment(segment, start, anchor, rig, backend, config, progress).solve()
+        solved = BundleAdjustment(start, task, progress).solve()
         _check(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
         causal = _concatenated([_trajectory(earlier), causal])
@@ -272,12 +261,13 @@ def _overlaps(causal: Trajectory, stamps_ns: IntArray) -> bool:
 
 def _check(solved: AdjustedSegment) -> None:
     """Refuse a minimum that does not fit the observations."""
-    if solved.observations < _MIN_OBSERVATIONS_PER_KEYFRAME * solved.keyframes:
-        raise UndeterminedError(
-            f"{solved.observations} observations in {solved.keyframes} keyframes are too few"
+    found = solved.figures
+    if found.observations < _MIN_OBSERVATIONS_PER_KEYFRAME * found.keyframes:
+        raise _UndeterminedError(
+            f"{found.observations} observations in {found.keyframes} keyframes are too few"
         )
-    if not solved.pixel_residual < MAX_PIXEL_RESIDUAL:
-        raise EstimationError(f"images do not fit: residuals of {solved.pixel_residual:.1f} σ")
+    if not found.pixel_residual < MAX_PIXEL_RESIDUAL:
+        raise EstimationError(f"images do not fit: residuals of {found.pixel_residual:.1f} σ")
     if not all(np.isfinite(state.world_T_body.matrix()).all() for state in solved.states):
         raise EstimationError("a pose is not finite")
 
@@ -298,7 +288,7 @@ def _concatenated(parts: list[Trajectory]) -> Trajectory:
 
 
 def _summary(
-    solved: list[AdjustedSegment], frames: int, began: tuple[float, float]
+    solved: list[AdjustmentFigures], frames: int, began: tuple[float, float]
 ) -> FinalBaSummary:
     """Figures of all segments together."""
 
@@ -311,17 +301,17 @@ def _summary(
         return float(np.sqrt(np.average(squares, weights=weights)))
 
     return FinalBaSummary(
-        len(solved),
-        frames,
-        total("keyframes"),
-        total("features"),
-        total("observations"),
-        total("iterations"),
-        sum(part.cost_before for part in solved),
-        sum(part.cost_after for part in solved),
-        rms("imu_residual", "keyframes"),
-        rms("pixel_residual", "observations"),
-        rms("pixel_sigma", "observations"),
-        time.perf_counter() - began[0],
-        time.process_time() - began[1],
+        segments=len(solved),
+        frames=frames,
+        keyframes=total("keyframes"),
+        features=total("features"),
+        observations=total("observations"),
+        iterations=total("iterations"),
+        cost_before=sum(part.cost_before for part in solved),
+        cost_after=sum(part.cost_after for part in solved),
+        imu_residual=rms("imu_residual", "keyframes"),
+        pixel_residual=rms("pixel_residual", "observations"),
+        pixel_sigma=rms("pixel_sigma", "observations"),
+        seconds=time.perf_counter() - began[0],
+        cpu_seconds=time.process_time() - began[1],
     )

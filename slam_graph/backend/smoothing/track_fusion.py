@@ -22,24 +22,29 @@ from dataclasses import replace
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection
-from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig
-from slam_graph.smoothing.projected_matches import (
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.projected_matches import (
     REACH_PX,
     Matches,
     Scene,
     consistent_matches,
     projected_matches,
 )
-from slam_graph.smoothing.recording_problem import BundleAdjustment
-from slam_graph.smoothing.recording_segment import (
+from slam_graph.backend.smoothing.recording_problem import (
+    BundleAdjustment,
+    SegmentStart,
+    SmoothingTask,
+)
+from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     triangulated,
     views,
     with_gtsam_cameras,
 )
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.geometry import NavState
+from slam_graph.sensors import Rig
 
 _VISIT_S = 6.0
 """Length of a visit: the drift within it is negligible."""
@@ -55,44 +60,33 @@ _SETTLED = 0.1
 
 
 def with_fused_features(
-    segment: RecordingSegment,
-    states: list[NavState],
-    anchor: int,
-    rig: Rig,
-    backend: BackendConfig,
-    config: FinalBaConfig,
-    report: Callable[[int], None],
-) -> tuple[RecordingSegment, list[NavState], int]:
+    given: SegmentStart, task: SmoothingTask, report: Callable[[int], None]
+) -> tuple[SegmentStart, int]:
     """Fuse the features of a segment.
 
     Args:
-        segment: of a recording.
-        states: initial states of its keyframes.
-        anchor: number of the keyframe whose position and yaw are fixed.
-        rig: calibrated sensors.
-        backend: noise and triangulation.
-        config: settings.
+        given: segment, initial states and anchor.
+        task: calibration and settings.
         report: is given the number of steps after each.
 
     Returns:
-        The segment with fused features, the states of its keyframes after the last loose bundle
+        The segment with fused features and the states of its keyframes after the last loose bundle
         adjustment, and the number of steps of all of them.
 
     Raises:
         EstimationError: if there is no minimum.
     """
+    segment, states, anchor = given.segment, given.states, given.anchor
     chosen = np.unique([*range(anchor % _THINNING, len(states), _THINNING), 0, len(states) - 1])
-
+    fixed = int(np.searchsorted(chosen, anchor))
     steps = 0
 
     def adjusted(segment: RecordingSegment, states: list[NavState]) -> list[NavState]:
         nonlocal steps
         before = steps
         thin = replace(segment, keyframes=segment.keyframes[chosen])
-        start, fixed = [states[k] for k in chosen], int(np.searchsorted(chosen, anchor))
-        problem = BundleAdjustment(
-            thin, start, fixed, rig, backend, config, lambda n: report(before + n)
-        )
+        start = SegmentStart(thin, [states[k] for k in chosen], fixed)
+        problem = BundleAdjustment(start, task, lambda n: report(before + n))
         everywhere = problem.solve_loosely()
         steps += problem.iterations
         return [everywhere[frame] for frame in segment.keyframes]
@@ -100,11 +94,11 @@ def with_fused_features(
     states, own = adjusted(segment, states), np.arange(len(segment.seen.ids))
     before = own
     for _ in range(_MAX_ROUNDS):
-        label = _labels(segment, states, rig, backend)
+        label = _labels(segment, states, task.rig, task.backend)
         if np.sum(label != before) <= _SETTLED * np.sum(label != own):
             break
         states, before = adjusted(_relabelled(segment, label), states), label
-    return _relabelled(segment, label), states, steps
+    return SegmentStart(_relabelled(segment, label), states, anchor), steps
 
 
 def _relabelled(segment: RecordingSegment, label: IntArray) -> RecordingSegment:

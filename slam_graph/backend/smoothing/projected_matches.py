@@ -24,7 +24,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import binom
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend import Geometry, Observations, RigProjection
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 
 _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
 """Standard deviation of the drift between visits, a weak prior: shift (m) and yaw (rad)."""

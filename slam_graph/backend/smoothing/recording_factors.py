@@ -25,21 +25,16 @@ import numpy as np
 from gtsam.symbol_shorthand import B, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import (
-    IMU_GAP_SCALE,
-    BackendConfig,
-    Geometry,
-    Observations,
-    ProjectionFactors,
-    RigProjection,
-    RobustLoss,
-    imu_factor,
-    pixel_noise,
-    zero_velocity_factors,
-)
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
+from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
+from slam_graph.backend.smoothing.recording_segment import RecordingSegment
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.sensors import Rig, preintegrate, preintegration_params
-from slam_graph.smoothing.recording_segment import RecordingSegment
-from slam_graph.smoothing.smoothing_config import FinalBaConfig
 
 
 def nearest_keyframe(stamps_ns: IntArray, keyframes: IntArray) -> IntArray:

@@ -9,16 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend import (
-    BackendConfig,
-    Observations,
-    RigProjection,
-    StandstillDetector,
-    ZeroVelocityConfig,
-    triangulate,
-)
+from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
-from slam_graph.smoothing.frame_log import FrameLog
 
 _MAX_INITIAL_ERROR = 30.0
 """Features with a larger root-mean-square reprojection error are left out, in units of σ."""

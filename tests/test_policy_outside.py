@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Policies of one's own are treated by what they say of themselves, not by their names."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from slam_graph.arrays import BoolArray
+from slam_graph.backend import FEATURE_POLICIES, POSE_SELECTIONS, FeaturePolicy, PoseSelection
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.selection_policies import WaitingTracks
+from slam_graph.backend.policies import CostPolicy
+from slam_graph.backend.window import Window
+
+
+def all_poses(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
+    """Keeps every pose, whatever `max_past_poses` says."""
+    return PoseSelection(list(window.past))
+
+
+def none_due(tracks: WaitingTracks) -> BoolArray:
+    return np.zeros(len(tracks.ids), np.bool_)
+
+
+def all_due(tracks: WaitingTracks) -> BoolArray:
+    return np.ones(len(tracks.ids), np.bool_)
+
+
+@pytest.fixture(autouse=True)
+def outside() -> Iterator[None]:
+    with (
+        POSE_SELECTIONS.registered("all", all_poses),
+        FEATURE_POLICIES.registered(
+            "state_and_wait", FeaturePolicy(none_due, drops_ended=True, uses_tracks=False)
+        ),
+        FEATURE_POLICIES.registered("anew", FeaturePolicy(all_due, relinearized=True)),
+    ):
+        yield
+
+
+@pytest.mark.parametrize("features", ["state", "state_and_wait"])
+def test_settings_of_tracks_are_refused_where_none_are_used(features: str) -> None:
+    assert CostPolicy(features=features).features == features
+    with pytest.raises(ValidationError, match="uses no features outside the state"):
+        CostPolicy(features=features, max_features_per_step=7)
+    with pytest.raises(ValidationError, match=f"{features} measures only features of the state"):
+        CostPolicy(features=features, max_state_features=0)
+
+
+@pytest.mark.parametrize("features", ["once", "every_step", "anew"])
+def test_settings_of_tracks_are_accepted_where_some_are_used(features: str) -> None:
+    assert CostPolicy(features=features, max_features_per_step=7).max_features_per_step == 7
+    assert CostPolicy(features=features, max_state_features=0).max_state_features == 0
+
+
+@pytest.mark.parametrize("features", ["every_step", "anew"])
+def test_features_that_stay_are_refused_where_all_their_observations_are_dropped(
+    features: str,
+) -> None:
+    with pytest.raises(ValidationError, match=f"{features} makes a feature part of the prior"):
+        CostPolicy(past_poses="evenly_spaced", features=features, max_state_features=0)
+
+
+@pytest.mark.parametrize("past_poses", ["most_recent", "evenly_spaced", "keyframes"])
+def test_a_track_longer_than_the_poses_is_refused(past_poses: str) -> None:
+    longest = CostPolicy(past_poses=past_poses, max_past_poses=3, state_feature_frames=5)
+    assert longest.frames_before_state == 5
+    with pytest.raises(ValidationError, match="a feature waits over 5 frames at most"):
+        CostPolicy(past_poses=past_poses, max_past_poses=3, state_feature_frames=6)
+
+
+def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
+    policy = CostPolicy(past_poses="all", max_past_poses=3, state_feature_frames=20)
+    assert policy.frames_before_state == 20
