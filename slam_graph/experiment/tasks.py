@@ -25,7 +25,7 @@ from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.frontend import build_frontend
 from slam_graph.pipeline import run
-from slam_graph.settings import ConfigTree, Settings, override, validate
+from slam_graph.settings import ConfigTree, Settings
 from slam_graph.simulation import TRAJECTORIES, SimulationConfig, StartConfig, simulate
 from slam_graph.version import __version__
 
@@ -127,8 +127,8 @@ def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) 
         tree.merge(ConfigTree({"trajectory": str(path), "real_imu": True}))
         name = path.name
     for text in overrides:
-        tree.merge(override(text))
-    return Source(name=f"sim_{_plain(name)}", simulation=validate(SimulationConfig, tree))
+        tree.merge(ConfigTree.override(text))
+    return Source(name=f"sim_{_plain(name)}", simulation=tree.validated(SimulationConfig))
 
 
 def _plain(name: str) -> str:

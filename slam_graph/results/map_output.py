@@ -10,7 +10,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import tum_lines
 from slam_graph.maps import SlamMap, read_map, write_map
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
 
@@ -195,7 +194,7 @@ def export_tum(content: SlamMap, path: Path | str, force: bool = False) -> list[
         refuse_to_replace(file, force)
     for file, trajectory in zip(paths, content.trajectories(), strict=True):
         try:
-            write_text(file, tum_lines(trajectory))
+            write_text(file, trajectory.tum_lines())
         except OSError as error:
             raise DataError(f"{file}: cannot be written ({error.strerror or error})") from error
     return paths

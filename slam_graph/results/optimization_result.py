@@ -21,8 +21,6 @@ from slam_graph.bundle_adjustment import (
     bal_lines,
     reprojection_errors,
 )
-from slam_graph.config import dump_yaml
-from slam_graph.geometry import tum_lines
 from slam_graph.pose_graph import (
     Certificate,
     PoseGraphPolicy,
@@ -129,7 +127,7 @@ class BalResult:
         """
         files = ResultFolder(folder)
         files.text("optimized.txt", self.lines())
-        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.text("config.yaml", [self.policy.as_yaml()])
         files.json("metrics.json", self.metrics)
         write_ply(files.path("scene.ply"), self.after.points, self.after.centres())
         self._draw(files.path("bundle_adjustment.png"))
@@ -244,9 +242,9 @@ class PoseGraphResult:
         solution, graph = self.solution, self.solution.graph
         files = ResultFolder(folder)
         files.text("optimized.g2o", g2o_lines(graph, solution.poses))
-        files.text("trajectory.tum", tum_lines(graph.trajectory(solution.poses)))
+        files.text("trajectory.tum", graph.trajectory(solution.poses).tum_lines())
         files.text("edges.csv", self._edge_lines())
-        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.text("config.yaml", [self.policy.as_yaml()])
         files.json("metrics.json", self.metrics)
         if self.covariances is not None:
             files.text("covariances.csv", self._covariance_lines(self.covariances))

@@ -14,11 +14,11 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import WindowGraph
-from slam_graph.config import RunConfig, dump_yaml
+from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.evaluation import ape, innovation_report, select
-from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory, tum_lines
+from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
@@ -253,22 +253,22 @@ class RunResult:
             The files, in the order in which they were written.
         """
         files = ResultFolder(folder)
-        files.text(names.TRAJECTORY, tum_lines(self.trajectory))
+        files.text(names.TRAJECTORY, self.trajectory.tum_lines())
         files.text(names.STATES, names.state_lines(self.history))
         if self.smoothed is not None:
-            files.text(names.SMOOTHED, tum_lines(self.smoothed))
+            files.text(names.SMOOTHED, self.smoothed.tum_lines())
         if self.loops is not None and self.loop_closed is not None:
-            files.text(names.LOOP_CLOSED, tum_lines(self.loop_closed))
+            files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
             files.text("loops.csv", self.loops.csv_lines())
             write_ply(files.path("map_loop.ply"), self.loops.points())
         if self.localization is not None:
-            files.text(names.IN_MAP, tum_lines(self.localization.trajectory()))
+            files.text(names.IN_MAP, self.localization.trajectory().tum_lines())
             files.text("localization.csv", self.localization.csv_lines())
         if self.groundtruth is not None:
-            files.text(names.GROUNDTRUTH, tum_lines(self.groundtruth))
+            files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)
         files.text("timing.csv", self.logs.timing.csv_lines())
-        files.text(names.CONFIG, [dump_yaml(self.config)])
+        files.text(names.CONFIG, [self.config.as_yaml()])
         write_kalibr(self.rig, files.path(names.RIG))
         files.json(names.METRICS, self.metrics)
         calibrated = self.logs.calibration.latest
