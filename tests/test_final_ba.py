@@ -14,6 +14,7 @@ from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.absolute_pose_error import ape
@@ -22,7 +23,6 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import (
     FlightConfig,

@@ -60,6 +60,18 @@ class NavState:
     gyro_bias: FloatArray = field(kw_only=True)
     covariance: FloatArray | None = field(default=None, kw_only=True)
 
+    def predicted(self, pim: gtsam.PreintegratedCombinedMeasurements, stamp_ns: int) -> NavState:
+        """The state at `stamp_ns`, the end of a preintegration that began at this state: g(x_t)."""
+        bias = gtsam.imuBias.ConstantBias(self.accel_bias, self.gyro_bias)
+        there = pim.predict(gtsam.NavState(self.world_T_body, self.velocity), bias)
+        return NavState(
+            stamp_ns,
+            there.pose(),
+            np.asarray(there.velocity()),
+            accel_bias=self.accel_bias,
+            gyro_bias=self.gyro_bias,
+        )
+
     def __repr__(self) -> str:
         position = ", ".join(f"{value:.3f}" for value in self.world_T_body.translation())
         return f"NavState({seconds_text(self.stamp_ns)} s, position ({position}) m)"

@@ -15,7 +15,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import WindowGraph
 from slam_graph.config import RunConfig
-from slam_graph.datasets import SequenceInfo
+from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.evaluation import ape, innovation_report, select
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
@@ -27,7 +27,7 @@ from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder, appearing
 from slam_graph.results.run_logs import RunLogs
-from slam_graph.sensors import Rig, write_kalibr
+from slam_graph.sensors import Rig
 from slam_graph.smoothing import FinalBa
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
@@ -269,11 +269,11 @@ class RunResult:
         write_ply(files.path(names.POINTS), self.points)
         files.text("timing.csv", self.logs.timing.csv_lines())
         files.text(names.CONFIG, [self.config.as_yaml()])
-        write_kalibr(self.rig, files.path(names.RIG))
+        files.text(names.RIG, [kalibr_text(self.rig)])
         files.json(names.METRICS, self.metrics)
         calibrated = self.logs.calibration.latest
         if calibrated is not None:
-            write_kalibr(calibrated.rig, files.path("calibration_estimated.yaml"))
+            files.text("calibration_estimated.yaml", [kalibr_text(calibrated.rig)])
             files.text("calibration.csv", self.logs.calibration.csv_lines())
         for stamp_ns, graph in self.graphs.items():
             for name, text in graph.texts().items():

@@ -160,7 +160,14 @@ _REAL_START = StartConfig(
 
 
 class SimulationConfig(Settings):
-    """All settings of a simulation."""
+    """All settings of a simulation.
+
+    Attributes:
+        TRAJECTORIES: names of the generated trajectories; any other text is the path of a recorded
+            one.
+    """
+
+    TRAJECTORIES: ClassVar[tuple[str, ...]] = TRAJECTORIES
 
     kind: Literal["tracks", "images"] = Field("tracks")
     """tracks: feature tracks, made in seconds, for questions about the back end; images: rendered

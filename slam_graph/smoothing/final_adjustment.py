@@ -22,7 +22,7 @@ from slam_graph.arrays import IntArray
 from slam_graph.backend import BackendConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.sensors import Rig, preintegration_params
+from slam_graph.sensors import Rig
 from slam_graph.smoothing.frame_log import FrameLog
 from slam_graph.smoothing.keyframe_states import states_at
 from slam_graph.smoothing.recording_problem import AdjustedSegment, BundleAdjustment
@@ -125,7 +125,7 @@ def adjust_recording(
     keyframes = log.keyframes
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
         raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
-    params = preintegration_params(rig.imu, backend.noise.gravity)
+    params = rig.imu.preintegration_params(backend.noise.gravity)
     causal = _extended_backward(log, causal, rig, backend, config, report)
     parts: list[Trajectory] = []  # final, as compact arrays
     states: list[NavState] = []  # of the last segment, from its anchor on
@@ -198,7 +198,7 @@ def _extended_backward(
     Backward IMU prediction alone holds for a few seconds only. So it is done in strides, each
     followed by a bundle adjustment of the frames around it.
     """
-    keyframes, params = log.keyframes, preintegration_params(rig.imu, backend.noise.gravity)
+    keyframes, params = log.keyframes, rig.imu.preintegration_params(backend.noise.gravity)
     stamps_ns = log.frames_ns[keyframes] + round(rig.cameras[0].time_offset_s * 1e9)
     while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > _STRIDE:
         first = before - _STRIDE

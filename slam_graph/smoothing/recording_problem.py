@@ -28,7 +28,7 @@ from slam_graph.backend import (
 )
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig, preintegration_params
+from slam_graph.sensors import Rig
 from slam_graph.smoothing.keyframe_states import fill_in
 from slam_graph.smoothing.recording_factors import RecordingFactors, averaged, nearest_keyframe
 from slam_graph.smoothing.recording_segment import (
@@ -284,5 +284,5 @@ class BundleAdjustment:
                     gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
-        params = preintegration_params(self._rig.imu, self._backend.noise.gravity)
+        params = self._rig.imu.preintegration_params(self._backend.noise.gravity)
         return fill_in(keyframes, self._segment.stamps_ns, self._segment.imu, params)

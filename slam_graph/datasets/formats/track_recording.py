@@ -38,17 +38,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
-    within,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, read_kalibr, read_yaml
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
 FORMAT_NAME = "slam_graph-tracks"
 FORMAT_VERSION = 1
@@ -186,11 +187,11 @@ class TrackRecordingSequence(RecordedSequence):
         self._index = np.fromfile(path / FRAMES, self._record)
         self._check_descriptors()
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """How much was recorded."""
         stamps = self._index["stamp"]
         ends = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0)
-        return Extent(len(stamps), *ends, self._samples)
+        return self.holding(len(stamps), *ends, self._samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU stream from `after_ns` on."""
@@ -206,7 +207,7 @@ class TrackRecordingSequence(RecordedSequence):
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """The recorded frames, read one by one."""
-        wanted = np.flatnonzero(within(self._index["stamp"], start_ns, end_ns))
+        wanted = np.flatnonzero(self.within(self._index["stamp"], start_ns, end_ns))
         if len(wanted) == 0:
             return
         size, before = FEATURE_RECORD.itemsize, self._index["counts"][: wanted[0]]
