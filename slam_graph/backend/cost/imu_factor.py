@@ -15,7 +15,7 @@ the rotation are attributed to the gyroscope, those of the velocity to the accel
 The dynamics model: the state of a new frame predicted by the IMU, and the factor between frames.
 The residual x_{t+1} - g(x_t) of the dynamics is the preintegrated IMU factor of Forster et al. 2017
 with the random walk of the biases (GTSAM's `CombinedImuFactor`); the integration itself is in
-`sensors.imu_buffer`.
+`ImuData.preintegrated` (`sensors.measurements`).
 """
 
 from __future__ import annotations

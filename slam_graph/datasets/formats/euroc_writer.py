@@ -173,7 +173,7 @@ class EurocWriter:
         if info.content == "tracks":
             raise DataError(
                 f"{info.name}: format '{info.format}' holds feature tracks, no images; copy it as "
-                "it is, or write tracks with slam_graph.datasets.formats.track_recorder.TrackRecorder"
+                "it is, or write tracks with slam_graph.datasets.TrackRecorder"
             )
         seconds = max((info.end_ns - info.start_ns) * 1e-9, 1e-9)
         rate_hz = round((info.frames - 1) / seconds, 3)

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded feature tracks: the folder format, and its replay.
 
-The folder format of recorded feature tracks: its files and their records. All numbers are little-
-endian, and no file is a pickle:
+A recording is replayed bit for bit, so that every algorithm gets the same features. `TrackRecorder`
+writes recordings. All numbers are little-endian, and no file is a pickle:
 
 - ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, `name`, and the number of `cameras`,
   `frames`, `imu_samples` and `features`, by which a truncated file is recognised;
-- ``calibration.yaml``: the rig, as `slam_graph.sensors.kalibr_calibration` writes it;
+- ``calibration.yaml``: the rig, as `slam_graph.datasets.calibration.kalibr_calibration` writes it;
 - ``frames.bin``: for each frame `stamp` (int64, ns) and `counts` (int64 for each camera), the
   number of features of each camera;
 - ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
@@ -17,11 +17,6 @@ endian, and no file is a pickle:
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
 - ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
   `NavState` under their names (`world_T_body` as a 4x4 matrix).
-
-A recording is replayed bit for bit.
-
-Recorded feature tracks: replayed, so that every algorithm gets the same features. `TrackRecorder`
-writes recordings; `track_format` describes the files.
 """
 
 from __future__ import annotations
