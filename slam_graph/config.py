@@ -7,11 +7,10 @@ Later sources replace earlier ones: defaults, algorithm, YAML file, options, ove
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
@@ -20,12 +19,11 @@ from slam_graph.errors import ConfigError, closest
 from slam_graph.frontend import FrontendConfig
 from slam_graph.loop_closure import LoopClosureConfig
 from slam_graph.maps import LocalizationConfig, MapConfig
-from slam_graph.settings import ConfigTree, Settings, expert, override_trees, read_tree, validate
+from slam_graph.settings import ConfigTree, Settings, expert
 
 __all__ = [
     "LimitsConfig",
     "RunConfig",
-    "dump_yaml",
     "load_config",
 ]
 
@@ -55,15 +53,15 @@ def algorithm_tree(name: str) -> ConfigTree:
         ConfigError: if there is no such algorithm or file.
     """
     if Path(name).suffix in (".yaml", ".yml"):
-        return read_tree(Path(name))
+        return ConfigTree.read(Path(name))
     if name not in algorithm_names():
         raise ConfigError(f"unknown algorithm '{name}'; {closest(name, algorithm_names())}")
-    return read_tree(config_folder() / "algorithms" / f"{name}.yaml")
+    return ConfigTree.read(config_folder() / "algorithms" / f"{name}.yaml")
 
 
 def _named_algorithm(value: Any) -> Any:
     """Read the table of an algorithm that is given by its name."""
-    return validate(AlgorithmConfig, algorithm_tree(value)) if isinstance(value, str) else value
+    return algorithm_tree(value).validated(AlgorithmConfig) if isinstance(value, str) else value
 
 
 def _counted_cameras(value: Any) -> Any:
@@ -158,7 +156,7 @@ class RunConfig(Settings):
             ConfigError: if a change does not fit the schema.
         """
         tree = ConfigTree(self.model_dump(exclude_unset=True))
-        return validate(type(self), _changed(tree, overrides, options))
+        return _changed(tree, overrides, options).validated(type(self))
 
 
 def load_config(
@@ -183,7 +181,7 @@ def load_config(
     tree = ConfigTree()
     if file is not None:
         tree = _algorithm_or_settings(file)
-    return validate(RunConfig, _changed(tree, overrides, options))
+    return _changed(tree, overrides, options).validated(RunConfig)
 
 
 def _algorithm_or_settings(file: Path | str) -> ConfigTree:
@@ -195,7 +193,7 @@ def _algorithm_or_settings(file: Path | str) -> ConfigTree:
         raise ConfigError(
             f"'{name}' is neither a YAML file nor an algorithm; {closest(name, algorithm_names())}"
         )
-    tree = read_tree(Path(file))
+    tree = ConfigTree.read(Path(file))
     if "algorithm" not in tree.values and tree.values.keys() & AlgorithmConfig.model_fields.keys():
         return ConfigTree({"algorithm": name})
     return tree
@@ -210,7 +208,7 @@ def _changed(
     tree.values.setdefault("algorithm", _DEFAULT_ALGORITHM)
     given = {name: _plain(value) for name, value in options.items() if value is not None}
     tree.merge(ConfigTree(given, {(name,): f"option {name}" for name in given}))
-    changes = override_trees(overrides)
+    changes = ConfigTree.overrides(overrides)
     for change in changes:  # the algorithm's name first: other overrides may change its table
         if isinstance(change.values.get("algorithm"), str):
             tree.merge(change)
@@ -228,11 +226,6 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def dump_yaml(config: BaseModel) -> str:
-    """The settings as YAML that `load_config` reads back, each with its meaning as a comment."""
-    return "\n".join(_yaml_lines(config, config.model_dump(mode="json"), "")) + "\n"
-
-
 def _expand_algorithm(tree: ConfigTree) -> None:
     """Replace the name of an algorithm by its table, so that overrides can change the table."""
     name = tree.values["algorithm"]
@@ -245,19 +238,3 @@ def _expand_algorithm(tree: ConfigTree) -> None:
         raise ConfigError(f"{where}: {error}" if where else str(error)) from error
     tree.values["algorithm"] = table.values
     tree.where |= {("algorithm", *path): place for path, place in table.where.items()}
-
-
-def _yaml_lines(config: BaseModel, plain: dict[str, Any], indent: str) -> Iterator[str]:
-    """The lines of those settings of a table that are in its dump `plain`."""
-    for name, info in type(config).model_fields.items():
-        if name not in plain:
-            continue
-        if info.description:
-            yield f"{indent}# {' '.join(info.description.split())}"
-        value = getattr(config, name)
-        if isinstance(value, BaseModel):
-            yield f"{indent}{name}:"
-            yield from _yaml_lines(value, plain[name], indent + "  ")
-        else:
-            text = yaml.safe_dump(plain[name], default_flow_style=True, width=10_000)
-            yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()}"

@@ -14,7 +14,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, GatingConfig, InitializationConfig
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate, preintegration_params
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 
@@ -80,11 +80,11 @@ def exact_recording(
     step_s = 1.0 / FRAME_RATE_HZ
     imu = Flight().imu(-0.1, frames * step_s)
     buffer.add(imu)
-    params, bias = preintegration_params(mounted.imu, 9.81), gtsam.imuBias.ConstantBias()
+    params, bias = mounted.imu.preintegration_params(9.81), gtsam.imuBias.ConstantBias()
     for _ in range(1, frames):
         stamp_ns = state.stamp_ns + round(step_s * NS_PER_S)
         samples = buffer.between(state.stamp_ns, stamp_ns)
-        state = predict(state, preintegrate(samples, bias, params), stamp_ns)
+        state = state.predicted(samples.preintegrated(bias, params), stamp_ns)
         states.append(state)
     given = 0
     for i, state in enumerate(states):
@@ -107,7 +107,7 @@ def batch_problem(
     """All factors of a flight, and the truth to begin at."""
     graph, values, buffer = gtsam.NonlinearFactorGraph(), gtsam.Values(), ImuBuffer()
     buffer.add(ImuData.concatenate([packet.imu for packet in flown]))
-    params = preintegration_params(mounted.imu, 9.81)
+    params = mounted.imu.preintegration_params(9.81)
     bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
     S = start.covariance
     assert S is not None
@@ -125,7 +125,7 @@ def batch_problem(
         values.insert(B(i), gtsam.imuBias.ConstantBias())
         if i:
             samples = buffer.between(flown[i - 1].frame.stamp_ns, packet.frame.stamp_ns)
-            graph.add(imu_factor(i - 1, i, preintegrate(samples, bias, params)))
+            graph.add(imu_factor(i - 1, i, samples.preintegrated(bias, params)))
         assert isinstance(packet.frame, FeatureFrame)
         for mount, observed in zip(mounted.cameras, packet.frame.cameras, strict=True):
             c = mount.camera

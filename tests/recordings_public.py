@@ -10,8 +10,8 @@ import numpy as np
 from recordings import SIZE, write_euroc, write_lines
 from scipy.spatial.transform import Rotation
 
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.euroc import EurocSequence
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 
 LATITUDE, LONGITUDE = 49.011212804408, 8.4228850417969
 KITTI_START_NS = 1_317_042_145_964_389_445

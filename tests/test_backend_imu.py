@@ -16,12 +16,12 @@ from scipy.stats import chi2, kstest
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.imu_buffer import ImuBuffer, predict, preintegrate, preintegration_params
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
 
 NOISE = ImuNoise(1e-3, 2e-4, 2e-2, 5e-3, 200.0)
-PARAMS = preintegration_params(NOISE, 9.81)
+PARAMS = NOISE.preintegration_params(9.81)
 NO_BIAS = gtsam.imuBias.ConstantBias()
 
 
@@ -57,7 +57,7 @@ def test_constant_rate_and_acceleration_at_once() -> None:
             force + start.accel_bias,
         )
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
-        pim = preintegrate(samples, bias, PARAMS)
+        pim = samples.preintegrated(bias, PARAMS)
         assert pim.deltaTij() == pytest.approx(length_s, abs=1e-9)
         R_1 = R_0 * Rotation.from_rotvec(rate * length_s)
         truth = NavState(
@@ -72,7 +72,7 @@ def test_constant_rate_and_acceleration_at_once() -> None:
             accel_bias=start.accel_bias,
             gyro_bias=start.gyro_bias,
         )
-        predicted = predict(start, pim, 10**9)
+        predicted = start.predicted(pim, 10**9)
         assert predicted.stamp_ns == 10**9
         np.testing.assert_array_equal(predicted.gyro_bias, start.gyro_bias)
         errors.append(error_of(predicted, truth))
@@ -88,8 +88,8 @@ def test_a_sinusoid_converges_with_the_sample_rate() -> None:
     bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
     errors = []
     for rate_hz in (50, 100, 200, 400):
-        pim = preintegrate(flight.imu(0.4, 1.4, rate_hz), bias, PARAMS)
-        errors.append(error_of(predict(start, pim, truth.stamp_ns), truth))
+        pim = flight.imu(0.4, 1.4, rate_hz).preintegrated(bias, PARAMS)
+        errors.append(error_of(start.predicted(pim, truth.stamp_ns), truth))
     table = np.array(errors)
     assert np.all(table[:-1] / table[1:] > 1.9)  # at least proportional to the period
     assert np.all(table[-1] < (1e-5, 1e-3, 1.5e-3))
@@ -102,10 +102,10 @@ def test_a_change_of_bias_is_corrected_to_first_order() -> None:
     samples = flight.imu(0.0, 0.5)
     small = np.array([2e-3, -1e-3, 1e-3])
     other = replace(start, accel_bias=10 * small, gyro_bias=small)
-    corrected = predict(other, preintegrate(samples, NO_BIAS, PARAMS), 5 * 10**8)
+    corrected = other.predicted(samples.preintegrated(NO_BIAS, PARAMS), 5 * 10**8)
     bias = gtsam.imuBias.ConstantBias(other.accel_bias, other.gyro_bias)
-    anew = predict(other, preintegrate(samples, bias, PARAMS), 5 * 10**8)
-    plain = predict(start, preintegrate(samples, NO_BIAS, PARAMS), 5 * 10**8)
+    anew = other.predicted(samples.preintegrated(bias, PARAMS), 5 * 10**8)
+    plain = start.predicted(samples.preintegrated(NO_BIAS, PARAMS), 5 * 10**8)
     assert all(
         c < 0.02 * p for c, p in zip(error_of(corrected, anew), error_of(plain, anew), strict=True)
     )
@@ -136,9 +136,9 @@ def draws() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Errors (N, 15) of noisy preintegrations, their covariance, and the factors' χ² (N,)."""
     rng, flight = np.random.default_rng(5), Flight()
     samples = flight.imu(0.3, 0.8)
-    clean = preintegrate(samples, NO_BIAS, PARAMS)
+    clean = samples.preintegrated(NO_BIAS, PARAMS)
     start = flight.nav_state(0.3)
-    ideal = predict(start, clean, 8 * 10**8)
+    ideal = start.predicted(clean, 8 * 10**8)
     values = gtsam.Values()
     for frame, state in ((0, start), (1, ideal)):
         values.insert(X(frame), state.world_T_body)
@@ -148,7 +148,7 @@ def draws() -> tuple[FloatArray, FloatArray, FloatArray]:
     errors, squares = [], []
     for _ in range(300):
         samples_k, walked = noisy(samples, rng)
-        pim = preintegrate(samples_k, NO_BIAS, PARAMS)
+        pim = samples_k.preintegrated(NO_BIAS, PARAMS)
         turn = gtsam.Rot3.Logmap(clean.deltaRij().between(pim.deltaRij()))
         errors.append(
             np.concatenate(
@@ -185,8 +185,8 @@ def test_the_residual_of_the_truth_is_chi_squared(
 
 def test_the_scale_multiplies_all_densities() -> None:
     samples = Flight().imu(0.0, 0.2)
-    single = preintegrate(samples, NO_BIAS, preintegration_params(NOISE, 9.81)).preintMeasCov()
-    triple = preintegrate(samples, NO_BIAS, preintegration_params(NOISE, 9.81, 3.0)).preintMeasCov()
+    single = samples.preintegrated(NO_BIAS, NOISE.preintegration_params(9.81)).preintMeasCov()
+    triple = samples.preintegrated(NO_BIAS, NOISE.preintegration_params(9.81, 3.0)).preintMeasCov()
     ratio = np.diag(triple) / np.diag(single)
     np.testing.assert_allclose(np.delete(ratio, [3, 4, 5]), 9.0, rtol=1e-2)
     assert np.all((ratio[3:6] > 1.0) & (ratio[3:6] <= 9.0))  # the integration's own error is fixed

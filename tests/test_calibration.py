@@ -10,12 +10,12 @@ import pytest
 import yaml
 from recordings import edit_text, write_euroc
 
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration_yaml import read_yaml
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.euroc_calibration import read_euroc_rig
-from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
 CHAIN = """cam0:

@@ -19,9 +19,9 @@ from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, 
 from slam_graph.backend.estimator import Estimator
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.errors import ConfigError
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import (
     FeatureFrame,
     FeatureObservations,

@@ -12,9 +12,9 @@ from flight import rig
 from fov_camera import FOV
 
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 

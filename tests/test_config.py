@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from slam_graph.config import RunConfig, algorithm_names, config_folder, dump_yaml, load_config
+from slam_graph.config import RunConfig, algorithm_names, config_folder, load_config
 from slam_graph.errors import ConfigError
-from slam_graph.settings.tree import override, read_tree
+from slam_graph.settings.tree import ConfigTree
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -21,11 +21,11 @@ def write(tmp_path: Path, text: str) -> Path:
 def test_defaults_are_complete_and_survive_a_round_trip(tmp_path: Path) -> None:
     config = load_config()
     assert config == RunConfig()
-    assert load_config(write(tmp_path, dump_yaml(config))) == config
+    assert load_config(write(tmp_path, config.as_yaml())) == config
 
 
 def test_dump_explains_every_setting() -> None:
-    text = dump_yaml(load_config())
+    text = load_config().as_yaml()
     assert "# Standard deviation of a feature observation, in pixels." in text
     assert yaml.safe_load(text)["backend"]["noise"]["pixel_sigma"] == 1.0
 
@@ -34,7 +34,7 @@ def test_dump_explains_every_setting() -> None:
 def test_every_algorithm_survives_a_round_trip(tmp_path: Path, name: str) -> None:
     """What its engine does not use is not written, as it would be refused when it is read."""
     config = load_config(algorithm=name)
-    text = dump_yaml(config)
+    text = config.as_yaml()
     assert load_config(write(tmp_path, text)) == config
     own = config.algorithm.engine == "square_root"
     assert ("cost" in yaml.safe_load(text)["algorithm"]) == own
@@ -171,7 +171,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_merging_leaves_the_parts_as_they_were() -> None:
-    first, second = override("a.b=1"), override("a.c=2")
+    first, second = ConfigTree.override("a.b=1"), ConfigTree.override("a.c=2")
     first.merge(second)
     assert first.values == {"a": {"b": 1, "c": 2}}
     assert second.values == {"a": {"c": 2}}
@@ -179,7 +179,7 @@ def test_merging_leaves_the_parts_as_they_were() -> None:
 
 
 def test_configs_are_found() -> None:
-    assert read_tree(config_folder() / "algorithms" / "msckf.yaml").values["name"] == "msckf"
+    assert ConfigTree.read(config_folder() / "algorithms" / "msckf.yaml").values["name"] == "msckf"
 
 
 def test_an_old_word_names_the_new_one() -> None:

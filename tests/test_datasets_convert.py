@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.datasets.formats.euroc_writer import convert_to_euroc
+from slam_graph.datasets.formats.euroc_writer import EurocWriter
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import Rig
 
@@ -111,7 +111,7 @@ def test_time_offsets_and_shutters_are_kept(tmp_path: Path) -> None:
     rig = open_dataset(source).rig
     cameras = tuple(replace(c, time_offset_s=-3e-3, rolling_shutter=True) for c in rig.cameras)
     write_kalibr(Rig(cameras, rig.imu), chain)
-    convert_to_euroc(open_dataset(source, calibration=chain), tmp_path / "new")
+    EurocWriter.convert(open_dataset(source, calibration=chain), tmp_path / "new")
     same_rig(open_dataset(tmp_path / "new").rig, Rig(cameras, rig.imu))
 
 
@@ -124,7 +124,7 @@ def test_only_euroc_folders_are_replaced_and_only_if_told_so(tmp_path: Path) -> 
         assert status == 1
         assert message in said
     assert (target / "mine.txt").read_text() == "precious"
-    convert_to_euroc(open_dataset(source, cameras=1), tmp_path / "other")
+    EurocWriter.convert(open_dataset(source, cameras=1), tmp_path / "other")
     status, _ = convert(source, tmp_path / "other", "--force")
     assert status == 0
     assert open_dataset(tmp_path / "other").info().cameras == 2
@@ -143,7 +143,7 @@ def test_a_recording_that_cannot_be_read_leaves_nothing(tmp_path: Path) -> None:
 def test_tracks_are_not_images(tmp_path: Path) -> None:
     tracks = open_dataset(write_openvins(tmp_path / "simulated"))
     with pytest.raises(DataError, match="holds feature tracks, no images"):
-        convert_to_euroc(tracks, tmp_path / "new")
+        EurocWriter.convert(tracks, tmp_path / "new")
 
 
 def test_sources_need_a_name_and_a_place(tmp_path: Path) -> None:

@@ -18,11 +18,11 @@ from recordings import (
     write_imu,
 )
 
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.pairing import ABSENT, group_by_time
 from slam_graph.errors import DataError
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import CameraFrame
 
 

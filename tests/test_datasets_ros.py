@@ -21,10 +21,10 @@ from recordings_ros import (
     write_bag,
 )
 
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import DataError
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import CameraFrame
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from recordings import edit_line, edit_text, write_euroc, write_lines, write_openvins
 
+from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.eqvio import EqvioTracks, wheel_tracks
 from slam_graph.datasets.formats.openvins_sim import OpenvinsSimulation
 from slam_graph.datasets.formats.track_recorder import TrackRecorder
@@ -17,8 +19,6 @@ from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.errors import DataError
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors.euroc_calibration import read_euroc_rig
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfig

@@ -22,7 +22,6 @@ from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.config import load_config
-from slam_graph.sensors.imu_buffer import preintegrate, preintegration_params
 from slam_graph.sensors.measurements import FeatureFrame
 
 CONFIG = BackendConfig(initialization=InitializationConfig(mode="given", fix_gauge=False))
@@ -79,8 +78,8 @@ def test_without_first_estimates_the_claims_grow() -> None:
 def test_the_dynamics_do_not_see_these_directions() -> None:
     """The law behind the tests above, at values that do not fit the measurements."""
     flight = Flight()
-    params = preintegration_params(rig().imu, 9.81)
-    pim = preintegrate(flight.imu(0.0, 0.3), gtsam.imuBias.ConstantBias(), params)
+    params = rig().imu.preintegration_params(9.81)
+    pim = flight.imu(0.0, 0.3).preintegrated(gtsam.imuBias.ConstantBias(), params)
     state = State()
     state.insert_imu_state(0, flight.nav_state(0.2))
     state.insert_imu_state(1, flight.nav_state(0.7))

@@ -13,8 +13,8 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
-from slam_graph.geometry.trajectory import Trajectory, interpolate, seconds_text, tum_lines
-from slam_graph.geometry.trajectory_alignment import Similarity, align, align_first_pose, umeyama
+from slam_graph.geometry.trajectory import Trajectory, interpolate, seconds_text
+from slam_graph.geometry.trajectory_alignment import Similarity
 
 MODES = ("yaw", "se3", "sim3")
 
@@ -43,7 +43,7 @@ def random_similarity(seed: int, mode: str) -> Similarity:
 def test_alignment_recovers_the_transformation(mode: str, seed: int) -> None:
     estimate = random_trajectory(seed)
     truth = random_similarity(seed, mode)
-    found = align(truth.apply(estimate).positions, estimate.positions, mode)
+    found = Similarity.of_positions(truth.apply(estimate).positions, estimate.positions, mode)
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
     np.testing.assert_allclose(found.translation, truth.translation, atol=1e-10)
     assert found.scale == pytest.approx(truth.scale, rel=1e-12)
@@ -56,7 +56,7 @@ def test_alignment_is_a_minimum(mode: str) -> None:
     rng = np.random.default_rng(5)
     estimate = random_trajectory(1).positions
     reference = estimate + rng.normal(size=estimate.shape)
-    best = align(reference, estimate, mode)
+    best = Similarity.of_positions(reference, estimate, mode)
 
     def cost(rotation: np.ndarray, translation: np.ndarray, scale: float) -> float:
         return float(np.sum((reference - scale * estimate @ rotation.T - translation) ** 2))
@@ -72,13 +72,15 @@ def test_alignment_is_a_minimum(mode: str) -> None:
 
 def test_a_reflection_is_never_returned() -> None:
     points = np.random.default_rng(2).normal(size=(20, 3))
-    assert np.linalg.det(umeyama(points * (1, 1, -1), points).rotation) == pytest.approx(1.0)
+    assert np.linalg.det(
+        Similarity.of_positions(points * (1, 1, -1), points, "se3").rotation
+    ) == pytest.approx(1.0)
 
 
 def test_first_poses_coincide_after_their_alignment() -> None:
     truth = random_trajectory(3)
     moved = random_similarity(4, "yaw").apply(truth)
-    back = align_first_pose(truth, moved).apply(moved)
+    back = Similarity.of_first_pose(truth, moved).apply(moved)
     np.testing.assert_allclose(back.positions, truth.positions, atol=1e-10)
 
 
@@ -86,7 +88,7 @@ def test_first_poses_coincide_after_their_alignment() -> None:
 def test_positions_without_extent_cannot_be_aligned(mode: str) -> None:
     still = np.ones((10, 3))
     with pytest.raises(DataError, match="cannot align"):
-        align(still, still, mode)
+        Similarity.of_positions(still, still, mode)
 
 
 def test_nearest_agrees_with_brute_force() -> None:
@@ -192,7 +194,7 @@ def test_seconds_keep_every_nanosecond(stamp_ns: int, text: str) -> None:
 def test_tum_file_keeps_stamps_and_nine_decimals(tmp_path: Path) -> None:
     path = tmp_path / "t.tum"
     trajectory = random_trajectory(4)
-    path.write_text("# comment\n" + "".join(tum_lines(trajectory)))
+    path.write_text("# comment\n" + "".join(trajectory.tum_lines()))
     back = read_groundtruth(path)
     np.testing.assert_array_equal(back.stamps_ns, trajectory.stamps_ns)
     np.testing.assert_allclose(back.positions, trajectory.positions, atol=5.1e-10)

@@ -19,6 +19,7 @@ from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.absolute_pose_error import ape
@@ -26,7 +27,6 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import (
     FlightConfig,

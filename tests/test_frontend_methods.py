@@ -32,12 +32,7 @@ from slam_graph.frontend.keypoints import spread
 from slam_graph.frontend.matching import descriptor_distances, match
 from slam_graph.frontend.prediction import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
-from slam_graph.sensors.imu_buffer import (
-    ImuBuffer,
-    predict,
-    preintegrate,
-    preintegration_params,
-)
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
 
@@ -175,12 +170,12 @@ def test_imu_motion_is_the_prediction_of_the_back_end(gravity: float) -> None:
     motion.state = state
     end_ns = round(1.3 * S)
     bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-    params = preintegration_params(ImuNoise(), gravity)
-    pim = preintegrate(buffer.between(S, end_ns), bias, params)
+    params = ImuNoise().preintegration_params(gravity)
+    pim = buffer.between(S, end_ns).preintegrated(bias, params)
     pose, rotation = motion.pose(end_ns), motion.rotation(S, end_ns)
     assert pose is not None
     assert rotation is not None
-    predicted = predict(state, pim, end_ns).world_T_body
+    predicted = state.predicted(pim, end_ns).world_T_body
     np.testing.assert_array_equal(pose.matrix(), predicted.matrix())
     np.testing.assert_allclose(rotation.matrix(), pim.deltaRij().matrix(), atol=1e-6)
     fallen = flight.nav_state(1.3).world_T_body.translation() - pose.translation()

@@ -30,10 +30,10 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
-from slam_graph.sensors.imu_buffer import ImuBuffer, preintegration_params
+from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
-PARAMS = preintegration_params(rig().imu, 9.81)
+PARAMS = rig().imu.preintegration_params(9.81)
 TIMES = np.linspace(0.0, 1.5, 11)
 MOTION = BackendConfig(initialization=InitializationConfig(mode="motion"))
 

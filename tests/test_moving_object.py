@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.errors import ConfigError
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.rendering import cast
 from slam_graph.simulation.simulated_sequence import SimulatedImages

@@ -17,7 +17,7 @@ from images import CAMERA, painted, shift, view
 from slam_graph.errors import ConfigError
 from slam_graph.plugins import Choice, Registry
 from slam_graph.settings.base import Settings
-from slam_graph.settings.tree import ConfigTree, validate
+from slam_graph.settings.tree import ConfigTree
 
 Shape = Callable[[float], float]
 GROUP = "slam_graph.test_shapes"
@@ -117,7 +117,7 @@ def test_a_setting_names_a_part(site: Path) -> None:
     assert names == ["auto", "square", "disc"]
     tree = ConfigTree({"shape": "dics"}, {("shape",): "draw.yaml:3"})
     with pytest.raises(ConfigError, match=r"^draw.yaml:3: shape: unknown shape 'dics'; .*'disc'\?"):
-        validate(Drawing, tree)
+        tree.validated(Drawing)
 
 
 def test_the_names_that_are_known_without_an_import_are_those_registered() -> None:

@@ -20,7 +20,7 @@ from slam_graph.config import RunConfig
 from slam_graph.evaluation.consistency import mean_bounds, nees
 from slam_graph.experiment.tasks import find_sources
 from slam_graph.pipeline.run_recording import run
-from slam_graph.settings.tree import ConfigTree, validate
+from slam_graph.settings.tree import ConfigTree
 
 SAMPLE_SEED = "SLAM_GRAPH_SAMPLE_SEED"
 SAMPLED = 4
@@ -62,7 +62,7 @@ def settings(algorithm: AlgorithmConfig) -> RunConfig:
         "backend": {"initialization": {"fix_gauge": False}},
         "final_ba": {"enabled": False},
     }
-    return validate(RunConfig, ConfigTree(tree))
+    return ConfigTree(tree).validated(RunConfig)
 
 
 @pytest.mark.parametrize("number", range(SAMPLED))

@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.data_checks import check_sequence
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.kalibr_calibration import write_kalibr
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import SimulationConfig

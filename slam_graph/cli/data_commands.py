@@ -92,14 +92,14 @@ def convert(
 ) -> None:
     """Write a recording of images as an EuRoC folder, whole or not at all."""
     from slam_graph.cli.console import ProgressBar
-    from slam_graph.datasets import convert_to_euroc, refuse_existing
+    from slam_graph.datasets import EurocWriter
 
-    refuse_existing(output, force)
+    EurocWriter.refuse_existing(output, force)
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
         report = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
-        convert_to_euroc(sequence, output, force, report)
+        EurocWriter.convert(sequence, output, force, report)
     for kind, count in sequence.diagnostics.counts.items():
         typer.echo(f"warning: {kind} {count}", err=True)
     typer.echo(str(output))

@@ -43,9 +43,9 @@ config_app = typer.Typer(
 @config_app.command()
 def dump(config: ConfigFile = None, set_: Overrides = None, algorithm: Algorithm = None) -> None:
     """Print all settings as YAML with their meanings; the output is a valid --config file."""
-    from slam_graph.config import dump_yaml, load_config
+    from slam_graph.config import load_config
 
-    typer.echo(dump_yaml(load_config(config, set_ or (), algorithm=algorithm)), nl=False)
+    typer.echo(load_config(config, set_ or (), algorithm=algorithm).as_yaml(), nl=False)
 
 
 @config_app.command()

@@ -158,17 +158,17 @@ def read_policy(
         overrides: `key=value` each.
         options: values by table and name; None changes nothing.
     """
-    from slam_graph.settings import ConfigTree, override, read_tree, validate
+    from slam_graph.settings import ConfigTree
 
-    tree = ConfigTree() if file is None else read_tree(file)
+    tree = ConfigTree() if file is None else ConfigTree.read(file)
     for (table, name), value in options.items():
         if value is not None:
             where = f"option {name}"
             places: dict[tuple[str | int, ...], str] = {(table,): where, (table, name): where}
             tree.merge(ConfigTree({table: {name: value}}, places))
     for text in overrides:
-        tree.merge(override(text))
-    return validate(kind, tree)
+        tree.merge(ConfigTree.override(text))
+    return tree.validated(kind)
 
 
 def write_result(

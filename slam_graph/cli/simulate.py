@@ -71,7 +71,7 @@ def simulate(
 
     OUTPUT is then a recording like any other. The same settings and seed write the same bytes.
     """
-    from slam_graph.datasets import refuse_existing
+    from slam_graph.datasets import EurocWriter
     from slam_graph.simulation import simulate as make
 
     tracks = {
@@ -92,7 +92,7 @@ def simulate(
         "seed": seed,
         "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
     }
-    refuse_existing(output)
+    EurocWriter.refuse_existing(output)
     sequence = make(config, set_ or (), **given)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: one protocol (`sequence`), a reader per format, and `open_dataset`."""
+"""Recordings: one protocol (`sequence`), a reader per format, and `open_dataset`.
+
+Calibration files are read and written in `calibration/`.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -10,70 +13,53 @@ __all__ = [
     "DATASETS",
     "EurocSequence",
     "EurocWriter",
-    "Extent",
     "Format",
-    "FrameStream",
     "ReaderOptions",
     "RecordedSequence",
     "Rows",
     "Sequence",
     "SequenceInfo",
     "TrackRecorder",
-    "TrackRecordingSequence",
     "check_sequence",
-    "convert_to_euroc",
     "dataset_from_arrays",
+    "kalibr_text",
     "open_dataset",
-    "parse",
+    "pose_from_matrix",
     "read_groundtruth",
-    "refuse_existing",
-    "within",
+    "read_kalibr",
+    "rig_from_kalibr",
 ]
 
 if TYPE_CHECKING:
+    from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
+    from slam_graph.datasets.calibration.kalibr_calibration import (
+        kalibr_text,
+        read_kalibr,
+        rig_from_kalibr,
+    )
     from slam_graph.datasets.data_checks import check_sequence
     from slam_graph.datasets.dataset_registry import DATASETS, Format, open_dataset
     from slam_graph.datasets.formats.euroc import EurocSequence
-    from slam_graph.datasets.formats.euroc_writer import (
-        EurocWriter,
-        convert_to_euroc,
-        refuse_existing,
-    )
+    from slam_graph.datasets.formats.euroc_writer import EurocWriter
     from slam_graph.datasets.formats.track_recorder import TrackRecorder
-    from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
     from slam_graph.datasets.groundtruth import read_groundtruth
     from slam_graph.datasets.memory_sequence import dataset_from_arrays
-    from slam_graph.datasets.sequence import (
-        Extent,
-        FrameStream,
-        ReaderOptions,
-        RecordedSequence,
-        Sequence,
-        SequenceInfo,
-        within,
-    )
-    from slam_graph.datasets.streams.csv_rows import Rows, parse
+    from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence, Sequence, SequenceInfo
+    from slam_graph.datasets.streams.csv_rows import Rows
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
+            "calibration.calibration_yaml": ("pose_from_matrix",),
+            "calibration.kalibr_calibration": ("kalibr_text", "read_kalibr", "rig_from_kalibr"),
             "data_checks": ("check_sequence",),
             "dataset_registry": ("DATASETS", "Format", "open_dataset"),
             "formats.euroc": ("EurocSequence",),
-            "formats.euroc_writer": ("EurocWriter", "convert_to_euroc", "refuse_existing"),
+            "formats.euroc_writer": ("EurocWriter",),
             "formats.track_recorder": ("TrackRecorder",),
-            "formats.track_recording": ("TrackRecordingSequence",),
             "groundtruth": ("read_groundtruth",),
             "memory_sequence": ("dataset_from_arrays",),
-            "sequence": (
-                "Extent",
-                "FrameStream",
-                "ReaderOptions",
-                "RecordedSequence",
-                "Sequence",
-                "SequenceInfo",
-                "within",
-            ),
-            "streams.csv_rows": ("Rows", "parse"),
+            "sequence": ("ReaderOptions", "RecordedSequence", "Sequence", "SequenceInfo"),
+            "streams.csv_rows": ("Rows",),
         },
     )

@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
-    parse,
     read_rows,
     stamps_from_seconds,
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import read_body_T_sensor
 
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders of poses in EuRoC and similar recordings, in the order of preference."""
@@ -121,10 +120,10 @@ def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
     columns = tuple(range(count + 1))
     if delimiter is None:
         dtype: list[tuple[Any, ...]] = [("stamp", STAMP_TEXT), ("values", "f8", (count,))]
-        table = parse(rows, dtype, "time [s], position, quaternion xyzw", columns, None)
+        table = rows.parse(dtype, "time [s], position, quaternion xyzw", columns, None)
         return stamps_from_seconds(rows, table["stamp"]), table["values"]
     dtype = [("stamp", "i8"), ("values", "f8", (count,))]
-    table = parse(rows, dtype, f"stamp [ns] and {count} numbers", columns)
+    table = rows.parse(dtype, f"stamp [ns] and {count} numbers", columns)
     values = table["values"].copy()
     values[:, 3:7] = table["values"][:, [4, 5, 6, 3]]
     return table["stamp"], values

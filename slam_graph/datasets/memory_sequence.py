@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
-    within,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, Image
@@ -199,17 +198,17 @@ class _FeaturesInMemory(RecordedSequence):
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """The frames as they were given."""
-        for k in np.flatnonzero(within(self._stamps_ns, start_ns, end_ns)):
+        for k in np.flatnonzero(self.within(self._stamps_ns, start_ns, end_ns)):
             yield self._features[k]
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
         return self._imu.blocks(self.diagnostics, after_ns)
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
         stamps = self._stamps_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self._imu.count())
+        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), self._imu.count())
 
     def initial_state(self) -> NavState | None:
         """The known state at the start, if one was given."""

@@ -172,22 +172,6 @@ class Sequence(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Extent:
-    """How much a recording holds.
-
-    Attributes:
-        frames: number of frames.
-        start_ns, end_ns: times of the first and the last frame; of the IMU if there are no frames.
-        imu_samples: number of IMU samples in the file, before faulty ones are dropped.
-    """
-
-    frames: int
-    start_ns: int
-    end_ns: int
-    imu_samples: int
-
-
 @dataclass(frozen=True)
 class ReaderOptions:
     """What a reader is asked for besides the path of the recording.
@@ -275,12 +259,46 @@ class RecordedSequence(ABC):
         """The cleaned IMU stream from `after_ns` on, in blocks, with strictly increasing stamps."""
 
     @abstractmethod
-    def measure(self) -> Extent:
-        """Count what the files hold; this may read through them once."""
+    def measure(self) -> SequenceInfo:
+        """Count what the files hold; this may read through them once.
+
+        A format gives its counts to `holding`.
+        """
+
+    def holding(self, frames: int, start_ns: int, end_ns: int, imu_samples: int) -> SequenceInfo:
+        """What the sequence holds, by its counts.
+
+        Args:
+            frames: number of frames.
+            start_ns: time of the first frame; of the first IMU sample if there are no frames.
+            end_ns: time of the last frame; of the last IMU sample if there are no frames.
+            imu_samples: number of IMU samples in the file, before faulty ones are dropped.
+        """
+        return SequenceInfo(
+            name=self.name,
+            format=self.format,
+            content=self.content,
+            cameras=len(self.rig.cameras),
+            frames=frames,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            imu_samples=imu_samples,
+            has_groundtruth=self.has_groundtruth,
+        )
 
     @cached_property
-    def _extent(self) -> Extent:
+    def _info(self) -> SequenceInfo:
         return self.measure()
+
+    @staticmethod
+    def within(stamps_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:
+        """Which times (N,) lie in a range with optional ends, both included."""
+        inside = np.ones(len(stamps_ns), bool)
+        if start_ns is not None:
+            inside &= stamps_ns >= start_ns
+        if end_ns is not None:
+            inside &= stamps_ns <= end_ns
+        return inside
 
     @property
     def has_groundtruth(self) -> bool:
@@ -289,18 +307,7 @@ class RecordedSequence(ABC):
 
     def info(self) -> SequenceInfo:
         """What the sequence holds; without any frames the times are those of the IMU."""
-        extent = self._extent
-        return SequenceInfo(
-            name=self.name,
-            format=self.format,
-            content=self.content,
-            cameras=len(self.rig.cameras),
-            frames=extent.frames,
-            start_ns=extent.start_ns,
-            end_ns=extent.end_ns,
-            imu_samples=extent.imu_samples,
-            has_groundtruth=self.has_groundtruth,
-        )
+        return self._info
 
     def packets(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Packet]:
         """Frames in the order of time, each with the IMU samples that lead up to it.
@@ -337,13 +344,3 @@ class RecordedSequence(ABC):
     def initial_state(self) -> NavState | None:
         """The state at the start that comes with the data; None unless a format has one."""
         return None
-
-
-def within(stamps_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:
-    """Which times (N,) lie in a range with optional ends, both included."""
-    inside = np.ones(len(stamps_ns), bool)
-    if start_ns is not None:
-        inside &= stamps_ns >= start_ns
-    if end_ns is not None:
-        inside &= stamps_ns <= end_ns
-    return inside

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.geometry import AlignmentMode, Similarity, Trajectory, align
+from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def aligned_pair(
     """
     require_known(alignment, get_args(AlignmentMode), "alignment")
     truth, guess = synchronize(reference, estimate, pairing, limit_s)
-    similarity = align(truth.positions, guess.positions, alignment)
+    similarity = Similarity.of_positions(truth.positions, guess.positions, alignment)
     return truth, similarity.apply(guess), similarity
 
 

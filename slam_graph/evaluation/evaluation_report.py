@@ -22,8 +22,6 @@ from slam_graph.geometry import (
     Similarity,
     StateHistory,
     Trajectory,
-    align_first_pose,
-    align_yaw,
 )
 
 _REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
@@ -142,9 +140,9 @@ def _truth_from_estimate(
         return Similarity.identity(), "none"
     true, own = synchronize(truth, estimate)
     try:
-        return align_yaw(true.positions, own.positions), "yaw"
+        return Similarity.of_positions(true.positions, own.positions, "yaw"), "yaw"
     except DataError:
-        return align_first_pose(true, own), "first_pose"
+        return Similarity.of_first_pose(true, own), "first_pose"
 
 
 def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:

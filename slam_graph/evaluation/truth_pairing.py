@@ -18,9 +18,9 @@ import numpy as np
 from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.choices import PAIRINGS, Pairing, require_known
-from slam_graph.geometry import DEFAULT_MAX_GAP_S, Trajectory, interpolate
+from slam_graph.geometry import Trajectory, interpolate
 
-_DEFAULT_LIMITS_S: dict[Pairing, float] = {"interpolate": DEFAULT_MAX_GAP_S, "nearest": 0.01}
+_DEFAULT_LIMITS_S: dict[Pairing, float] = {"interpolate": Trajectory.MAX_GAP_S, "nearest": 0.01}
 """How far apart two samples of the truth may be to interpolate between them; how far in time the
 nearest one may be."""
 

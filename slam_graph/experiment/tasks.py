@@ -20,13 +20,13 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets import Sequence, TrackRecorder, TrackRecordingSequence, open_dataset
+from slam_graph.datasets import Sequence, TrackRecorder, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.frontend import build_frontend
 from slam_graph.pipeline import run
-from slam_graph.settings import ConfigTree, Settings, override, validate
-from slam_graph.simulation import TRAJECTORIES, SimulationConfig, StartConfig, simulate
+from slam_graph.settings import ConfigTree, Settings
+from slam_graph.simulation import SimulationConfig, simulate
 from slam_graph.version import __version__
 
 _PREFIX = "sim:"
@@ -113,22 +113,22 @@ def _recorded(path: str, groundtruth: str | None) -> Source:
 
 def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) -> Source:
     tree = ConfigTree({"trajectory": trajectory, "duration_s": duration_s})
-    if trajectory in TRAJECTORIES:
+    if trajectory in SimulationConfig.TRAJECTORIES:
         # the error of the start is drawn from its covariance: without it the NEES is too small
-        tree.merge(ConfigTree({"start": StartConfig(error=True).model_dump()}))
+        tree.merge(ConfigTree({"start": {"error": True}}))
         name = trajectory
     else:
         path = Path(trajectory).resolve()
         if not path.exists():
             raise DataError(
                 f"{_PREFIX}{trajectory}: no such file or folder; "
-                f"{closest(trajectory, TRAJECTORIES)}"
+                f"{closest(trajectory, SimulationConfig.TRAJECTORIES)}"
             )
         tree.merge(ConfigTree({"trajectory": str(path), "real_imu": True}))
         name = path.name
     for text in overrides:
-        tree.merge(override(text))
-    return Source(name=f"sim_{_plain(name)}", simulation=validate(SimulationConfig, tree))
+        tree.merge(ConfigTree.override(text))
+    return Source(name=f"sim_{_plain(name)}", simulation=tree.validated(SimulationConfig))
 
 
 def _plain(name: str) -> str:
@@ -221,7 +221,7 @@ class RunTask(Settings):
 
     def do(self) -> None:
         """Run the algorithm; every outcome except an interruption is a result."""
-        result = run(TrackRecordingSequence(self.tracks), self.config)
+        result = run(open_dataset(self.tracks, "recording"), self.config)
         if result.status == "interrupted":
             result.check()
         about = {"data": self.data, "algorithm": self.algorithm, "seed": self.seed}

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.frontend import epipolar_distance, essential_matrix
+from slam_graph.frontend import epipolar_error
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
@@ -124,18 +124,17 @@ class TrackQuality:
         for mounted, a, b in zip(self._rig.cameras, before.cameras, after.cameras, strict=True):
             world_T_a = world_T_before * mounted.body_T_camera
             world_T_b = world_T_after * mounted.body_T_camera
-            E = essential_matrix(world_T_b.between(world_T_a))
-            m_a, m_b = _common(a, b)
-            self._epipolar_px.append(epipolar_distance(E, m_a, m_b) * mounted.camera.fx)
+            error = epipolar_error(world_T_b.between(world_T_a), *_common(a, b))
+            self._epipolar_px.append(error * mounted.camera.fx)
 
     def _across(self, frame: FeatureFrame) -> None:
         """Note how far the second camera's features are from the epipolar lines of the first."""
         if len(frame.cameras) < 2:
             return
         first, second = self._rig.cameras[:2]
-        E = essential_matrix(second.body_T_camera.between(first.body_T_camera))
-        m_a, m_b = _common(frame.cameras[0], frame.cameras[1])
-        self._stereo_px.append(epipolar_distance(E, m_a, m_b) * first.camera.fx)
+        second_T_first = second.body_T_camera.between(first.body_T_camera)
+        error = epipolar_error(second_T_first, *_common(frame.cameras[0], frame.cameras[1]))
+        self._stereo_px.append(error * first.camera.fx)
 
 
 def _common(a: FeatureObservations, b: FeatureObservations) -> tuple[FloatArray, FloatArray]:

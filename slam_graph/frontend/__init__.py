@@ -17,14 +17,12 @@ __all__ = [
     "FrontendConfig",
     "Image",
     "Keypoints",
-    "Orb",
     "build_frontend",
-    "epipolar_distance",
-    "essential_matrix",
+    "epipolar_error",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.frontend.descriptors import Descriptor, Orb
+    from slam_graph.frontend.descriptors import Descriptor
     from slam_graph.frontend.detectors import Detector
     from slam_graph.frontend.frontend_config import (
         DESCRIPTORS,
@@ -34,16 +32,16 @@ if TYPE_CHECKING:
     )
     from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
     from slam_graph.frontend.keypoints import Image, Keypoints
-    from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
+    from slam_graph.frontend.outliers import epipolar_error
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "descriptors": ("Descriptor", "Orb"),
+            "descriptors": ("Descriptor",),
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
             "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
             "keypoints": ("Image", "Keypoints"),
-            "outliers": ("epipolar_distance", "essential_matrix"),
+            "outliers": ("epipolar_error",),
         },
     )

@@ -21,7 +21,10 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.geometry import NavState
-from slam_graph.sensors import STANDARD_GRAVITY, CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+
+STANDARD_GRAVITY = 9.81
+"""Magnitude of gravity in m/s² where the settings (`backend.noise.gravity`) are not at hand."""
 
 
 class FrameStats(defaultdict[str, float]):

@@ -14,21 +14,13 @@ from slam_graph.frontend.association import Associator
 from slam_graph.frontend.camera_tracker import CameraTracker
 from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
-from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
+from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, FrameStats
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.prediction import ImuMotion, PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.sensors import (
-    STANDARD_GRAVITY,
-    Camera,
-    CameraFrame,
-    FeatureFrame,
-    FeatureObservations,
-    ImuData,
-    Rig,
-)
+from slam_graph.sensors import Camera, CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
 
 _FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""

@@ -285,6 +285,11 @@ def epipolar_distance(E: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatA
     return distance
 
 
+def epipolar_error(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
+    """`epipolar_distance` (N,) of matches (N, 2) between two views whose relative pose is known."""
+    return epipolar_distance(essential_matrix(b_T_a), m_a, m_b)
+
+
 def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
     """Depths (N, 2) in a and in b of the closest points of the two rays, in metres.
 

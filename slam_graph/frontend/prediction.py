@@ -20,16 +20,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.geometry import NavState
-from slam_graph.sensors import (
-    ImuBuffer,
-    ImuData,
-    ImuNoise,
-    RigCamera,
-    integrate_rotation,
-    predict,
-    preintegrate,
-    preintegration_params,
-)
+from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, RigCamera
 
 _HISTORY_NS = 2_000_000_000
 """How long samples are kept; frames and states of the back end are never that far behind."""
@@ -55,7 +46,7 @@ class ImuMotion:
         """
         self.state: NavState | None = None
         self._imu = ImuBuffer()
-        self._params = preintegration_params(noise, gravity)
+        self._params = noise.preintegration_params(gravity)
 
     def add(self, imu: ImuData) -> None:
         """Add samples that follow those already given; others are left out."""
@@ -70,7 +61,7 @@ class ImuMotion:
         if not self._covers(start_ns, end_ns):
             return None
         bias = np.zeros(3) if self.state is None else self.state.gyro_bias
-        return integrate_rotation(self._imu.between(start_ns, end_ns), bias)
+        return self._imu.between(start_ns, end_ns).rotation(bias)
 
     def pose(self, stamp_ns: int) -> gtsam.Pose3 | None:
         """world_T_body, predicted from the last state; None without a state or samples."""
@@ -82,8 +73,8 @@ class ImuMotion:
         if not self._covers(state.stamp_ns, stamp_ns):
             return None
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-        pim = preintegrate(self._imu.between(state.stamp_ns, stamp_ns), bias, self._params)
-        return predict(state, pim, stamp_ns).world_T_body
+        pim = self._imu.between(state.stamp_ns, stamp_ns).preintegrated(bias, self._params)
+        return state.predicted(pim, stamp_ns).world_T_body
 
     def _covers(self, start_ns: int, end_ns: int) -> bool:
         """Whether there are samples over a whole interval, which must not be empty."""

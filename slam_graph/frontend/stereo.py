@@ -24,7 +24,7 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
-from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
+from slam_graph.frontend.outliers import epipolar_error, triangulated_depths
 from slam_graph.sensors import Camera, Rig, RigCamera
 
 _OVERLAP_GRID = 8
@@ -230,7 +230,6 @@ class StereoMatcher:
         self._camera = camera
         self._other_T_reference = other_T_reference
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
-        self._E = essential_matrix(other_T_reference)
         self._lucas_kanade = lucas_kanade
         self._extractor = extractor
         self._config = config
@@ -290,8 +289,9 @@ class StereoMatcher:
     def _inliers(self, m_reference: FloatArray, m_other: FloatArray) -> BoolArray:
         """Which matches (N, 2) fit the calibration of the rig, (N,)."""
         focal_px = self._camera.fx
-        distance_px = epipolar_distance(self._E, m_reference, m_other) * focal_px
-        depth_m = triangulated_depths(self._other_T_reference, m_reference, m_other)[:, 0]
+        pose = self._other_T_reference
+        distance_px = epipolar_error(pose, m_reference, m_other) * focal_px
+        depth_m = triangulated_depths(pose, m_reference, m_other)[:, 0]
         # In terms of disparity, because far points may come out a little beyond infinity
         disparity_px = focal_px * self._baseline_m / depth_m
         nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m

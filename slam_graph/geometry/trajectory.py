@@ -60,6 +60,18 @@ class NavState:
     gyro_bias: FloatArray = field(kw_only=True)
     covariance: FloatArray | None = field(default=None, kw_only=True)
 
+    def predicted(self, pim: gtsam.PreintegratedCombinedMeasurements, stamp_ns: int) -> NavState:
+        """The state at `stamp_ns`, the end of a preintegration that began at this state: g(x_t)."""
+        bias = gtsam.imuBias.ConstantBias(self.accel_bias, self.gyro_bias)
+        there = pim.predict(gtsam.NavState(self.world_T_body, self.velocity), bias)
+        return NavState(
+            stamp_ns,
+            there.pose(),
+            np.asarray(there.velocity()),
+            accel_bias=self.accel_bias,
+            gyro_bias=self.gyro_bias,
+        )
+
     def __repr__(self) -> str:
         position = ", ".join(f"{value:.3f}" for value in self.world_T_body.translation())
         return f"NavState({seconds_text(self.stamp_ns)} s, position ({position}) m)"
@@ -70,6 +82,8 @@ class Trajectory:
     """Poses over time, as arrays.
 
     Attributes:
+        MAX_GAP_S: inside a longer gap between poses `interpolate` gives nothing by default: four
+            frames at 20 Hz; over more a straight line says little of the motion.
         stamps_ns: (N,) int64, strictly increasing.
         positions: (N, 3) of the body in the world, in metres.
         quaternions: (N, 4) of world_R_body as (x, y, z, w), of unit length.
@@ -77,6 +91,8 @@ class Trajectory:
         accel_biases: (N, 3) m/s², or None. Biases are given by name.
         gyro_biases: (N, 3) rad/s, or None.
     """
+
+    MAX_GAP_S: ClassVar[float] = 0.2
 
     stamps_ns: IntArray
     positions: FloatArray
@@ -102,6 +118,12 @@ class Trajectory:
         }
         stamps_ns, quaternions = self.stamps_ns[rows], self.quaternions[rows]
         return Trajectory(stamps_ns, self.positions[rows], quaternions, **optional)
+
+    def tum_lines(self) -> Iterator[str]:
+        """The lines of a TUM file: t[s] x y z qx qy qz qw, with nine decimals."""
+        rows = np.hstack([self.positions, self.quaternions])
+        for stamp, row in zip(self.stamps_ns, rows, strict=True):
+            yield f"{seconds_text(int(stamp))} {' '.join(f'{v:.9f}' for v in row.tolist())}\n"
 
     def as_dict(self) -> dict[str, FloatArray | IntArray]:
         """All columns (N,) by name with unit, as for `pandas.DataFrame(trajectory.as_dict())`."""
@@ -207,19 +229,8 @@ def seconds_text(stamp_ns: int) -> str:
     return f"{sign}{magnitude // 10**9}.{magnitude % 10**9:09d}"
 
 
-def tum_lines(trajectory: Trajectory) -> Iterator[str]:
-    """The lines of a TUM file: t[s] x y z qx qy qz qw, with nine decimals."""
-    rows = np.hstack([trajectory.positions, trajectory.quaternions])
-    for stamp, row in zip(trajectory.stamps_ns, rows, strict=True):
-        yield f"{seconds_text(int(stamp))} {' '.join(f'{value:.9f}' for value in row.tolist())}\n"
-
-
-DEFAULT_MAX_GAP_S = 0.2
-"""Four frames at 20 Hz; over a longer gap a straight line says little of the motion."""
-
-
 def interpolate(
-    trajectory: Trajectory, stamps_ns: IntArray, max_gap_s: float = DEFAULT_MAX_GAP_S
+    trajectory: Trajectory, stamps_ns: IntArray, max_gap_s: float = Trajectory.MAX_GAP_S
 ) -> tuple[Trajectory, BoolArray]:
     """The trajectory at those of the given times that have poses before and after, near enough.
 

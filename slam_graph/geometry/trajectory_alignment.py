@@ -45,6 +45,46 @@ class Similarity:
         """The map that changes nothing."""
         return Similarity(np.eye(3), np.zeros(3))
 
+    @staticmethod
+    def of_positions(
+        reference: FloatArray, estimate: FloatArray, mode: AlignmentMode
+    ) -> Similarity:
+        """The map of `mode` from the positions of an estimate to those of the reference.
+
+        Args:
+            reference: (N, 3) positions.
+            estimate: (N, 3) positions at the same times.
+            mode: `scale` corrects the scale of Sim(3) alone, neither rotation nor translation.
+
+        Raises:
+            DataError: if the mode is unknown, or the positions do not determine the map.
+        """
+        if mode not in ALIGNMENT_MODES:
+            raise DataError(f"unknown alignment '{mode}'; {closest(mode, ALIGNMENT_MODES)}")
+        if mode == "none":
+            return Similarity.identity()
+        if mode == "yaw":
+            return _align_yaw(reference, estimate)
+        similarity = _umeyama(reference, estimate, with_scale=mode != "se3")
+        if mode == "scale":
+            return Similarity(np.eye(3), np.zeros(3), similarity.scale)
+        return similarity
+
+    @staticmethod
+    def of_first_pose(reference: Trajectory, estimate: Trajectory) -> Similarity:
+        """Yaw and translation that align the first pose of the estimate with that of the reference.
+
+        Unlike a least-squares fit it leaves the errors that grow from the start as they are. A
+        consistency test needs these, because the covariance starts at zero.
+        """
+        difference = (
+            Rotation.from_quat(reference.quaternions[0])
+            * Rotation.from_quat(estimate.quaternions[0]).inv()
+        ).as_matrix()
+        yaw = np.arctan2(difference[1, 0] - difference[0, 1], difference[0, 0] + difference[1, 1])
+        rotation = Rotation.from_euler("z", yaw).as_matrix()
+        return Similarity(rotation, reference.positions[0] - rotation @ estimate.positions[0])
+
     def apply(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory in the world of the reference; biases are in the body and stay."""
         linear = self.scale * self.rotation
@@ -58,7 +98,7 @@ class Similarity:
         )
 
 
-def umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = False) -> Similarity:
+def _umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = False) -> Similarity:
     """The least-squares similarity from the points of an estimate to those of a reference.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
@@ -88,7 +128,7 @@ def umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = Fals
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
-def align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
+def _align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
     """The least-squares rotation about world z and translation (4 degrees of freedom).
 
     With C = Σ r eᵀ over centred points, Σ |r - Rz(ψ) e|² is least where
@@ -111,41 +151,3 @@ def align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
         )
     rotation = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()
     return Similarity(rotation, mean_reference - rotation @ mean_estimate)
-
-
-def align_first_pose(reference: Trajectory, estimate: Trajectory) -> Similarity:
-    """Yaw and translation that align the first pose of the estimate with that of the reference.
-
-    Unlike a least-squares fit it leaves the errors that grow from the start as they are. A
-    consistency test needs these, because the covariance starts at zero.
-    """
-    difference = (
-        Rotation.from_quat(reference.quaternions[0])
-        * Rotation.from_quat(estimate.quaternions[0]).inv()
-    ).as_matrix()
-    yaw = np.arctan2(difference[1, 0] - difference[0, 1], difference[0, 0] + difference[1, 1])
-    rotation = Rotation.from_euler("z", yaw).as_matrix()
-    return Similarity(rotation, reference.positions[0] - rotation @ estimate.positions[0])
-
-
-def align(reference: FloatArray, estimate: FloatArray, mode: AlignmentMode) -> Similarity:
-    """The map of `mode` from the positions of an estimate to those of the reference.
-
-    Args:
-        reference: (N, 3) positions.
-        estimate: (N, 3) positions at the same times.
-        mode: `scale` corrects the scale of Sim(3) alone, neither rotation nor translation.
-
-    Raises:
-        DataError: if the mode is unknown, or the positions do not determine the map.
-    """
-    if mode not in ALIGNMENT_MODES:
-        raise DataError(f"unknown alignment '{mode}'; {closest(mode, ALIGNMENT_MODES)}")
-    if mode == "none":
-        return Similarity.identity()
-    if mode == "yaw":
-        return align_yaw(reference, estimate)
-    similarity = umeyama(reference, estimate, with_scale=mode != "se3")
-    if mode == "scale":
-        return Similarity(np.eye(3), np.zeros(3), similarity.scale)
-    return similarity

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import triangulate_frames
-from slam_graph.frontend import Image, Keypoints, Orb
+from slam_graph.frontend import DESCRIPTORS, Image, Keypoints
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.loop_closure.loop_config import KeyframeConfig
 from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
@@ -82,7 +82,7 @@ class KeyframeDescriber:
     def __init__(self, camera: Camera, corners: int) -> None:
         self._camera = camera
         self._corners = corners
-        self._descriptor = Orb()
+        self._descriptor = DESCRIPTORS["orb"]()
 
     def describe(self, image: Image, seen: FeatureObservations) -> FeatureObservations:
         """The tracked features of an image with descriptors, followed by further corners.

@@ -17,16 +17,17 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray
+from slam_graph.datasets import kalibr_text, rig_from_kalibr
 from slam_graph.errors import DataError
 from slam_graph.loop_closure import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
 from slam_graph.pose_graph import Poses
-from slam_graph.sensors import kalibr_table, parse_yaml, rig_from_table
 
 _MAX_COORDINATE_M = 1e8
 _MAX_NORMALIZED = 1e4
@@ -91,7 +92,7 @@ def write_map(path: str | Path, content: SlamMap) -> None:
         "slam_graph": content.version,
         "gravity_aligned": content.gravity_aligned,
         "recordings": [
-            {"name": r.name, "poses": r.poses, "calibration": kalibr_table(r.rig)}
+            {"name": r.name, "poses": r.poses, "calibration": yaml.safe_load(kalibr_text(r.rig))}
             for r in content.recordings
         ],
     }
@@ -301,9 +302,8 @@ def _poses(arrays: dict[str, NDArray[Any]], prefix: str, path: Path) -> Poses:
 
 def _recording(entry: _Recording, path: Path) -> MapRecording:
     """A recording with its calibration."""
-    where = path / HEADER
-    calibration = parse_yaml(json.dumps(entry.calibration), where)
-    return MapRecording(entry.name, entry.poses, rig_from_table(calibration))
+    rig = rig_from_kalibr(json.dumps(entry.calibration), path / HEADER)
+    return MapRecording(entry.name, entry.poses, rig)
 
 
 def _check_map(content: SlamMap, path: Path) -> None:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets import Rows, parse
+from slam_graph.datasets import Rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
@@ -175,7 +175,7 @@ def _parse(rows: Rows, tag: str) -> _Block:
     if tag in ("EDGE2", "EDGE3") and len(rows.lines[0].split()) == 1 + line.ids + size:
         entries = 0  # TORO files may omit the information: it is the identity then
     dtype = [("tag", "S16"), ("ids", np.int64, (line.ids,)), ("numbers", float, (size + entries,))]
-    table = parse(rows, dtype, f"{tag}, {line.expected()}", delimiter=None)
+    table = rows.parse(dtype, f"{tag}, {line.expected()}", delimiter=None)
     ids, numbers = table["ids"], table["numbers"]
     _check_numbers(rows, numbers)
     k = 3 * (line.dimension - 1)

@@ -14,7 +14,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import accuracy_report, ape, synchronize
-from slam_graph.geometry import Similarity, Trajectory, align_yaw, umeyama
+from slam_graph.geometry import Similarity, Trajectory
 from slam_graph.maps import SlamMap
 
 _POSE_WIDTH = 7
@@ -149,7 +149,7 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
     if sum(len(true) for true, _ in pairs) < _LEAST_SHARED:
         raise DataError(f"the truth covers fewer than {_LEAST_SHARED} keyframes of the map")
     true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
-    return align_yaw(true, own) if known.gravity_aligned else umeyama(true, own)
+    return Similarity.of_positions(true, own, "yaw" if known.gravity_aligned else "se3")
 
 
 def errors_in_map(

@@ -12,7 +12,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import tum_lines
 from slam_graph.maps import SlamMap, read_map, write_map
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
 
@@ -191,7 +190,7 @@ def export_map(
             write_ply(file, content.points, content.poses.translations)
     for file, trajectory in zip(tracks, content.trajectories(), strict=False):
         with _writable(file):
-            write_text(file, tum_lines(trajectory))
+            write_text(file, trajectory.tum_lines())
     return [*clouds, *tracks]
 
 

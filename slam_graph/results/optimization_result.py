@@ -15,8 +15,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalPolicy, BalSolution
-from slam_graph.config import dump_yaml
-from slam_graph.geometry import tum_lines
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
@@ -100,7 +98,7 @@ class BalResult:
         """
         files = ResultFolder(folder)
         files.text("optimized.txt", self.solution.lines())
-        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.text("config.yaml", [self.policy.as_yaml()])
         files.json("metrics.json", self.metrics)
         adjusted = self.solution.adjusted
         write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
@@ -203,9 +201,9 @@ class PoseGraphResult:
         solution, graph = self.solution, self.solution.graph
         files = ResultFolder(folder)
         files.text("optimized.g2o", solution.g2o_lines())
-        files.text("trajectory.tum", tum_lines(graph.trajectory(solution.poses)))
+        files.text("trajectory.tum", graph.trajectory(solution.poses).tum_lines())
         files.text("edges.csv", self._edge_lines())
-        files.text("config.yaml", [dump_yaml(self.policy)])
+        files.text("config.yaml", [self.policy.as_yaml()])
         files.json("metrics.json", self.metrics)
         if self.covariances is not None:
             files.text("covariances.csv", self._covariance_lines(self.covariances))

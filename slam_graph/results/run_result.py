@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import FinalBa, WindowGraph
-from slam_graph.config import RunConfig, dump_yaml
-from slam_graph.datasets import SequenceInfo
+from slam_graph.config import RunConfig
+from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.evaluation import ape, innovation_report
-from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory, tum_lines
+from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
@@ -25,7 +25,7 @@ from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import RunLogs
-from slam_graph.sensors import Rig, write_kalibr
+from slam_graph.sensors import Rig
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 
@@ -250,27 +250,27 @@ class RunResult:
             The files, in the order in which they were written.
         """
         files = ResultFolder(folder)
-        files.text(names.TRAJECTORY, tum_lines(self.trajectory))
+        files.text(names.TRAJECTORY, self.trajectory.tum_lines())
         files.text(names.STATES, names.state_lines(self.history))
         if self.smoothed is not None:
-            files.text(names.SMOOTHED, tum_lines(self.smoothed))
+            files.text(names.SMOOTHED, self.smoothed.tum_lines())
         if self.loops is not None and self.loop_closed is not None:
-            files.text(names.LOOP_CLOSED, tum_lines(self.loop_closed))
+            files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
             files.text("loops.csv", self.loops.csv_lines())
             write_ply(files.path("map_loop.ply"), self.loops.points())
         if self.localization is not None:
-            files.text(names.IN_MAP, tum_lines(self.localization.trajectory()))
+            files.text(names.IN_MAP, self.localization.trajectory().tum_lines())
             files.text("localization.csv", self.localization.csv_lines())
         if self.groundtruth is not None:
-            files.text(names.GROUNDTRUTH, tum_lines(self.groundtruth))
+            files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)
         files.text("timing.csv", self.logs.timing.csv_lines())
-        files.text(names.CONFIG, [dump_yaml(self.config)])
-        write_kalibr(self.rig, files.path(names.RIG))
+        files.text(names.CONFIG, [self.config.as_yaml()])
+        files.text(names.RIG, [kalibr_text(self.rig)])
         files.json(names.METRICS, self.metrics)
         calibrated = self.logs.calibration.latest
         if calibrated is not None:
-            write_kalibr(calibrated.rig, files.path("calibration_estimated.yaml"))
+            files.text("calibration_estimated.yaml", [kalibr_text(calibrated.rig)])
             files.text("calibration.csv", self.logs.calibration.csv_lines())
         for stamp_ns, graph in self.graphs.items():
             for name, text in graph.texts().items():

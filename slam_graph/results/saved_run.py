@@ -14,13 +14,14 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig, load_config
+from slam_graph.datasets import read_kalibr
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.results import result_files as names
 from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
 from slam_graph.results.result_files import LATEST
-from slam_graph.sensors import Rig, read_kalibr
+from slam_graph.sensors import Rig
 
 
 def load_result(folder: Path | str) -> SavedRun:

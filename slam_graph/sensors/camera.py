@@ -3,8 +3,8 @@
 """A calibrated camera: focal lengths, principal point, and the coefficients of a camera model.
 
 All functions take and return arrays of N points and are vectorised over them. Derivatives are those
-of pixels. The models are in `camera_model` (what one is, and how to add one), `pinhole_models` and
-`omnidirectional_models`.
+of pixels. What a model is, and how to add one, is in `camera_model`; the models are in
+`lens_models`.
 """
 
 from __future__ import annotations

@@ -1,29 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The IMU between two times: the buffer of recent samples, and their integration.
-
-Samples are taken as instantaneous values of a signal that is linear between them: from one sample
-to the next the mean of the two is integrated. Back end, smoothing and front end all integrate with
-the functions of this module.
-"""
+"""The buffer of recent IMU samples, which gives the samples between two times."""
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
-from slam_graph.geometry import NavState
 from slam_graph.sensors.measurements import ImuData
-from slam_graph.sensors.rig import ImuNoise
-
-STANDARD_GRAVITY = 9.81
-"""Magnitude of gravity in m/s² where the settings (`backend.noise.gravity`) are not at hand."""
 
 _FAR_FUTURE_NS = 2**62
-
-_INTEGRATION_SIGMA = 1e-5
-"""Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
 
 
 class ImuBuffer:
@@ -92,87 +77,3 @@ class ImuBuffer:
             for values in (self.data.gyro, self.data.accel)
         )
         return ImuData(stamps, gyro, accel)
-
-
-def _steps(samples: ImuData) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Durations (K - 1,) in s between samples, mean rates and specific forces (K - 1, 3)."""
-    gyro = 0.5 * (samples.gyro[1:] + samples.gyro[:-1])
-    accel = 0.5 * (samples.accel[1:] + samples.accel[:-1])
-    return np.diff(samples.stamps_ns) * 1e-9, gyro, accel
-
-
-def integrate_rotation(samples: ImuData, gyro_bias: FloatArray) -> gtsam.Rot3:
-    """Rotation start_R_end of the body from the first to the last sample.
-
-    Args:
-        samples: at least one; `ImuBuffer.between` gives them with the ends in place.
-        gyro_bias: (3,) rad/s.
-    """
-    durations_s, gyro, _ = _steps(samples)
-    start_R_end = gtsam.Rot3()
-    for turn in (gyro - gyro_bias) * durations_s[:, None]:
-        start_R_end = start_R_end * gtsam.Rot3.Expmap(turn)
-    return start_R_end
-
-
-def preintegration_params(
-    noise: ImuNoise,
-    gravity: float,
-    scale: float = 1.0,
-    gyro_scale: float = 1.0,
-    accel_scale: float = 1.0,
-) -> gtsam.PreintegrationCombinedParams:
-    """GTSAM's parameters for an IMU.
-
-    Args:
-        noise: continuous-time densities.
-        gravity: magnitude in m/s²; the world's z axis points up.
-        scale: factor on all densities.
-        gyro_scale: factor on the white noise of the gyroscope.
-        accel_scale: factor on that of the accelerometer.
-    """
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
-    eye = np.eye(3)
-    params.setGyroscopeCovariance(eye * (scale * gyro_scale * noise.gyro_noise_density) ** 2)
-    params.setAccelerometerCovariance(eye * (scale * accel_scale * noise.accel_noise_density) ** 2)
-    params.setBiasOmegaCovariance(eye * (scale * noise.gyro_random_walk) ** 2)
-    params.setBiasAccCovariance(eye * (scale * noise.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(eye * _INTEGRATION_SIGMA**2)
-    return params
-
-
-def preintegrate(
-    samples: ImuData,
-    bias: gtsam.imuBias.ConstantBias,
-    params: gtsam.PreintegrationCombinedParams,
-) -> gtsam.PreintegratedCombinedMeasurements:
-    """Preintegrate from the first to the last sample (Forster et al. 2017).
-
-    Args:
-        samples: at least two; `ImuBuffer.between` gives them with the ends in place.
-        bias: at which the integration is linearised.
-        params: noise of the IMU.
-    """
-    pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    durations_s, gyro, accel = _steps(samples)
-    # GTSAM turns the specific force by the attitude at the start of a step; this is half a step on
-    half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
-    accel = accel + np.cross(half_turn, accel - bias.accelerometer())
-    for a, w, dt in zip(accel, gyro, durations_s.tolist(), strict=True):
-        pim.integrateMeasurement(a, w, dt)
-    return pim
-
-
-def predict(
-    state: NavState, pim: gtsam.PreintegratedCombinedMeasurements, stamp_ns: int
-) -> NavState:
-    """The state at the end of a preintegration that began at `state`: g(x_t)."""
-    bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-    there = pim.predict(gtsam.NavState(state.world_T_body, state.velocity), bias)
-    return NavState(
-        stamp_ns,
-        there.pose(),
-        np.asarray(there.velocity()),
-        accel_bias=state.accel_bias,
-        gyro_bias=state.gyro_bias,
-    )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,10 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuData:
-    """A block of consecutive IMU samples, in the body frame.
+    """A block of consecutive IMU samples, in the body frame, and their integration.
+
+    For the integration samples are instantaneous values of a signal that is linear between them:
+    from one sample to the next the mean of the two is integrated.
 
     Attributes:
         stamps_ns: (N,) int64, strictly increasing.
@@ -51,6 +55,43 @@ class ImuData:
 
     def __getitem__(self, index: slice) -> ImuData:
         return ImuData(self.stamps_ns[index], self.gyro[index], self.accel[index])
+
+    def rotation(self, gyro_bias: FloatArray) -> gtsam.Rot3:
+        """Rotation start_R_end of the body from the first to the last sample, at least one.
+
+        Args:
+            gyro_bias: (3,) rad/s.
+        """
+        durations_s, gyro, _ = self._steps()
+        start_R_end = gtsam.Rot3()
+        for turn in (gyro - gyro_bias) * durations_s[:, None]:
+            start_R_end = start_R_end * gtsam.Rot3.Expmap(turn)
+        return start_R_end
+
+    def preintegrated(
+        self, bias: gtsam.imuBias.ConstantBias, params: gtsam.PreintegrationCombinedParams
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        """Preintegration from the first to the last of at least two samples (Forster et al. 2017).
+
+        Args:
+            bias: at which the integration is linearised.
+            params: noise of the IMU (`ImuNoise.preintegration_params`).
+        """
+        pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
+        durations_s, gyro, accel = self._steps()
+        # GTSAM turns the specific force by the attitude at the start of a step; this is half a
+        # step on
+        half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
+        accel = accel + np.cross(half_turn, accel - bias.accelerometer())
+        for a, w, dt in zip(accel, gyro, durations_s.tolist(), strict=True):
+            pim.integrateMeasurement(a, w, dt)
+        return pim
+
+    def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""
+        gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
+        accel = 0.5 * (self.accel[1:] + self.accel[:-1])
+        return np.diff(self.stamps_ns) * 1e-9, gyro, accel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

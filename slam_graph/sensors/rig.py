@@ -17,8 +17,8 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 
-_ROTATION_TOLERANCE = 1e-3
-"""Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
+_INTEGRATION_SIGMA = 1e-5
+"""Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,32 @@ class ImuNoise:
     accel_noise_density: float = 2.0e-3
     accel_random_walk: float = 3.0e-3
     rate_hz: float = 200.0
+
+    def preintegration_params(
+        self,
+        gravity: float,
+        scale: float = 1.0,
+        gyro_scale: float = 1.0,
+        accel_scale: float = 1.0,
+    ) -> gtsam.PreintegrationCombinedParams:
+        """GTSAM's parameters for this IMU.
+
+        Args:
+            gravity: magnitude in m/s²; the world's z axis points up.
+            scale: factor on all densities.
+            gyro_scale: factor on the white noise of the gyroscope.
+            accel_scale: factor on that of the accelerometer.
+        """
+        params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+        eye = np.eye(3)
+        gyro = scale * gyro_scale * self.gyro_noise_density
+        accel = scale * accel_scale * self.accel_noise_density
+        params.setGyroscopeCovariance(eye * gyro**2)
+        params.setAccelerometerCovariance(eye * accel**2)
+        params.setBiasOmegaCovariance(eye * (scale * self.gyro_random_walk) ** 2)
+        params.setBiasAccCovariance(eye * (scale * self.accel_random_walk) ** 2)
+        params.setIntegrationCovariance(eye * _INTEGRATION_SIGMA**2)
+        return params
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,29 +103,6 @@ class Rig:
         if not 1 <= count <= len(self.cameras):
             raise DataError(f"asked for {count} cameras, the rig has {len(self.cameras)}")
         return Rig(self.cameras[:count], self.imu)
-
-
-def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
-    """A pose from a 4x4 homogeneous matrix.
-
-    Args:
-        matrix: (4, 4).
-        where: what the matrix is and where it stands (file, line), for the error message.
-
-    Raises:
-        DataError: if the matrix is not 4x4, not finite, or its rotation part is not a rotation.
-    """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
-        raise DataError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
-    R = matrix[:3, :3]
-    defect = float(np.max(np.abs(R @ R.T - np.eye(3))))
-    if defect > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-        raise DataError(
-            f"{where}: the upper left 3x3 block is not a rotation "
-            f"(|R Rᵀ - I| = {defect:.2g}, det = {np.linalg.det(R):.3g})"
-        )
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), matrix[:3, 3])
 
 
 @dataclass(frozen=True, slots=True)

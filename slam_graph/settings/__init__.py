@@ -10,20 +10,16 @@ __all__ = [
     "ConfigTree",
     "Settings",
     "expert",
-    "override",
-    "override_trees",
-    "read_tree",
-    "validate",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.settings.base import Settings, expert
-    from slam_graph.settings.tree import ConfigTree, override, override_trees, read_tree, validate
+    from slam_graph.settings.tree import ConfigTree
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "base": ("Settings", "expert"),
-            "tree": ("ConfigTree", "override", "override_trees", "read_tree", "validate"),
+            "tree": ("ConfigTree",),
         },
     )

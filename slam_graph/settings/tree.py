@@ -34,6 +34,74 @@ class ConfigTree:
     values: dict[str, Any] = field(default_factory=dict)
     where: dict[KeyPath, str] = field(default_factory=dict)
 
+    @staticmethod
+    def read(path: Path) -> ConfigTree:
+        """Read a YAML file whose top level is a table.
+
+        Raises:
+            ConfigError: if it is missing, not YAML, not a table, or has a key twice.
+        """
+        try:
+            loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+            node = loader.get_single_node()
+            values = loader.construct_document(node) if node is not None else {}
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot read configuration: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{path}: configuration is not UTF-8 text") from error
+        except yaml.YAMLError as error:
+            raise ConfigError(_yaml_fault(path, error)) from error
+        if not isinstance(values, dict):
+            raise ConfigError(
+                f"{path}:1: expected a table of settings, got {type(values).__name__}"
+            )
+        where: dict[KeyPath, str] = {(): str(path)}
+        if node is not None:
+            _record_lines(node, path, (), where)
+        return ConfigTree(values, where)
+
+    @staticmethod
+    def override(text: str) -> ConfigTree:
+        """The tree of one `a.b=value`; the value is read as YAML, which gives it its type.
+
+        Raises:
+            ConfigError: if there is no `=`, a key is empty, or the value is not YAML.
+        """
+        name, separator, value_text = text.partition("=")
+        keys = name.strip().split(".")
+        where = f"--set {text}"
+        if not separator or not all(keys):
+            raise ConfigError(f"{where}: expected key=value, e.g. backend.noise.pixel_sigma=1.5")
+        try:
+            value = yaml.safe_load(value_text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{where}: the value is not YAML; put it in quotes") from error
+        return _branch(keys, value, where)
+
+    @staticmethod
+    def overrides(overrides: str | Iterable[str] | Mapping[str, Any]) -> list[ConfigTree]:
+        """A tree for each override, in their order.
+
+        Args:
+            overrides: texts `a.b=value`, or a mapping from `a.b` to the value.
+
+        Raises:
+            ConfigError: if one is malformed.
+        """
+        if isinstance(overrides, str):
+            return [ConfigTree.override(overrides)]
+        if not isinstance(overrides, Mapping):
+            return [ConfigTree.override(text) for text in overrides]
+        trees = []
+        for name, value in overrides.items():
+            keys = name.split(".")
+            if not all(keys):
+                raise ConfigError(
+                    f"override '{name}': expected a key, e.g. backend.noise.pixel_sigma"
+                )
+            trees.append(_branch(keys, value, f"override {name}"))
+        return trees
+
     def merge(self, other: ConfigTree) -> None:
         """Lay another tree over this one: tables are merged, other values are replaced."""
         _merge(self.values, other.values)
@@ -46,84 +114,19 @@ class ConfigTree:
                 return self.where[path[:length]]
         return self.where.get((), "configuration")
 
+    def validated(self, model: type[_ModelT]) -> _ModelT:
+        """The typed settings of this tree.
 
-def read_tree(path: Path) -> ConfigTree:
-    """Read a YAML file whose top level is a table.
-
-    Raises:
-        ConfigError: if it is missing, not YAML, not a table, or has a key twice.
-    """
-    try:
-        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
-        node = loader.get_single_node()
-        values = loader.construct_document(node) if node is not None else {}
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot read configuration: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: configuration is not UTF-8 text") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(_yaml_fault(path, error)) from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}:1: expected a table of settings, got {type(values).__name__}")
-    where: dict[KeyPath, str] = {(): str(path)}
-    if node is not None:
-        _record_lines(node, path, (), where)
-    return ConfigTree(values, where)
-
-
-def override(text: str) -> ConfigTree:
-    """The tree of one `a.b=value`; the value is read as YAML, which gives it its type.
-
-    Raises:
-        ConfigError: if there is no `=`, a key is empty, or the value is not YAML.
-    """
-    name, separator, value_text = text.partition("=")
-    keys = name.strip().split(".")
-    where = f"--set {text}"
-    if not separator or not all(keys):
-        raise ConfigError(f"{where}: expected key=value, e.g. backend.noise.pixel_sigma=1.5")
-    try:
-        value = yaml.safe_load(value_text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where}: the value is not YAML; put it in quotes") from error
-    return _branch(keys, value, where)
-
-
-def override_trees(overrides: str | Iterable[str] | Mapping[str, Any]) -> list[ConfigTree]:
-    """A tree for each override, in their order.
-
-    Args:
-        overrides: texts `a.b=value`, or a mapping from `a.b` to the value.
-
-    Raises:
-        ConfigError: if one is malformed.
-    """
-    if isinstance(overrides, str):
-        return [override(overrides)]
-    if not isinstance(overrides, Mapping):
-        return [override(text) for text in overrides]
-    trees = []
-    for name, value in overrides.items():
-        keys = name.split(".")
-        if not all(keys):
-            raise ConfigError(f"override '{name}': expected a key, e.g. backend.noise.pixel_sigma")
-        trees.append(_branch(keys, value, f"override {name}"))
-    return trees
-
-
-def validate(model: type[_ModelT], tree: ConfigTree) -> _ModelT:
-    """The typed settings of a tree.
-
-    Raises:
-        ConfigError: naming the first fault, where it stands, and the closest known key if a key
-            is unknown.
-    """
-    try:
-        return model.model_validate(tree.values)
-    except ValidationError as error:
-        faults = error.errors(include_url=False)
-        more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
-        raise ConfigError(f"{_describe(model, tree, dict(faults[0]))}{more}") from error
+        Raises:
+            ConfigError: naming the first fault, where it stands, and the closest known key if a key
+                is unknown.
+        """
+        try:
+            return model.model_validate(self.values)
+        except ValidationError as error:
+            faults = error.errors(include_url=False)
+            more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+            raise ConfigError(f"{_describe(model, self, dict(faults[0]))}{more}") from error
 
 
 def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]) -> str:

@@ -12,23 +12,21 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "TRAJECTORIES",
     "SimulatedSequence",
     "SimulationConfig",
-    "StartConfig",
     "simulate",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.simulation.simulated_sequence import SimulatedSequence
-    from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig, StartConfig
+    from slam_graph.simulation.simulation_config import SimulationConfig
     from slam_graph.simulation.simulator import simulate
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "simulated_sequence": ("SimulatedSequence",),
-            "simulation_config": ("SimulationConfig", "StartConfig", "TRAJECTORIES"),
+            "simulation_config": ("SimulationConfig",),
             "simulator": ("simulate",),
         },
     )

@@ -27,13 +27,13 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import (
-    STANDARD_GRAVITY,
     ImuData,
     ImuNoise,
-    preintegrate,
-    preintegration_params,
 )
+from slam_graph.simulation.motion import GRAVITY
 from slam_graph.simulation.path_report import PathReport, report_on
+
+_GRAVITY = -float(GRAVITY[2])
 
 _STATE_SPACING_S = 0.025
 """Time between the states of the batch; between two of them the path is integrated."""
@@ -130,7 +130,7 @@ class _Batch:
         self.truth = truth
         self.imu = imu
         self._noisy = noisy
-        self._params = preintegration_params(noise, STANDARD_GRAVITY)
+        self._params = noise.preintegration_params(_GRAVITY)
         self._seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
         every = max(1, round(_STATE_SPACING_S / float(np.median(np.diff(self._seconds)))))
         last = len(imu) - 1
@@ -183,7 +183,7 @@ class _Batch:
         begin, end = self._rows[:-1], self._rows[1:]
         p, v, R = states.positions[:-1], states.velocities[:-1], states.rotations[:-1]
         bias = states.biases[:-1]
-        gravity = np.array([0.0, 0.0, -STANDARD_GRAVITY])
+        gravity = np.array([0.0, 0.0, -_GRAVITY])
         steps = [(begin, p, v, R)]
         for step in range(int(np.max(end - begin))):
             row = np.minimum(begin + step, end - 1)
@@ -248,7 +248,7 @@ class _Batch:
         graph = gtsam.NonlinearFactorGraph()
         zero = gtsam.imuBias.ConstantBias()
         for k, (first, last) in enumerate(zip(self._rows[:-1], self._rows[1:], strict=True)):
-            pim = preintegrate(self._noisy[int(first) : int(last) + 1], zero, self._params)
+            pim = self._noisy[int(first) : int(last) + 1].preintegrated(zero, self._params)
             keys = X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1)
             graph.add(gtsam.CombinedImuFactor(*keys, pim))
         return graph

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import STANDARD_GRAVITY, ImuData, ImuNoise
+from slam_graph.sensors import ImuData, ImuNoise
+from slam_graph.simulation.motion import GRAVITY
 
 JUMP_M = 5e-3
 _JUMP_TO_NOISE = 8.0
@@ -142,7 +143,7 @@ def _differences(path: Trajectory, imu: ImuData) -> tuple[FloatArray, FloatArray
     rotations, dt = Rotation.from_quat(path.quaternions), np.diff(path.stamps_ns)[:, None] * 1e-9
     turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
     gyro = 0.5 * (imu.gyro[1:] + imu.gyro[:-1]) - path.gyro_biases[:-1] - turn / dt
-    acceleration = np.diff(path.velocities, axis=0) / dt + [0.0, 0.0, STANDARD_GRAVITY]
+    acceleration = np.diff(path.velocities, axis=0) / dt - GRAVITY
     half = rotations[:-1] * Rotation.from_rotvec(0.5 * turn)
     force = half.inv().apply(acceleration)
     accel = 0.5 * (imu.accel[1:] + imu.accel[:-1]) - path.accel_biases[:-1] - force

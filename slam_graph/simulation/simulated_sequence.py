@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,12 +19,10 @@ import yaml
 from slam_graph.arrays import IntArray
 from slam_graph.datasets import (
     EurocWriter,
-    Extent,
-    FrameStream,
     ReaderOptions,
     RecordedSequence,
+    SequenceInfo,
     TrackRecorder,
-    within,
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
@@ -95,10 +93,10 @@ class SimulatedSequence(RecordedSequence):
         """Always true."""
         return True
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Number of frames and IMU samples, and the time of the first and last frame."""
         stamps = self.flight.exposures_ns - self._offset_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self.flight.imu.samples)
+        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), self.flight.imu.samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU samples from `after_ns` on."""
@@ -182,14 +180,16 @@ class SimulatedTracks(SimulatedSequence):
         super().__init__(name, config, flight, diagnostics)
         self.landmarks = landmarks
 
-    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+    def frames(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[FeatureFrame, None, None]:
         """Frames of features; those before `start_ns` are simulated too, but left out."""
         flight, config = self.flight, self.config
         simulator = TrackSimulator(
             flight.rig, flight.world, self.landmarks, config.tracks, config.seed
         )
         stamps = flight.exposures_ns - self._offset_ns
-        until = flight.exposures_ns[within(stamps, None, end_ns)]
+        until = flight.exposures_ns[self.within(stamps, None, end_ns)]
         for frame in simulator.frames(flight.motion, until, self._offset_ns):
             if start_ns is None or frame.stamp_ns >= start_ns:
                 yield frame
@@ -231,10 +231,12 @@ class SimulatedImages(SimulatedSequence):
         began_ns = int(flight.exposures_ns[0])
         return MovingBoard.ahead_of(config, flight.motion, mounting, began_ns, self.config.seed)
 
-    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
+    def frames(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[CameraFrame, None, None]:
         """Frames of images."""
         exposures = self.flight.exposures_ns
-        wanted = exposures[within(exposures - self._offset_ns, start_ns, end_ns)]
+        wanted = exposures[self.within(exposures - self._offset_ns, start_ns, end_ns)]
         for exposure_ns in wanted.tolist():
             yield self.renderer.frame(self.flight.motion, exposure_ns, self._offset_ns)
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
-from slam_graph.settings import ConfigTree, Settings, expert, override, read_tree, validate
+from slam_graph.settings import ConfigTree, Settings, expert
 
 TRAJECTORIES = ("figure8", "rooms", "random")
 """Names of the generated trajectories; any other text is the path of a recorded one."""
@@ -160,7 +160,14 @@ _REAL_START = StartConfig(
 
 
 class SimulationConfig(Settings):
-    """All settings of a simulation."""
+    """All settings of a simulation.
+
+    Attributes:
+        TRAJECTORIES: names of the generated trajectories; any other text is the path of a recorded
+            one.
+    """
+
+    TRAJECTORIES: ClassVar[tuple[str, ...]] = TRAJECTORIES
 
     kind: Literal["tracks", "images"] = Field("tracks")
     """tracks: feature tracks, made in seconds, for questions about the back end; images: rendered
@@ -233,7 +240,7 @@ def load_simulation_config(
     elif config in TRAJECTORIES:
         raise ConfigError(f"'{config}' is no file of settings; write trajectory='{config}'")
     elif config is not None:
-        tree.merge(read_tree(Path(config)))
+        tree.merge(ConfigTree.read(Path(config)))
     given = {
         name: str(value) if isinstance(value, Path) else value
         for name, value in settings.items()
@@ -241,8 +248,8 @@ def load_simulation_config(
     }
     tree.merge(ConfigTree(given, {(name,): f"option {name}" for name in given}))
     for text in overrides:
-        tree.merge(override(text))
-    return validate(SimulationConfig, tree)
+        tree.merge(ConfigTree.override(text))
+    return tree.validated(SimulationConfig)
 
 
 def random_stream(seed: int, purpose: str, *index: int) -> list[int]:

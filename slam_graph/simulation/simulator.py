@@ -16,9 +16,10 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets import pose_from_matrix, read_kalibr
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera, pose_from_matrix, read_kalibr
+from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion

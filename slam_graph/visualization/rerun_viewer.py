@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import NavState, Trajectory, align_first_pose, interpolate
+from slam_graph.geometry import NavState, Similarity, Trajectory, interpolate
 from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
 
 ViewerMode = Literal["save", "spawn", "connect"]
@@ -155,7 +155,7 @@ class RerunViewer:
             np.array([state.world_T_body.translation()]),
             np.array([quaternion.coeffs()]),
         )
-        path = align_first_pose(own, start).apply(self._truth).positions
+        path = Similarity.of_first_pose(own, start).apply(self._truth).positions
         line = self._rr.LineStrips3D([path], colors=TRUTH_COLOR)
         self._log("world/groundtruth", line, static=True)
         self._truth = None

@@ -15,7 +15,7 @@ the rotation are attributed to the gyroscope, those of the velocity to the accel
 The dynamics model: the state of a new frame predicted by the IMU, and the factor between frames.
 The residual x_{t+1} - g(x_t) of the dynamics is the preintegrated IMU factor of Forster et al. 2017
 with the random walk of the biases (GTSAM's `CombinedImuFactor`); the integration itself is in
-`sensors.imu_buffer`.
+`ImuData.preintegrated` (`sensors.measurements`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.sensors import ImuBuffer, ImuNoise, predict, preintegrate, preintegration_params
+from slam_graph.sensors import ImuBuffer, ImuNoise
 
 PERSISTENCE_TIME_S = 0.5
 """Time constant of the mean correction, which shows whether corrections keep their direction."""
@@ -98,7 +98,7 @@ class DynamicsNoise:
     def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
         """Current parameters, with all densities multiplied by `scale`."""
         scale *= self._config.imu_scale
-        return preintegration_params(self._imu, self._config.gravity, scale, *self.factors)
+        return self._imu.preintegration_params(self._config.gravity, scale, *self.factors)
 
     @property
     def factors(self) -> tuple[float, float]:
@@ -177,8 +177,8 @@ class Propagation:
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.estimate.atConstantBias(B(i))
-        pim = preintegrate(samples, bias, self._params(imu, window.stamp_ns, stamp_ns))
-        predicted = predict(previous, pim, stamp_ns)
+        pim = samples.preintegrated(bias, self._params(imu, window.stamp_ns, stamp_ns))
+        predicted = previous.predicted(pim, stamp_ns)
         window.state.insert_imu_state(j, predicted)
         window.past.append(i)
         window.moving.append(i)

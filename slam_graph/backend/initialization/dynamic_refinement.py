@@ -38,7 +38,6 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
-from slam_graph.sensors import preintegrate
 
 _BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the batch problem is solved."""
@@ -131,7 +130,7 @@ class DynamicRefinement:
         start = guess.states[0]
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         for k, samples in enumerate(frames.imu_between(context.imu)):
-            factors.append(imu_factor(k, k + 1, preintegrate(samples, bias, self._params)))
+            factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, self._params)))
         first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
         first = fix_gauge(first, MOTION_PRIOR)
         factors += _prior_factors(first)

@@ -38,7 +38,7 @@ from slam_graph.backend.initialization.visual_inertial_alignment import (
     estimate_gyro_bias,
 )
 from slam_graph.geometry import NavState
-from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, preintegrate
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
 
 _SAMPLES = 100
 """If half of the features are static, one sample of four has only such with a probability of
@@ -269,7 +269,7 @@ def _integrate(
     R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
     rotations, displacements, velocities = [R], [p], [v]
     for block in samples:
-        pim = preintegrate(block, bias, params)
+        pim = block.preintegrated(bias, params)
         p = p + v * pim.deltaTij() + R @ pim.deltaPij()
         v = v + R @ pim.deltaVij()
         R = R @ pim.deltaRij().matrix()

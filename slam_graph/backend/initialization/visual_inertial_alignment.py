@@ -37,7 +37,7 @@ from slam_graph.backend.cost.feature_factors import eliminate_points
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.solve.square_root import triangularize
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, preintegrate
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
 _MIN_COMMON = 8
 """Pairs of frames with fewer common features than this are left out."""
@@ -165,7 +165,7 @@ def _rotation(
     samples: ImuData, gyro_bias: FloatArray, params: gtsam.PreintegrationCombinedParams
 ) -> FloatArray:
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias)
-    return np.asarray(preintegrate(samples, bias, params).deltaRij().matrix())
+    return np.asarray(samples.preintegrated(bias, params).deltaRij().matrix())
 
 
 def _bearings(obs: FeatureObservations, rows: NDArray[np.intp], R: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.datasets import ReaderOptions, TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Packet, Rig
 
@@ -114,7 +114,7 @@ class FrameLog:
 
     def packets(self, first: int, stop: int) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = TrackRecordingSequence(self._path, ReaderOptions(diagnostics=_Silent()))
+        sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.geometry import NavState, Trajectory, interpolate
-from slam_graph.sensors import ImuBuffer, predict, preintegrate
+from slam_graph.sensors import ImuBuffer
 
 _MAX_GAP_S = 1.0
 """States farther apart are not interpolated: the IMU predicts across the gap."""
@@ -65,8 +65,8 @@ def _predict_forward(
 ) -> NavState:
     """The state at a later time."""
     bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-    pim = preintegrate(imu.between(state.stamp_ns, stamp_ns), bias, params)
-    return predict(state, pim, stamp_ns)
+    pim = imu.between(state.stamp_ns, stamp_ns).preintegrated(bias, params)
+    return state.predicted(pim, stamp_ns)
 
 
 def _predict_backward(
@@ -78,7 +78,7 @@ def _predict_backward(
     R = R' ΔRᵀ, v = v' - g T - R Δv, p = p' - v T - ½ g T² - R Δp.
     """
     bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-    pim = preintegrate(imu.between(stamp_ns, state.stamp_ns), bias, params)
+    pim = imu.between(stamp_ns, state.stamp_ns).preintegrated(bias, params)
     seconds, gravity = pim.deltaTij(), params.n_gravity
     rotation = state.world_T_body.rotation().compose(pim.deltaRij().inverse())
     velocity = state.velocity - gravity * seconds - rotation.rotate(pim.deltaVij())

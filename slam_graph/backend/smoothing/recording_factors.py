@@ -34,7 +34,7 @@ from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.sensors import Rig, preintegrate, preintegration_params
+from slam_graph.sensors import Rig
 
 
 def nearest_keyframe(stamps_ns: IntArray, keyframes: IntArray) -> IntArray:
@@ -189,8 +189,8 @@ class RecordingFactors:
             scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
             # variances of non-stationary noise add up
             gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-            params = preintegration_params(self._rig.imu, noise.gravity, scale, gyro, accel)
-            pim = preintegrate(imu.between(start_ns, end_ns), values.atConstantBias(B(k)), params)
+            params = self._rig.imu.preintegration_params(noise.gravity, scale, gyro, accel)
+            pim = imu.between(start_ns, end_ns).preintegrated(values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():
                 factors += zero_velocity_factors(k, k + 1)

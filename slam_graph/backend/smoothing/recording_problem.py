@@ -38,7 +38,7 @@ from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
-from slam_graph.sensors import Rig, preintegration_params
+from slam_graph.sensors import Rig
 
 OUTLIER_WIDTH = 3.7
 """Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
@@ -74,7 +74,7 @@ class SmoothingTask:
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
         """Noise of the IMU by the calibration."""
-        return preintegration_params(self.rig.imu, self.backend.noise.gravity)
+        return self.rig.imu.preintegration_params(self.backend.noise.gravity)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,17 +25,16 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
-    within,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
-    parse,
     read_rows,
     stamps_from_seconds,
 )
@@ -47,7 +46,7 @@ from slam_graph.datasets.streams.track_frames import (
     frames_from_tables,
 )
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera, ImuData, ImuNoise, Rig, RigCamera, read_kalibr
+from slam_graph.sensors import Camera, ImuData, ImuNoise, Rig, RigCamera
 
 HEADER = "row_type,"
 META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"
@@ -98,14 +97,14 @@ class EqvioTracks(RecordedSequence):
         rig = _read_rig(path) if chain is None else read_kalibr(chain).select(1)
         super().__init__(path.stem, options.select(rig), options)
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Count frames and IMU samples in one pass over the file."""
         counter, samples = StampCounter(), 0
         for rows in read_rows(self.path):
             for stamp in _parse_features(rows)["stamp"].tolist():
                 counter.add(stamp)
             samples += len(rows.select(IMU_PREFIX).lines)
-        return Extent(counter.frames, counter.first_ns, counter.latest_ns, samples)
+        return self.holding(counter.frames, counter.first_ns, counter.latest_ns, samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
@@ -122,7 +121,7 @@ class EqvioTracks(RecordedSequence):
         camera = self.rig.cameras[0].camera
         for rows in read_rows(self.path):
             table = _parse_features(rows)
-            table = table[within(table["stamp"], start_ns, end_ns)]
+            table = table[self.within(table["stamp"], start_ns, end_ns)]
             table["pixel"] = camera.distort(table["normalized"])[0]
             yield table
 
@@ -133,14 +132,14 @@ def _stamps(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int64]:
 
 
 def _parse_imu(rows: Rows) -> ImuData:
-    table = parse(rows, IMU_ROW, "an imu row", IMU_COLUMNS)
+    table = rows.parse(IMU_ROW, "an imu row", IMU_COLUMNS)
     return ImuData(_stamps(rows, table["stamp"]), table["gyro"], table["accel"])
 
 
 def _parse_features(rows: Rows) -> TrackTable:
     """The tracks among some rows, without their pixels."""
     rows = rows.select(FEATURE_PREFIX)
-    parsed = parse(rows, _FEATURE_ROW, "a vision_feature row", _FEATURE_COLUMNS)
+    parsed = rows.parse(_FEATURE_ROW, "a vision_feature row", _FEATURE_COLUMNS)
     table = np.zeros(len(parsed), TRACK_ROW)
     table["stamp"] = _stamps(rows, parsed["stamp"])
     table["id"] = parsed["id"]

@@ -26,6 +26,9 @@ from typing import ClassVar
 import numpy as np
 
 from slam_graph.arrays import IntArray
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig, read_imu_noise
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.groundtruth import find_groundtruth
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows
@@ -35,7 +38,7 @@ from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors import Rig, read_euroc_rig, read_imu_noise, read_kalibr, read_yaml
+from slam_graph.sensors import Rig
 
 
 def _find_mav0(path: Path) -> Path:

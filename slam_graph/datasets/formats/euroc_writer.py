@@ -21,18 +21,12 @@ import numpy as np
 import yaml
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.calibration.euroc_calibration import camera_entry
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import (
-    CameraFrame,
-    ImuData,
-    ImuNoise,
-    Rig,
-    RigCamera,
-    camera_entry,
-    write_kalibr,
-)
+from slam_graph.sensors import CameraFrame, ImuData, ImuNoise, Rig, RigCamera
 
 CALIBRATION = "calibration.yaml"
 """The calibration in Kalibr's format, beside ``mav0``."""
@@ -54,20 +48,6 @@ _TRUTH_FOLDER = "state_groundtruth_estimate0"
 
 Progress = Callable[[int], None]
 """Called with the time of every frame that was written."""
-
-
-def refuse_existing(path: Path, force: bool = False) -> None:
-    """Refuse a folder that exists already, before any work is done.
-
-    Args:
-        path: where to write.
-        force: let a folder with ``mav0`` in it be replaced; nothing else ever is.
-    """
-    if force and (path / "mav0").is_dir():
-        return
-    if path.exists():
-        what = "is not an EuRoC folder and is not replaced" if force else "exists already"
-        raise DataError(f"{path}: {what}; remove it or write to another folder")
 
 
 class EurocWriter:
@@ -96,11 +76,25 @@ class EurocWriter:
         force: bool = False,
         with_imu: bool = True,
     ) -> None:
-        refuse_existing(path, force)
+        self.refuse_existing(path, force)
         self._with_imu = with_imu
         self._path, self._rig, self._truth = path, rig, truth
         self._comment, self._rate_hz = comment, rate_hz
         self._files = ExitStack()
+
+    @staticmethod
+    def refuse_existing(path: Path, force: bool = False) -> None:
+        """Refuse a folder that exists already, before any work is done.
+
+        Args:
+            path: where to write.
+            force: let a folder with ``mav0`` in it be replaced; nothing else ever is.
+        """
+        if force and (path / "mav0").is_dir():
+            return
+        if path.exists():
+            what = "is not an EuRoC folder and is not replaced" if force else "exists already"
+            raise DataError(f"{path}: {what}; remove it or write to another folder")
 
     def __enter__(self) -> Self:
         try:
@@ -154,6 +148,47 @@ class EurocWriter:
                 raise DataError(f"{folder / name}: cannot be written; is the disk full?")
             index.write(f"{frame.stamp_ns},{name}\n")
 
+    @staticmethod
+    def convert(
+        sequence: RecordedSequence,
+        path: str | Path,
+        force: bool = False,
+        progress: Progress | None = None,
+    ) -> None:
+        """Write a recording to a new EuRoC folder, completely or not at all.
+
+        Images become 8 bit grey PNG with the stamp of their frame. Unusable samples of the IMU are
+        left out, and so are missing and damaged images; the sequence counts them.
+
+        Args:
+            sequence: any recording of images; without an IMU there is no ``imu0`` in the folder.
+            path: the new folder.
+            force: replace an existing EuRoC folder.
+            progress: called with the time of every frame that was written.
+
+        Raises:
+            DataError: if the recording holds no images, or the folder exists already.
+        """
+        info = sequence.info()
+        if info.content == "tracks":
+            raise DataError(
+                f"{info.name}: format '{info.format}' holds feature tracks, no images; copy it as "
+                "it is, or write tracks with slam_graph.datasets.TrackRecorder"
+            )
+        seconds = max((info.end_ns - info.start_ns) * 1e-9, 1e-9)
+        rate_hz = round((info.frames - 1) / seconds, 3)
+        comment = f"converted from {info.format}"
+        rig, truth, has_imu = sequence.rig, sequence.groundtruth(), sequence.has_imu
+        with EurocWriter(Path(path), rig, truth, comment, rate_hz, force, has_imu) as writer:
+            for block in sequence.imu_blocks():
+                writer.write_imu(block)
+            for frame in sequence.frames():
+                if not isinstance(frame, CameraFrame):
+                    raise DataError(f"{info.name}: frame at {frame.stamp_ns} holds no images")
+                writer.write_frame(frame)
+                if progress is not None:
+                    progress(frame.stamp_ns)
+
     def _open(self, folder: Path, columns: str, calibration: dict[str, object]) -> TextIO:
         """The index of a new sensor, beside its calibration."""
         folder.mkdir(parents=True)
@@ -175,47 +210,6 @@ class EurocWriter:
         self._folder.rename(self._path)
         if replaces:
             shutil.rmtree(old, ignore_errors=True)
-
-
-def convert_to_euroc(
-    sequence: RecordedSequence,
-    path: str | Path,
-    force: bool = False,
-    progress: Progress | None = None,
-) -> None:
-    """Write a recording to a new EuRoC folder, completely or not at all.
-
-    Images become 8 bit grey PNG with the stamp of their frame. Unusable samples of the IMU are left
-    out, and so are missing and damaged images; the sequence counts them.
-
-    Args:
-        sequence: any recording of images; without an IMU there is no ``imu0`` in the folder.
-        path: the new folder.
-        force: replace an existing EuRoC folder.
-        progress: called with the time of every frame that was written.
-
-    Raises:
-        DataError: if the recording holds no images, or the folder exists already.
-    """
-    info = sequence.info()
-    if info.content == "tracks":
-        raise DataError(
-            f"{info.name}: format '{info.format}' holds feature tracks, no images; copy it as it "
-            "is, or write tracks with slam_graph.datasets.formats.track_recorder.TrackRecorder"
-        )
-    seconds = max((info.end_ns - info.start_ns) * 1e-9, 1e-9)
-    rate_hz = round((info.frames - 1) / seconds, 3)
-    comment = f"converted from {info.format}"
-    truth, has_imu = sequence.groundtruth(), sequence.has_imu
-    with EurocWriter(Path(path), sequence.rig, truth, comment, rate_hz, force, has_imu) as writer:
-        for block in sequence.imu_blocks():
-            writer.write_imu(block)
-        for frame in sequence.frames():
-            if not isinstance(frame, CameraFrame):
-                raise DataError(f"{info.name}: frame at {frame.stamp_ns} holds no images")
-            writer.write_frame(frame)
-            if progress is not None:
-                progress(frame.stamp_ns)
 
 
 _SENSOR_TYPES = {"cam": "camera", "imu": "imu", _TRUTH_FOLDER.rstrip("0"): "ground truth"}

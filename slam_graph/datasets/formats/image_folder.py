@@ -20,12 +20,12 @@ from typing import ClassVar
 import numpy as np
 
 from slam_graph.arrays import IntArray
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
-    parse,
     read_rows,
     stamp_from_seconds,
 )
@@ -34,7 +34,7 @@ from slam_graph.datasets.streams.images import FileImages
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
-from slam_graph.sensors import ImuData, Rig, read_kalibr
+from slam_graph.sensors import ImuData, Rig
 
 _SHORTEST_PERIOD_NS = 100_000
 """Frames closer in time than this have stamps in another unit."""
@@ -168,9 +168,9 @@ def _parse_timed_imu(rows: Rows) -> ImuData:
     """Samples of rows: time, gyro xyz in rad/s, accel xyz in m/s²."""
     what = "time, gyro xyz, accel xyz"
     if not any(_in_seconds(_cells(line)[0]) for line in rows.lines):
-        table = parse(rows, INTEGER_STAMPS, what)
+        table = rows.parse(INTEGER_STAMPS, what)
         return ImuData(table["stamp"], table["gyro"], table["accel"])
-    table = parse(rows, [("stamp", STAMP_TEXT), *INTEGER_STAMPS[1:]], what)
+    table = rows.parse([("stamp", STAMP_TEXT), *INTEGER_STAMPS[1:]], what)
     stamps = [stamp_from_seconds(text, rows, k) for k, text in enumerate(table["stamp"])]
     return ImuData(np.array(stamps, np.int64), table["gyro"], table["accel"])
 

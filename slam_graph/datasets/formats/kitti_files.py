@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
-from slam_graph.datasets.streams.csv_rows import STAMP_TEXT, parse, read_rows, stamps_from_seconds
+from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
+from slam_graph.datasets.streams.csv_rows import STAMP_TEXT, read_rows, stamps_from_seconds
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera, pose_from_matrix
+from slam_graph.sensors import Camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ def read_seconds(path: Path) -> NDArray[np.int64]:
     """
     blocks = []
     for rows in read_rows(path):
-        table = parse(rows, [("stamp", STAMP_TEXT)], "time [s]", (0,), None)
+        table = rows.parse([("stamp", STAMP_TEXT)], "time [s]", (0,), None)
         blocks.append(stamps_from_seconds(rows, table["stamp"]))
     if not blocks:
         raise DataError(f"{path}: no time stamps in this file")

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.kitti_files import (
     increasing,
     read_calibration,
@@ -25,12 +26,12 @@ from slam_graph.datasets.formats.kitti_files import (
     rectified_camera,
 )
 from slam_graph.datasets.sequence import ReaderOptions
-from slam_graph.datasets.streams.csv_rows import parse, read_rows
+from slam_graph.datasets.streams.csv_rows import read_rows
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import Rig, RigCamera, read_kalibr
+from slam_graph.sensors import Rig, RigCamera
 
 _WORLD_R_CAMERA0 = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Turns x right, y down, z forward into the x forward, y left, z up of a world frame."""
@@ -99,7 +100,7 @@ def _read_poses(path: Path) -> FloatArray:
         DataError: if a row cannot be read; names file and line.
     """
     blocks = [
-        parse(rows, [("pose", "f8", (12,))], "12 numbers of a 3x4 pose", None, None)["pose"]
+        rows.parse([("pose", "f8", (12,))], "12 numbers of a 3x4 pose", None, None)["pose"]
         for rows in read_rows(path)
     ]
     if not blocks:

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.kitti_files import (
     CalibrationFile,
     increasing,
@@ -40,7 +41,7 @@ from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera, read_kalibr
+from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera
 
 _EARTH_RADIUS_M = 6_378_137.0
 

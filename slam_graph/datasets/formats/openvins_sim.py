@@ -18,18 +18,19 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.euroc_calibration import read_camera
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
-    within,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
     count_rows,
-    parse,
     read_rows,
     require_rows,
     stamp_from_seconds,
@@ -44,15 +45,7 @@ from slam_graph.datasets.streams.track_frames import (
 )
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import (
-    ImuData,
-    ImuNoise,
-    Rig,
-    RigCamera,
-    read_camera,
-    read_kalibr,
-    read_yaml,
-)
+from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera
 
 _STATE_ROW = [("stamp", STAMP_TEXT), ("values", "f8", (16,))]
 _STATE_COLUMNS = "time [s], position, quaternion xyzw, velocity, gyro bias, accel bias"
@@ -129,7 +122,7 @@ def _read_start(path: Path) -> NavState:
 
 def _parse_states(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (N,) in ns and values (N, 16): p, q, v, gyro bias, accel bias."""
-    table = parse(rows, _STATE_ROW, _STATE_COLUMNS)
+    table = rows.parse(_STATE_ROW, _STATE_COLUMNS)
     return stamps_from_seconds(rows, table["stamp"]), table["values"]
 
 
@@ -177,7 +170,7 @@ class OpenvinsSimulation(RecordedSequence):
         for file in (self._tracks, self._imu_file):
             require_rows(file)
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Count frames and IMU samples in one pass over the files."""
         counter, latest = StampCounter(), ""
         for rows in read_rows(self._tracks, _ROWS_PER_TRACK_BLOCK):
@@ -187,7 +180,7 @@ class OpenvinsSimulation(RecordedSequence):
                     counter.add(stamp_from_seconds(text, rows, k))
                     latest = text
         samples = count_rows(self._imu_file)[0]
-        return Extent(counter.frames, counter.first_ns, counter.latest_ns, samples)
+        return self.holding(counter.frames, counter.first_ns, counter.latest_ns, samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
@@ -208,7 +201,7 @@ class OpenvinsSimulation(RecordedSequence):
 
     def _tables(self, start_ns: int | None, end_ns: int | None) -> Iterator[TrackTable]:
         for rows in read_rows(self._tracks, _ROWS_PER_TRACK_BLOCK):
-            parsed = parse(rows, _TRACK_COLUMNS, "time [s], camera, feature, u, v")
+            parsed = rows.parse(_TRACK_COLUMNS, "time [s], camera, feature, u, v")
             unknown = (parsed["camera"] < 0) | (parsed["camera"] >= self._known_cameras)
             if unknown.any():
                 raise DataError(
@@ -216,7 +209,7 @@ class OpenvinsSimulation(RecordedSequence):
                     f"but the calibration has {self._known_cameras}, counted from 0"
                 )
             stamps = stamps_from_seconds(rows, parsed["stamp"])
-            inside = within(stamps, start_ns, end_ns)
+            inside = self.within(stamps, start_ns, end_ns)
             table = np.zeros(int(inside.sum()), TRACK_ROW)
             table["stamp"] = stamps[inside]
             for name in ("camera", "id", "pixel"):
@@ -233,5 +226,5 @@ class OpenvinsSimulation(RecordedSequence):
 
 
 def _parse_imu(rows: Rows) -> ImuData:
-    table = parse(rows, IMU_ROW, "time [s], gyro xyz, accel xyz")
+    table = rows.parse(IMU_ROW, "time [s], gyro xyz, accel xyz")
     return ImuData(stamps_from_seconds(rows, table["stamp"]), table["gyro"], table["accel"])

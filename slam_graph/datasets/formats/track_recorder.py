@@ -15,10 +15,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig, write_kalibr
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
 
 class TrackRecorder:

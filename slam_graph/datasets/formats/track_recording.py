@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded feature tracks: the folder format, and its replay.
 
-The folder format of recorded feature tracks: its files and their records. All numbers are little-
-endian, and no file is a pickle:
+A recording is replayed bit for bit, so that every algorithm gets the same features. `TrackRecorder`
+writes recordings. All numbers are little-endian, and no file is a pickle:
 
 - ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, `name`, and the number of `cameras`,
   `frames`, `imu_samples` and `features`, by which a truncated file is recognised;
-- ``calibration.yaml``: the rig, as `slam_graph.sensors.kalibr_calibration` writes it;
+- ``calibration.yaml``: the rig, as `slam_graph.datasets.calibration.kalibr_calibration` writes it;
 - ``frames.bin``: for each frame `stamp` (int64, ns) and `counts` (int64 for each camera), the
   number of features of each camera;
 - ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
@@ -17,11 +17,6 @@ endian, and no file is a pickle:
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
 - ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
   `NavState` under their names (`world_T_body` as a 4x4 matrix).
-
-A recording is replayed bit for bit.
-
-Recorded feature tracks: replayed, so that every algorithm gets the same features. `TrackRecorder`
-writes recordings; `track_format` describes the files.
 """
 
 from __future__ import annotations
@@ -38,17 +33,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
-    within,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, read_kalibr, read_yaml
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
 FORMAT_NAME = "slam_graph-tracks"
 FORMAT_VERSION = 1
@@ -186,11 +182,11 @@ class TrackRecordingSequence(RecordedSequence):
         self._index = np.fromfile(path / FRAMES, self._record)
         self._check_descriptors()
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """How much was recorded."""
         stamps = self._index["stamp"]
         ends = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0)
-        return Extent(len(stamps), *ends, self._samples)
+        return self.holding(len(stamps), *ends, self._samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU stream from `after_ns` on."""
@@ -206,7 +202,7 @@ class TrackRecordingSequence(RecordedSequence):
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """The recorded frames, read one by one."""
-        wanted = np.flatnonzero(within(self._index["stamp"], start_ns, end_ns))
+        wanted = np.flatnonzero(self.within(self._index["stamp"], start_ns, end_ns))
         if len(wanted) == 0:
             return
         size, before = FEATURE_RECORD.itemsize, self._index["counts"][: wanted[0]]

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows, stamp_from_seconds
@@ -33,7 +34,7 @@ from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages, Image
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera, Rig, RigCamera, read_kalibr
+from slam_graph.sensors import Camera, Rig, RigCamera
 
 Size = tuple[int, int]
 

@@ -15,10 +15,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
 from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
-from slam_graph.datasets.sequence import Extent, FrameStream, ReaderOptions
+from slam_graph.datasets.sequence import FrameStream, ReaderOptions, SequenceInfo
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     STEREO_TOLERANCE_S,
@@ -31,7 +32,7 @@ from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, ImuNoise, read_kalibr
+from slam_graph.sensors import ImuData, ImuNoise
 
 SAMPLES_PER_BLOCK = 256
 
@@ -120,10 +121,10 @@ class RosBagSequence(GroupedSequence):
         """Which images belong together."""
         return self._index.groups
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
         stamps = self.groups.stamps_ns
-        return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), self._index.imu_samples)
+        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), self._index.imu_samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""

@@ -17,6 +17,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import (
     CAMERA_INFO,
@@ -27,7 +28,7 @@ from slam_graph.datasets.rosbag.messages import (
     TRANSFORMS,
 )
 from slam_graph.errors import DataError
-from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera, YamlValue, read_yaml
+from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera
 
 
 @dataclass(frozen=True, slots=True)

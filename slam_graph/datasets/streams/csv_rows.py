@@ -49,6 +49,36 @@ class Rows:
         kept = [k for k, line in enumerate(self.lines) if line.startswith(prefix)]
         return Rows(self.path, [self.lines[k] for k in kept], [self.numbers[k] for k in kept])
 
+    def parse(
+        self,
+        dtype: list[tuple[Any, ...]],
+        what: str,
+        columns: tuple[int, ...] | None = None,
+        delimiter: str | None = ",",
+    ) -> NDArray[Any]:
+        """The rows as a structured array.
+
+        Args:
+            dtype: of one row, as for `numpy.dtype`; without `columns` it must cover all columns.
+            what: the columns, for the message (e.g. ``stamp, gyro xyz, accel xyz``).
+            columns: which columns to read, default all.
+            delimiter: between columns; None for white space.
+
+        Raises:
+            DataError: if a row does not parse; names file and line of the first.
+        """
+        try:
+            return _loadtxt(self.lines, dtype, columns, delimiter)
+        except ValueError:
+            for k, line in enumerate(self.lines):
+                try:
+                    _loadtxt([line], dtype, columns, delimiter)
+                except ValueError as error:
+                    raise DataError(
+                        f"{self.where(k)}: {_reason(str(error), line)}; expected {what}"
+                    ) from None
+            raise
+
 
 def read_rows(path: Path, rows_per_block: int = _ROWS_PER_BLOCK) -> Iterator[Rows]:
     """Stream the data rows of a text file in blocks.
@@ -80,38 +110,6 @@ def _is_data(line: str, number: int) -> bool:
         return True
     start = line.strip()[:1]
     return start != "" and start not in "#%" and (number > 1 or start in _DIGITS | {"+", "-", "."})
-
-
-def parse(
-    rows: Rows,
-    dtype: list[tuple[Any, ...]],
-    what: str,
-    columns: tuple[int, ...] | None = None,
-    delimiter: str | None = ",",
-) -> NDArray[Any]:
-    """Parse rows into a structured array.
-
-    Args:
-        rows: what `read_rows` gave.
-        dtype: of one row, as for `numpy.dtype`; without `columns` it must cover all columns.
-        what: the columns, for the message (e.g. ``stamp, gyro xyz, accel xyz``).
-        columns: which columns to read, default all.
-        delimiter: between columns; None for white space.
-
-    Raises:
-        DataError: if a row does not parse; names file and line of the first.
-    """
-    try:
-        return _loadtxt(rows.lines, dtype, columns, delimiter)
-    except ValueError:
-        for k, line in enumerate(rows.lines):
-            try:
-                _loadtxt([line], dtype, columns, delimiter)
-            except ValueError as error:
-                raise DataError(
-                    f"{rows.where(k)}: {_reason(str(error), line)}; expected {what}"
-                ) from None
-        raise
 
 
 def _reason(message: str, line: str) -> str:

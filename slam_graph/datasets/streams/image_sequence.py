@@ -16,10 +16,10 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import (
-    Extent,
     FrameStream,
     ReaderOptions,
     RecordedSequence,
+    SequenceInfo,
 )
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.imu_stream import ImuSource
@@ -111,14 +111,14 @@ class GroupedSequence(RecordedSequence):
         """The cleaned IMU stream from `after_ns` on."""
         return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
 
-    def measure(self) -> Extent:
+    def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
         samples = 0 if self._imu is None else self._imu.count()
         stamps = self.groups.stamps_ns
         if len(stamps):
-            return Extent(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
+            return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
         assert self._imu is not None
-        return Extent(0, *self._imu.ends_ns(), samples)
+        return self.holding(0, *self._imu.ends_ns(), samples)
 
     def _range(self, start_ns: int | None, end_ns: int | None) -> range:
         """The frames within [start_ns, end_ns]."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.streams.csv_rows import Rows, count_rows, parse, read_rows, require_rows
+from slam_graph.datasets.streams.csv_rows import Rows, count_rows, read_rows, require_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import ImuData
@@ -201,5 +201,5 @@ class ImuFile:
 
 def parse_imu_rows(rows: Rows) -> ImuData:
     """Samples of rows (stamp in ns, gyro xyz in rad/s, accel xyz in m/s²): EuRoC's order."""
-    table = parse(rows, INTEGER_STAMPS, "stamp [ns], gyro xyz, accel xyz")
+    table = rows.parse(INTEGER_STAMPS, "stamp [ns], gyro xyz, accel xyz")
     return ImuData(table["stamp"], table["gyro"], table["accel"])

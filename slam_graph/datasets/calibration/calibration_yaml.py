@@ -12,8 +12,11 @@ import gtsam
 import numpy as np
 import yaml
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.sensors.rig import pose_from_matrix
+
+_ROTATION_TOLERANCE = 1e-3
+"""Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,3 +138,26 @@ def parse_yaml(text: str, path: str | Path) -> YamlValue:
     if not isinstance(node, yaml.MappingNode):
         raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
     return YamlValue(Path(path), node)
+
+
+def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
+    """A pose from a 4x4 homogeneous matrix.
+
+    Args:
+        matrix: (4, 4).
+        where: what the matrix is and where it stands (file, line), for the error message.
+
+    Raises:
+        DataError: if the matrix is not 4x4, not finite, or its rotation part is not a rotation.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+        raise DataError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
+    R = matrix[:3, :3]
+    defect = float(np.max(np.abs(R @ R.T - np.eye(3))))
+    if defect > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        raise DataError(
+            f"{where}: the upper left 3x3 block is not a rotation "
+            f"(|R Rᵀ - I| = {defect:.2g}, det = {np.linalg.det(R):.3g})"
+        )
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), matrix[:3, 3])

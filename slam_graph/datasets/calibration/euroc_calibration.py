@@ -10,11 +10,9 @@ from pathlib import Path
 
 import gtsam
 
+from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.errors import DataError
-from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-from slam_graph.sensors.camera import Camera
-from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.sensors import CAMERA_MODELS, Camera, CameraModel, ImuNoise, Rig, RigCamera
 
 
 def read_camera(entry: YamlValue) -> Camera:

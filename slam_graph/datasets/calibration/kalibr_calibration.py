@@ -18,15 +18,15 @@ from typing import Any
 import gtsam
 import yaml
 
-from slam_graph.errors import DataError
-from slam_graph.sensors.calibration_yaml import YamlValue, read_yaml
-from slam_graph.sensors.euroc_calibration import (
+from slam_graph.datasets.calibration.calibration_yaml import YamlValue, parse_yaml, read_yaml
+from slam_graph.datasets.calibration.euroc_calibration import (
     camera_entry,
     has_rolling_shutter,
     read_camera,
     read_imu_noise,
 )
-from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
+from slam_graph.errors import DataError
+from slam_graph.sensors import ImuNoise, Rig, RigCamera
 
 _IMU_KEY = "imu0"
 
@@ -54,12 +54,17 @@ def read_kalibr(
     return Rig(_chain_cameras(chain, needs_imu), _read_imu(chain, imu_path, fallback))
 
 
-def rig_from_table(table: YamlValue) -> Rig:
-    """The rig of a `kalibr_table`, which has the noise of the IMU among the cameras.
+def rig_from_kalibr(text: str, path: str | Path) -> Rig:
+    """The rig of a text like that of `kalibr_text`, which has the noise of the IMU too.
+
+    Args:
+        text: YAML, or JSON, which is YAML.
+        path: of the file that it stands in, for messages.
 
     Raises:
-        DataError: if a key is missing, or a value makes no sense.
+        DataError: if it is not YAML, a key is missing, or a value makes no sense.
     """
+    table = parse_yaml(text, path)
     return Rig(_chain_cameras(table), read_imu_noise(table.require(_IMU_KEY)))
 
 
@@ -128,15 +133,12 @@ def write_kalibr(rig: Rig, path: str | Path) -> None:
     """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all."""
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    text = "# Kalibr camera chain: T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu\n"
-    partial.write_text(
-        text + yaml.safe_dump(kalibr_table(rig), sort_keys=False, default_flow_style=None)
-    )
+    partial.write_text(kalibr_text(rig))
     partial.replace(path)
 
 
-def kalibr_table(rig: Rig) -> dict[str, Any]:
-    """The content of a Kalibr file with cameras and IMU."""
+def kalibr_text(rig: Rig) -> str:
+    """The content of a Kalibr file with cameras and IMU, which loses no digit."""
     content: dict[str, Any] = {
         f"cam{index}": _camera_entry(mounted) for index, mounted in enumerate(rig.cameras)
     }
@@ -147,7 +149,9 @@ def kalibr_table(rig: Rig) -> dict[str, Any]:
         "accelerometer_random_walk": float(rig.imu.accel_random_walk),
         "update_rate": float(rig.imu.rate_hz),
     }
-    return content
+    comment = "T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu"
+    table = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    return f"# Kalibr camera chain: {comment}\n{table}"
 
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
