@@ -39,8 +39,9 @@ def decisions(
     features: int = 40,
     length_s: float = 2.0,
     config: ZeroVelocityConfig = CONFIG,
+    noise_px: float = 0.15,
 ) -> tuple[list[bool], StandstillDetector]:
-    """What the detector says frame by frame of features that move together, with 0.15 px noise."""
+    """What the detector says frame by frame of noisy features that move together."""
     rng = np.random.default_rng(0)
     stamps = np.arange(0.0, length_s + 1e-9, 0.005)
     imu = ImuBuffer()
@@ -50,7 +51,7 @@ def decisions(
     detector, said = StandstillDetector(config), []
     home = rng.uniform(50.0, 400.0, (features, 2))
     for t_s in np.arange(0.0, length_s + 1e-9, FRAME_S).tolist():
-        pixels = home + drift_px(t_s) + rng.normal(0.0, 0.15, home.shape)
+        pixels = home + drift_px(t_s) + rng.normal(0.0, noise_px, home.shape)
         seen = FeatureObservations(np.arange(features), pixels, pixels / 400.0)
         stamp_ns = round(t_s * 1e9)
         said.append(detector.is_still(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,))))
@@ -73,6 +74,22 @@ def test_a_slow_hover_is_not_still() -> None:
     said, detector = decisions(lambda t_s: np.array([2.0 * t_s, 0.5 * t_s]))
     assert not any(said)
     assert detector.since_ns is None
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 0.5, 1.0, 2.0])
+def test_the_limit_follows_the_noise_of_the_tracks(noise_px: float) -> None:
+    """Noise is no motion, and does not hide motion: 1 px of noise is 1.7 px between two frames."""
+    features = 150
+    said, detector = decisions(no_drift, features=features, noise_px=noise_px)
+    assert detector.noise_px == pytest.approx(noise_px, rel=0.1)
+    assert all(said[round(CONFIG.window_s / FRAME_S) :])
+    assert len(detector.dynamic) <= 0.02 * features
+    drifting, _ = decisions(
+        lambda t_s: np.array([max(2.0, 1.5 * noise_px) * t_s, 0.5 * t_s]),
+        features=features,
+        noise_px=noise_px,
+    )
+    assert not any(drifting)
 
 
 def test_running_motors_may_shake_a_platform_on_the_ground() -> None:

@@ -95,9 +95,9 @@ class ZeroVelocityConfig(Settings):
     without features nearby: slow even motion may be taken for standstill."""
     max_disparity_px: float = Field(1.0, gt=0)
     """Largest median motion of the features at a standstill, in pixels, between two frames and over
-    the window. Raise it if features are noisy and standstill is not found, lower it if slow motion
-    is taken for standstill. Where many features are on something that moves, the limit is a third
-    of this, for the third of the features that moves least."""
+    the window, beyond the noise of the tracks, which is measured. Raise it if standstill is not
+    found, lower it if slow motion is taken for standstill. Where many features are on something
+    that moves, the limit is a third of this, for the third of the features that moves least."""
     window_s: float = expert(1.0, gt=0)
     """Length of the window over which nothing may have moved."""
     max_gyro_std: float = expert(0.2, gt=0)

@@ -7,6 +7,10 @@ tracking errors would make the estimate drift. Images and IMU must agree that no
 images alone cannot tell standstill from slow motion before a distant scene, and the IMU alone
 cannot tell it from slow even motion. Images are compared over the whole window, which tells a
 hovering platform (it drifts) from one on the ground. Running motors may shake the IMU.
+
+Features that do not move still differ between two frames by their noise: with a standard deviation
+of σ per coordinate, the length of the difference has a Rayleigh distribution of scale √2 σ. So σ is
+measured on the tracks, and the limit on the motion is a limit on what the noise does not explain.
 """
 
 from __future__ import annotations
@@ -34,6 +38,15 @@ POSITION_SIGMA = 1e-3
 """Standard deviation of the motion between two frames at a standstill, m."""
 _ROTATION_SIGMA = 1e-3
 """Standard deviation of the rotation between two frames at a standstill, rad."""
+
+_SAMPLING_SIGMAS = 3.0
+"""The limits are above what noise alone gives by this many standard deviations of a quantile."""
+
+_NO_NOISE = 1e-6
+"""Probability that noise alone moves a feature as far as one that counts as dynamic."""
+
+_NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a standard normal variable."""
 
 MIN_FEATURES = 5
 """Fewer common features than this do not show whether the image moves."""
@@ -68,6 +81,7 @@ class StandstillDetector:
         self.since_ns: int | None = None
         self.dynamic = np.zeros(0, np.int64)
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
+        self._noise_px: deque[tuple[int, float]] = deque()
 
     def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
         """Whether images and IMU agree that nothing has moved over the window.
@@ -81,6 +95,7 @@ class StandstillDetector:
         self._recent.append((stamp_ns, frame.cameras[0]))
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
+        self._measure_noise(start_ns)
         still = (
             self._enabled
             and self._recent[0][0] <= start_ns
@@ -100,6 +115,41 @@ class StandstillDetector:
         """Add features (N,) that were found to be dynamic in another way."""
         self.dynamic = np.union1d(self.dynamic, ids)
 
+    @property
+    def noise_px(self) -> float:
+        """Standard deviation of a coordinate of a feature over the window; 0 if not known."""
+        return float(np.median([sigma for _, sigma in self._noise_px])) if self._noise_px else 0.0
+
+    def _measure_noise(self, start_ns: int) -> None:
+        """Measure the noise of the tracks by the second differences of the last three frames.
+
+        Even motion cancels in them, and their median is that of motion that all features share.
+        """
+        while self._noise_px and self._noise_px[0][0] < start_ns:
+            self._noise_px.popleft()
+        if len(self._recent) < 3:
+            return
+        frames = [observations for _, observations in list(self._recent)[-3:]]
+        ids = np.intersect1d(frames[0].ids, frames[1].ids, assume_unique=True)
+        ids = np.intersect1d(ids, frames[2].ids, assume_unique=True)
+        ids = np.setdiff1d(ids, self.dynamic, assume_unique=True)
+        if len(ids) < MIN_FEATURES:
+            return
+        first, second, third = (_pixels_of(ids, frame) for frame in frames)
+        change = third - 2.0 * second + first
+        change -= np.median(change, axis=0)
+        # a second difference of independent errors has the variance (1 + 4 + 1) σ²
+        sigma = float(np.median(np.abs(change))) / (_NORMAL_MEDIAN * np.sqrt(6.0))
+        self._noise_px.append((self._recent[-1][0], sigma))
+
+    def _limit_px(self, motion_px: float, share: float, features: int) -> float:
+        """Limit on a quantile of N differences, for a limit on what is motion in them."""
+        quantile = _rayleigh(share)
+        density = quantile * (1.0 - share)
+        spread = np.sqrt(share * (1.0 - share) / features) / density
+        scale_px = np.sqrt(2.0) * self.noise_px
+        return float(np.hypot(motion_px, (quantile + _SAMPLING_SIGMAS * spread) * scale_px))
+
     def _images_are_still(self) -> bool:
         """Whether the last frame shows what the first and the last but one of the window show."""
         now = self._recent[-1][1]
@@ -111,22 +161,29 @@ class StandstillDetector:
         """Whether most features are static, or a third of them clearly while the others move.
 
         The second limit is lower: when the platform moves slowly, the features that move least
-        move nearly as much as the median.
+        move nearly as much as the median. Where the noise exceeds it, it tells nothing.
         """
         ids, motion = _common_motion_px(before, now)
         if len(ids) < MIN_FEATURES:
             return False
         least, median = np.quantile(np.linalg.norm(motion, axis=1), [_STATIC_SHARE, 0.5])
-        limit_px = self._max_disparity_px
-        return bool(median < limit_px or least < limit_px / _DYNAMIC_RATIO)
+        motion_px = self._max_disparity_px
+        common = float(np.linalg.norm(np.median(motion, axis=0)))
+        # the median of N normal differences has a standard deviation of sqrt(π / 2N) of theirs
+        spread = np.sqrt(np.pi / len(ids)) * self.noise_px
+        if median < self._limit_px(motion_px, 0.5, len(ids)):
+            return bool(common < motion_px + _SAMPLING_SIGMAS * spread)
+        limit_px = self._limit_px(motion_px / _DYNAMIC_RATIO, _STATIC_SHARE, len(ids))
+        return bool(least < limit_px < motion_px)
 
     def _find_dynamic(self) -> None:
         """Add the features that move although the platform stands still."""
         now = self._recent[-1][1]
+        noise_px = _rayleigh(1.0 - _NO_NOISE) * np.sqrt(2.0) * self.noise_px
+        limit_px = np.hypot(_DYNAMIC_RATIO * self._max_disparity_px, noise_px)
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
             disparity_px = np.linalg.norm(motion, axis=1)
-            limit_px = _DYNAMIC_RATIO * self._max_disparity_px
             self.dynamic = np.union1d(self.dynamic, ids[disparity_px > limit_px])
 
     def _imu_is_still(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
@@ -138,6 +195,18 @@ class StandstillDetector:
             np.max(np.std(recent.gyro, axis=0)) < self._config.max_gyro_std
             and np.max(np.std(recent.accel, axis=0)) < self._config.max_accel_std
         )
+
+
+def _rayleigh(share: float) -> float:
+    """A quantile of the Rayleigh distribution of scale 1; its density there is q (1 - share)."""
+    return float(np.sqrt(-2.0 * np.log(1.0 - share)))
+
+
+def _pixels_of(ids: IntArray, observations: FeatureObservations) -> FloatArray:
+    """Pixels (N, 2) of features (N,) that are all observed."""
+    order = np.argsort(observations.ids)
+    pixels: FloatArray = observations.pixels[order[np.searchsorted(observations.ids[order], ids)]]
+    return pixels
 
 
 def _common_motion_px(
