@@ -21,10 +21,15 @@ CHOSEN_ON = (
     "euroc_inertial/V2_01_easy",
     "openvins_sim/euroc_V1_01",
     "posegraphs",
+    "tumvi_inertial/room1",
 )
 """Paths below the folder of recordings that any parameter may have been chosen on."""
 
-HELD_OUT = ("euroc_inertial/V2_02_medium", "euroc_inertial/MH_04_difficult")
+HELD_OUT = (
+    "euroc_inertial/V2_02_medium",
+    "euroc_inertial/MH_04_difficult",
+    "tumvi_inertial/room3",
+)
 """Those that none may be chosen on."""
 
 FIRST_HELD_OUT_SEED = 100

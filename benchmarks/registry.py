@@ -25,6 +25,7 @@ from benchmarks import (
     posegraphs,
     real_imu,
     speed,
+    starts,
     wheel,
 )
 from benchmarks.suite import Benchmark
@@ -38,6 +39,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **policy_product.BENCHMARKS,
     **moving_object.BENCHMARKS,
     **real_imu.BENCHMARKS,
+    **starts.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,

@@ -24,8 +24,7 @@ class KeyframeConfig(Settings):
         frame_spacing_s="POINT_FRAME_SPACING_S",
         max_reprojection_px="MAX_REPROJECTION_PX",
         max_depth_error="MAX_DEPTH_ERROR",
-        triangulation="TRIANGULATION",
-    )
+    ) | {"triangulation": "is not set apart any more: points have the defaults of that table"}
 
     distance_m: float = expert(0.5, gt=0)
     """Distance from the last keyframe at which a frame becomes one. Less where flights stay within

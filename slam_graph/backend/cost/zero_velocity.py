@@ -36,7 +36,7 @@ VELOCITY_SIGMA = 0.01
 """Standard deviation of the velocity at a standstill, m/s."""
 POSITION_SIGMA = 1e-3
 """Standard deviation of the motion between two frames at a standstill, m."""
-_ROTATION_SIGMA = 1e-3
+ROTATION_SIGMA = 1e-3
 """Standard deviation of the rotation between two frames at a standstill, rad."""
 
 _SAMPLING_SIGMAS = 3.0
@@ -219,7 +219,7 @@ def _common_motion_px(
 
 def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:
     """The pose of frame j equals that of frame i, and its velocity is zero."""
-    between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_ROTATION_SIGMA, POSITION_SIGMA], 3))
+    between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3))
     still = gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)
     return [
         gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(), between),

@@ -14,11 +14,11 @@ class FinalBaConfig(Settings):
     """The bundle adjustment over the whole recording that ends a run."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "fusion_reach_px": "is a constant now: REACH_PX in smoothing/projected_matches.py",
-        "outlier_width": "is a constant now: OUTLIER_WIDTH in smoothing/recording_problem.py",
-        "gyro_bias_sigma": "is a constant now: GYRO_BIAS_SIGMA in smoothing/recording_factors.py",
-        "accel_bias_sigma": "is a constant now: ACCEL_BIAS_SIGMA in smoothing/recording_factors.py",
-        "overlap_keyframes": "is a constant now: OVERLAP in smoothing/final_adjustment.py",
+        "fusion_reach_px": "is a constant now: REACH_PX in backend/smoothing/projected_matches.py",
+        "outlier_width": "is a constant now: OUTLIER_WIDTH in backend/smoothing/recording_problem.py",
+        "gyro_bias_sigma": "is a constant now: GYRO_BIAS_SIGMA in backend/smoothing/recording_factors.py",
+        "accel_bias_sigma": "is a constant now: ACCEL_BIAS_SIGMA in backend/smoothing/recording_factors.py",
+        "overlap_keyframes": "is a constant now: OVERLAP in backend/smoothing/final_adjustment.py",
     }
 
     enabled: bool = True
