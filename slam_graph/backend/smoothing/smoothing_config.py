@@ -14,11 +14,14 @@ class FinalBaConfig(Settings):
     """The bundle adjustment over the whole recording that ends a run."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "fusion_reach_px": "is a constant now: REACH_PX in backend/smoothing/projected_matches.py",
-        "outlier_width": "is a constant now: OUTLIER_WIDTH in backend/smoothing/recording_problem.py",
-        "gyro_bias_sigma": "is a constant now: GYRO_BIAS_SIGMA in backend/smoothing/recording_factors.py",
-        "accel_bias_sigma": "is a constant now: ACCEL_BIAS_SIGMA in backend/smoothing/recording_factors.py",
-        "overlap_keyframes": "is a constant now: OVERLAP in backend/smoothing/final_adjustment.py",
+        key: f"is a constant now: {constant} in backend/smoothing/{file}.py"
+        for key, constant, file in (
+            ("fusion_reach_px", "REACH_PX", "projected_matches"),
+            ("outlier_width", "OUTLIER_WIDTH", "recording_problem"),
+            ("gyro_bias_sigma", "GYRO_BIAS_SIGMA", "recording_factors"),
+            ("accel_bias_sigma", "ACCEL_BIAS_SIGMA", "recording_factors"),
+            ("overlap_keyframes", "OVERLAP", "final_adjustment"),
+        )
     }
 
     enabled: bool = True
