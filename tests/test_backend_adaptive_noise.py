@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from slam_graph.backend.cost.imu_factor import DensityScale
+from slam_graph.backend.cost.imu_factor import RESPONSE_TIME_S, DensityScale
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
 from slam_graph.pipeline.run_recording import run
@@ -16,9 +16,9 @@ DT_S = 0.05
 COVARIANCE = np.array([[2.0, 0.4, 0.0], [0.4, 1.0, -0.3], [0.0, -0.3, 0.5]])
 
 
-def factors(corrections: np.ndarray) -> np.ndarray:
+def factors(corrections: np.ndarray, fall_time_s: float = RESPONSE_TIME_S) -> np.ndarray:
     """The factor after each of some corrections (N, 3), whose covariance is said to be as above."""
-    scale = DensityScale()
+    scale = DensityScale(fall_time_s)
     history = []
     for correction in corrections:
         scale.observe(correction, COVARIANCE, DT_S)
@@ -51,6 +51,12 @@ def test_large_and_persistent_corrections_raise_them_and_they_fall_back() -> Non
     history = factors(np.concatenate([corrections(0.9, 2.0)[:200], corrections(0.0, 1.0)]))
     assert history[200] > 3.0
     assert history[1000:].mean() < 1.03
+
+
+def test_a_slow_fall_keeps_what_was_learned_and_does_not_creep_up() -> None:
+    surprised = np.concatenate([corrections(0.9, 2.0)[:200], corrections(0.0, 1.0)])
+    assert factors(surprised, fall_time_s=10.0)[400] > 1.5 * factors(surprised)[400]
+    assert factors(corrections(0.0, 1.0), fall_time_s=10.0).mean() < 1.25
 
 
 def mean_nees(noise_scale: float, adaptive: bool) -> float:

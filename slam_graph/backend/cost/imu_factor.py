@@ -10,7 +10,10 @@ slowly they keep their direction over many steps. So densities are raised while 
 too large and persistent, and fall back otherwise, never below those of the calibration. Both
 conditions are needed: image errors that last, such as a feature that slides along an edge, make
 small corrections persistent, and a noisier IMU would trust such images even more. Corrections of
-the rotation are attributed to the gyroscope, those of the velocity to the accelerometer.
+the rotation are attributed to the white noise of the gyroscope, those of the velocity to that of
+the accelerometer, and those of the biases to their random walks: errors of scale and alignment of a
+real IMU change with the motion, slower than white noise and faster than a bias at rest. What was
+learned of a random walk is kept for longer, as it shows in some motions only.
 
 The dynamics model: the state of a new frame predicted by the IMU, and the factor between frames.
 The residual x_{t+1} - g(x_t) of the dynamics is the preintegrated IMU factor of Forster et al. 2017
@@ -40,6 +43,8 @@ SIZE_TIME_S = 2.0
 """Time constant of the mean squared correction."""
 RESPONSE_TIME_S = 1.0
 """Time in which the variance grows by a factor of e if squares are twice as large as expected."""
+_WALK_FALL_TIME_S = 10.0
+"""The same for random walks while they fall back."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0
@@ -48,17 +53,24 @@ IMU_GAP_SCALE = 1000.0
 """Factor on the noise densities between two frames where samples are missing: the IMU then hardly
 counts."""
 _ROTATION, _VELOCITY = slice(0, 3), slice(6, 9)
+_ACCEL_BIAS, _GYRO_BIAS = slice(9, 12), slice(12, 15)
 """Rows of a state's covariance."""
 
 
 class DensityScale:
-    """The factor on the density of one sensor.
+    """The factor on one density of one sensor.
 
     Attributes:
         factor: on the noise density, at least one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fall_time_s: float = RESPONSE_TIME_S) -> None:
+        """Begin with the calibrated density.
+
+        Args:
+            fall_time_s: takes the place of `RESPONSE_TIME_S` while the factor falls.
+        """
+        self._fall_time_s = fall_time_s
         self._direction = np.zeros(3)
         self._size = 1.0
         self.factor = 1.0
@@ -82,7 +94,8 @@ class DensityScale:
         self._size = memory * self._size + (1.0 - memory) * float(white @ white) / 3.0
         persistence = float(self._direction @ self._direction) / 3.0
         surprise = min(persistence, self._size, _MAX_SQUARE) - 1.0
-        factor = self.factor * np.exp(0.5 * surprise * dt_s / RESPONSE_TIME_S)
+        response_s = RESPONSE_TIME_S if surprise > 0.0 else self._fall_time_s
+        factor = self.factor * np.exp(0.5 * surprise * dt_s / response_s)
         self.factor = float(np.clip(factor, 1.0, MAX_FACTOR))
 
 
@@ -94,11 +107,18 @@ class DynamicsNoise:
         self._config = config
         self._gyro = DensityScale()
         self._accel = DensityScale()
+        self._gyro_walk = DensityScale(_WALK_FALL_TIME_S)
+        self._accel_walk = DensityScale(_WALK_FALL_TIME_S)
 
     def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
         """Current parameters, with all densities multiplied by `scale`."""
         scale *= self._config.imu_scale
-        return self._imu.preintegration_params(self._config.gravity, scale, *self.factors)
+        imu = replace(
+            self._imu,
+            gyro_random_walk=self._imu.gyro_random_walk * self._gyro_walk.factor,
+            accel_random_walk=self._imu.accel_random_walk * self._accel_walk.factor,
+        )
+        return imu.preintegration_params(self._config.gravity, scale, *self.factors)
 
     @property
     def factors(self) -> tuple[float, float]:
@@ -123,6 +143,10 @@ class DynamicsNoise:
         self._gyro.observe(rotation, gained[_ROTATION, _ROTATION], dt_s)
         velocity = corrected.velocity - predicted.velocity
         self._accel.observe(velocity, gained[_VELOCITY, _VELOCITY], dt_s)
+        accel_bias = corrected.accel_bias - predicted.accel_bias
+        self._accel_walk.observe(accel_bias, gained[_ACCEL_BIAS, _ACCEL_BIAS], dt_s)
+        gyro_bias = corrected.gyro_bias - predicted.gyro_bias
+        self._gyro_walk.observe(gyro_bias, gained[_GYRO_BIAS, _GYRO_BIAS], dt_s)
 
 
 def _predicted_covariance(
