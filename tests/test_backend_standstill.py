@@ -26,6 +26,7 @@ from slam_graph.geometry.trajectory import StateHistory, Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
+from slam_graph.simulation import simulate
 
 Motion = Callable[[float], FloatArray]
 CONFIG = ZeroVelocityConfig()
@@ -202,3 +203,27 @@ def test_real_images_before_take_off(data_dir: Path, cameras: int) -> None:
     assert distance_m(trajectory) < 1.5e-3
     assert trajectory.velocities is not None
     assert np.linalg.norm(trajectory.velocities, axis=1).max() < 0.01
+
+
+@pytest.mark.parametrize("algorithm", ["msckf", "swf", "okvis", "ekf"])
+def test_a_stop_during_a_flight_loses_nothing(algorithm: str) -> None:
+    """Whatever knows the past, prior or features: a stop of three seconds moves no estimate.
+
+    Simulated figures of eight with stops of four seconds, with one pixel of noise.
+    """
+    flight = {"hover_s": 4.0, "hover_every_s": 6.0}
+    sequence = simulate(duration_s=14.0, seed=7, cameras=2, flight=flight, tracks={"features": 60})
+    result = run(sequence, load_config(algorithm=algorithm, overrides=["final_ba.enabled=false"]))
+    truth, history = sequence.groundtruth(), result.history
+    assert truth is not None
+    assert truth.velocities is not None
+    trajectory = history.trajectory()
+    rows = np.searchsorted(truth.stamps_ns, trajectory.stamps_ns)
+    error = np.linalg.norm(trajectory.positions - truth.positions[rows], axis=1)
+    sigma = np.sqrt(np.trace(history.pose_covariances()[:, 3:, 3:], axis1=1, axis2=2))
+    seconds = (trajectory.stamps_ns - truth.stamps_ns[0]) * 1e-9
+    stopped = (np.linalg.norm(truth.velocities[rows], axis=1) < 1e-6) & (seconds > 8.0)
+    assert np.sum(stopped) > 60
+    before = int(np.flatnonzero(stopped)[0]) - 1
+    assert np.max(error[stopped]) < error[before] + 0.01
+    assert np.max(sigma[stopped]) < 1.5 * sigma[before] + 0.01

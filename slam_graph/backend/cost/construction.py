@@ -122,12 +122,13 @@ class CostConstruction:
 
         Args:
             window: with the current frame and its observations.
-            still: whether the platform stands still; then images say nothing new, and the new pose
-                takes the place of the last one.
+            still: whether the platform stands still. Then images say nothing new, and the new pose
+                takes the place of the last one; unless features are in the cost of every step, as
+                what was seen before is then known by them and not by the prior.
         """
         self.rejected = np.zeros(0, np.int64)
         cost, removals = self._prior_and_dynamics(window), Removals()
-        if still:
+        if still and not self._features.relinearized:
             poses = PoseSelection(window.past[:-1], keyframes=frozenset(window.keyframes))
             removals.add_features(Outcome.STANDSTILL, window.state_features)
             return self._constructed(window, cost, poses, window.state_features, removals)
