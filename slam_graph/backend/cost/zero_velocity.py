@@ -23,7 +23,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0
 """Disparity over the standstill limit above which a feature is dynamic while the platform is
@@ -44,6 +44,16 @@ _SAMPLING_SIGMAS = 3.0
 
 _NO_NOISE = 1e-6
 """Probability that noise alone moves a feature as far as one that counts as dynamic."""
+
+_GAINED_SPEED = 0.02
+"""Change of velocity, beyond what the noise of the IMU gives, that ends a standstill, m/s. It sees
+a take-off that noisy images do not see yet."""
+
+_BRIDGE = 2.0
+"""Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
+
+_MAX_NOISE_PX = 3.0
+"""Noisier tracks are wrong matches, and tell nothing."""
 
 _NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
@@ -164,7 +174,7 @@ class StandstillDetector:
         move nearly as much as the median. Where the noise exceeds it, it tells nothing.
         """
         ids, motion = _common_motion_px(before, now)
-        if len(ids) < MIN_FEATURES:
+        if len(ids) < MIN_FEATURES or self.noise_px > _MAX_NOISE_PX:
             return False
         least, median = np.quantile(np.linalg.norm(motion, axis=1), [_STATIC_SHARE, 0.5])
         motion_px = self._max_disparity_px
@@ -194,7 +204,26 @@ class StandstillDetector:
         return bool(
             np.max(np.std(recent.gyro, axis=0)) < self._config.max_gyro_std
             and np.max(np.std(recent.accel, axis=0)) < self._config.max_accel_std
+            and _gained_speed(recent) < _GAINED_SPEED
         )
+
+
+def _gained_speed(imu: ImuData) -> float:
+    """Largest change of velocity within some samples that noise does not explain, m/s.
+
+    At a standstill the specific force is constant but for noise. So the cumulative sum of its
+    deviations from the mean is a Brownian bridge, of the size that the noise of the samples gives
+    it (CUSUM; Page 1954). The noise is that of their differences, which hardly know slow changes.
+    """
+    if len(imu) < 3:
+        return 0.0
+    durations_s = np.diff(imu.stamps_ns)[:, None] * 1e-9
+    force = 0.5 * (imu.accel[1:] + imu.accel[:-1])
+    mean = np.sum(force * durations_s, axis=0) / np.sum(durations_s)
+    gained = np.max(np.abs(np.cumsum((force - mean) * durations_s, axis=0)), axis=0)
+    noise = np.std(np.diff(imu.accel, axis=0), axis=0) / np.sqrt(2.0)
+    explained = _BRIDGE * noise * np.sqrt(np.sum(durations_s**2))
+    return float(np.max(gained - explained))
 
 
 def _rayleigh(share: float) -> float:
