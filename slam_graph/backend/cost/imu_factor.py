@@ -43,8 +43,12 @@ SIZE_TIME_S = 2.0
 """Time constant of the mean squared correction."""
 RESPONSE_TIME_S = 1.0
 """Time in which the variance grows by a factor of e if squares are twice as large as expected."""
-_WALK_FALL_TIME_S = 10.0
-"""The same for random walks while they fall back."""
+_SLOW_FALL_TIME_S = 10.0
+"""The same for random walks and the accelerometer while they fall back."""
+_FIRST_ACCEL, _FIRST_ACCEL_WALK = 3.0, 2.0
+"""Factors on the densities of the accelerometer at the start, where nothing is learned yet. Motors
+shake it, and errors of its scale and alignment show in the first motions: a start that believes the
+data sheet takes both for a tilt."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0
@@ -64,16 +68,17 @@ class DensityScale:
         factor: on the noise density, at least one.
     """
 
-    def __init__(self, fall_time_s: float = RESPONSE_TIME_S) -> None:
-        """Begin with the calibrated density.
+    def __init__(self, fall_time_s: float = RESPONSE_TIME_S, factor: float = 1.0) -> None:
+        """Begin with a multiple of the calibrated density.
 
         Args:
             fall_time_s: takes the place of `RESPONSE_TIME_S` while the factor falls.
+            factor: at the start.
         """
         self._fall_time_s = fall_time_s
         self._direction = np.zeros(3)
         self._size = 1.0
-        self.factor = 1.0
+        self.factor = factor
 
     def observe(self, correction: FloatArray, covariance: FloatArray, dt_s: float) -> None:
         """Update the factor by the correction of one step.
@@ -105,10 +110,11 @@ class DynamicsNoise:
     def __init__(self, imu: ImuNoise, config: NoiseConfig) -> None:
         self._imu = imu
         self._config = config
+        adapts = config.adaptive.enabled
         self._gyro = DensityScale()
-        self._accel = DensityScale()
-        self._gyro_walk = DensityScale(_WALK_FALL_TIME_S)
-        self._accel_walk = DensityScale(_WALK_FALL_TIME_S)
+        self._accel = DensityScale(_SLOW_FALL_TIME_S, _FIRST_ACCEL if adapts else 1.0)
+        self._gyro_walk = DensityScale(_SLOW_FALL_TIME_S)
+        self._accel_walk = DensityScale(_SLOW_FALL_TIME_S, _FIRST_ACCEL_WALK if adapts else 1.0)
 
     def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
         """Current parameters, with all densities multiplied by `scale`."""
