@@ -112,6 +112,8 @@ def _key(
 
 _ANCHOR_SIGMA = 1e-3
 """Prior on position (m) and yaw (rad) of the anchor, which are unobservable: it fixes the gauge."""
+DEFINED_SIGMA = 1e-6
+"""The same where position and yaw of the anchor define the world."""
 _UNKNOWN_TILT_RAD = 10.0
 """Prior on roll and pitch of the anchor, which gravity determines: none."""
 GYRO_BIAS_SIGMA = 0.05
@@ -163,20 +165,48 @@ class RecordingFactors:
             factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return _graph(factors)
 
-    def _prior(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
-        """Priors on position and yaw of the anchor, and a loose one on the first bias."""
-        pose, bias = values.atPose3(X(self._anchor)), values.atConstantBias(B(0))
-        sigmas = np.diag([_UNKNOWN_TILT_RAD, _UNKNOWN_TILT_RAD, _ANCHOR_SIGMA])
+    def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
+        """A prior that fixes position and yaw of the anchor.
+
+        Args:
+            values: with the pose of the anchor.
+            sigma: of position (m) and yaw (rad); by default so small that they define the world.
+        """
+        pose = values.atPose3(X(self._anchor))
+        sigmas = np.diag([_UNKNOWN_TILT_RAD, _UNKNOWN_TILT_RAD, sigma])
         root = pose.rotation().matrix().T @ sigmas
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = root @ root.T
-        covariance[3:, 3:] = np.eye(3) * _ANCHOR_SIGMA**2
-        gauge = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        covariance[3:, 3:] = np.eye(3) * sigma**2
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        return gtsam.PriorFactorPose3(X(self._anchor), pose, noise)
+
+    def densities(self) -> FloatArray:
+        """(K-1, 2) noise densities of gyroscope and accelerometer between the keyframes."""
+        imu, count = self._rig.imu, len(self._segment.keyframes) - 1
+        factors = np.array([self._noise_factors(k) for k in range(count)]).reshape(-1, 3)
+        white = np.array([imu.gyro_noise_density, imu.accel_noise_density])
+        return np.asarray(factors[:, :1] * factors[:, 1:] * white)
+
+    def _prior(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
+        """Priors on position and yaw of the anchor, and a loose one on the first bias."""
+        bias = values.atConstantBias(B(0))
         loose = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3))
         return [
-            gtsam.PriorFactorPose3(X(self._anchor), pose, gauge),
+            self.gauge(values, _ANCHOR_SIGMA),
             gtsam.PriorFactorConstantBias(B(0), bias, loose),
         ]
+
+    def _noise_factors(self, k: int) -> tuple[float, float, float]:
+        """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
+        imu, noise = self._segment.imu, self._backend.noise
+        start_ns, end_ns = self._segment.keyframe_stamps_ns[k : k + 2].tolist()
+        gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
+        scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
+        i, j = self._segment.keyframes[k : k + 2]
+        # variances of non-stationary noise add up
+        gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
+        return scale, gyro, accel
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
@@ -185,11 +215,7 @@ class RecordingFactors:
         stamps_ns = self._segment.keyframe_stamps_ns.tolist()
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
-            gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-            scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
-            # variances of non-stationary noise add up
-            gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-            params = self._rig.imu.preintegration_params(noise.gravity, scale, gyro, accel)
+            params = self._rig.imu.preintegration_params(noise.gravity, *self._noise_factors(k))
             pim = imu.between(start_ns, end_ns).preintegrated(values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():

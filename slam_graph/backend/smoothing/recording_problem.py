@@ -9,6 +9,7 @@ without outliers, with features triangulated and IMU samples preintegrated anew.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,10 +36,18 @@ from slam_graph.backend.smoothing.recording_segment import (
     with_gtsam_cameras,
 )
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.state_covariances import (
+    FrameInterpolation,
+    aligned_covariances,
+    frame_covariances,
+    keyframe_covariances,
+)
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
+
+logger = logging.getLogger(__name__)
 
 OUTLIER_WIDTH = 3.7
 """Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
@@ -124,12 +133,15 @@ class AdjustedSegment:
     """The minimum of the cost of a segment.
 
     Attributes:
-        states: of every frame.
+        states: of every frame, with covariances relative to position and yaw of the anchor if they
+            could be computed.
         figures: of the minimum.
+        aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
+    aligned: FloatArray | None
 
 
 class BundleAdjustment:
@@ -189,7 +201,8 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        return AdjustedSegment(self._states(), figures)
+        states, aligned = self._with_covariances(self._states())
+        return AdjustedSegment(states, figures, aligned)
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -286,7 +299,8 @@ class BundleAdjustment:
         graph = gtsam.NonlinearFactorGraph(inertial)
         graph.push_back(self._factors.projections(obs, variances, self._sigma_px))
         params = gtsam.LevenbergMarquardtParams()
-        params.setOrdering(gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
+        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+        params.setOrdering(ordering)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
         before = cost = optimizer.error()
         for _ in range(self._config.max_iterations):
@@ -300,7 +314,29 @@ class BundleAdjustment:
         if not math.isfinite(cost):
             raise EstimationError("the cost of the bundle adjustment is not finite")
         self._values = optimizer.values()
+        self._solved = graph, ordering
         return before, cost, inertial.error(self._values)
+
+    def _with_covariances(self, states: list[NavState]) -> tuple[list[NavState], FloatArray | None]:
+        """The states of all frames with their covariances, and pose covariances after alignment."""
+        segment = self._segment
+        stamps_ns, keyframes = segment.stamps_ns, segment.keyframes
+        graph, ordering = self._solved
+        graph.push_back(self._factors.gauge(self._values))
+        weights = np.bincount(nearest_keyframe(stamps_ns, keyframes), minlength=len(keyframes))
+        try:
+            known = keyframe_covariances(graph, self._values, ordering, weights / len(stamps_ns))
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            logger.warning("no covariances: %s", " ".join(str(error).split())[:200])
+            return states, None
+        frames = FrameInterpolation.of(stamps_ns, keyframes, self._factors.densities())
+        poses = np.array([state.world_T_body.matrix() for state in states])
+        rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+        covariances = frame_covariances(known, frames, rotations)
+        states = [
+            replace(state, covariance=P) for state, P in zip(states, covariances, strict=True)
+        ]
+        return states, aligned_covariances(known, frames, rotations, positions)
 
     def _states(self) -> list[NavState]:
         """The states of all frames."""
