@@ -112,7 +112,7 @@ def _key(
 
 _ANCHOR_SIGMA = 1e-3
 """Prior on position (m) and yaw (rad) of the anchor, which are unobservable: it fixes the gauge."""
-DEFINED_SIGMA = 1e-6
+DEFINED_SIGMA = 1e-5
 """The same where position and yaw of the anchor define the world."""
 _UNKNOWN_TILT_RAD = 10.0
 """Prior on roll and pitch of the anchor, which gravity determines: none."""

@@ -327,7 +327,7 @@ class BundleAdjustment:
         try:
             known = keyframe_covariances(graph, self._values, ordering, weights / len(stamps_ns))
         except (RuntimeError, np.linalg.LinAlgError) as error:
-            logger.warning("no covariances: %s", " ".join(str(error).split())[:200])
+            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return states, None
         frames = FrameInterpolation.of(stamps_ns, keyframes, self._factors.densities())
         poses = np.array([state.world_T_body.matrix() for state in states])
