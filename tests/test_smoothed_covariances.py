@@ -137,7 +137,9 @@ def test_between_keyframes_errors_are_interpolated_and_the_imu_adds_a_bridge() -
     white = rng.normal(0.0, np.sqrt(dt), (2, draws, steps))
     walk, speed = gyro * white[0].cumsum(axis=1), accel * white[1].cumsum(axis=1)
     place = (speed - 0.5 * accel * white[1]).cumsum(axis=1) * dt
-    known = KeyframeCovariances(np.zeros((1, 30, 30)), None, np.zeros((4, 4)), np.zeros(3))
+    known = KeyframeCovariances(
+        np.tile(np.eye(3), (2, 1, 1)), np.zeros((1, 30, 30)), None, np.zeros((4, 4)), np.zeros(3)
+    )
     stamps = np.arange(steps + 1) * 10**6
     densities = np.array([[gyro, accel]])
     frames = FrameInterpolation.of(stamps * 5, np.array([0, steps]), densities)

@@ -32,6 +32,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors, variance_ratios
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.sensors import Rig
@@ -131,6 +132,9 @@ class RecordingFactors:
         rig: calibrated sensors, with cameras that GTSAM has (`with_gtsam_cameras`).
         backend: noise.
         config: the robust loss.
+
+    Attributes:
+        noise: factors on the noise of the IMU beyond those that the causal run learned.
     """
 
     def __init__(
@@ -143,6 +147,7 @@ class RecordingFactors:
     ) -> None:
         self._segment, self._anchor, self._rig = segment, anchor, rig
         self._backend, self._config = backend, config
+        self.noise = ImuNoiseFactors()
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
@@ -197,25 +202,44 @@ class RecordingFactors:
             gtsam.PriorFactorConstantBias(B(0), bias, loose),
         ]
 
+    def learn_noise(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, pairs: FloatArray
+    ) -> None:
+        """Estimate the noise of the IMU from the residuals at the minimum.
+
+        Args:
+            graph: the cost, with the factors of `inertial`.
+            values: the minimum.
+            pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes.
+        """
+        found = [graph.at(i) for i in range(graph.size())]
+        factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
+        used = [k for k in range(len(factors)) if not self._in_gap(k)]
+        ratios = variance_ratios([factors[k] for k in used], values, [pairs[k] for k in used])
+        self.noise = self.noise.times(ratios)
+
+    def _in_gap(self, k: int) -> bool:
+        """Whether IMU samples are missing after keyframe k."""
+        start_ns, end_ns = self._segment.keyframe_stamps_ns[k : k + 2].tolist()
+        return self._segment.imu.largest_gap_s(start_ns, end_ns) > self._backend.noise.max_imu_gap_s
+
     def _noise_factors(self, k: int) -> tuple[float, float, float]:
         """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
-        imu, noise = self._segment.imu, self._backend.noise
-        start_ns, end_ns = self._segment.keyframe_stamps_ns[k : k + 2].tolist()
-        gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-        scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
+        scale = self._backend.noise.imu_scale * (IMU_GAP_SCALE if self._in_gap(k) else 1.0)
         i, j = self._segment.keyframes[k : k + 2]
         # variances of non-stationary noise add up
-        gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-        return scale, gyro, accel
+        learned = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
+        return (scale, *self.noise.white(*learned.tolist()))
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
         factors: list[gtsam.NonlinearFactor] = []
         imu, noise = self._segment.imu, self._backend.noise
+        imu_noise = self.noise.walks(self._rig.imu)
         stamps_ns = self._segment.keyframe_stamps_ns.tolist()
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
-            params = self._rig.imu.preintegration_params(noise.gravity, *self._noise_factors(k))
+            params = imu_noise.preintegration_params(noise.gravity, *self._noise_factors(k))
             pim = imu.between(start_ns, end_ns).preintegrated(values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():

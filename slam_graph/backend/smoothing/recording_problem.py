@@ -38,6 +38,7 @@ from slam_graph.backend.smoothing.recording_segment import (
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
+    KeyframeCovariances,
     aligned_covariances,
     frame_covariances,
     keyframe_covariances,
@@ -189,6 +190,12 @@ class BundleAdjustment:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
+        known = self._covariances()
+        if known is not None and self._config.learn_imu_noise:
+            self._factors.learn_noise(self._solved[0], self._values, known.pairs)
+            points = stacked_points(self._values, obs.ids.tolist())
+            _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
+            known = self._covariances()
         dynamics = 15 * max(len(self._segment.keyframes) - 1, 1)
         figures = AdjustmentFigures(
             keyframes=len(self._segment.keyframes),
@@ -201,8 +208,7 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned = self._with_covariances(self._states())
-        return AdjustedSegment(states, figures, aligned)
+        return self._adjusted(figures, known)
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -317,26 +323,36 @@ class BundleAdjustment:
         self._solved = graph, ordering
         return before, cost, inertial.error(self._values)
 
-    def _with_covariances(self, states: list[NavState]) -> tuple[list[NavState], FloatArray | None]:
-        """The states of all frames with their covariances, and pose covariances after alignment."""
-        segment = self._segment
-        stamps_ns, keyframes = segment.stamps_ns, segment.keyframes
-        graph, ordering = self._solved
+    def _covariances(self) -> KeyframeCovariances | None:
+        """Covariances at the minimum; None if it does not determine all variables."""
+        segment, (graph, ordering) = self._segment, self._solved
+        graph = gtsam.NonlinearFactorGraph(graph)
         graph.push_back(self._factors.gauge(self._values))
-        weights = np.bincount(nearest_keyframe(stamps_ns, keyframes), minlength=len(keyframes))
+        nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
+        weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
-            known = keyframe_covariances(graph, self._values, ordering, weights / len(stamps_ns))
+            return keyframe_covariances(graph, self._values, ordering, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
-            return states, None
-        frames = FrameInterpolation.of(stamps_ns, keyframes, self._factors.densities())
+            return None
+
+    def _adjusted(
+        self, figures: AdjustmentFigures, known: KeyframeCovariances | None
+    ) -> AdjustedSegment:
+        """The states of all frames, with their covariances if they are known."""
+        states, segment = self._states(), self._segment
+        if known is None:
+            return AdjustedSegment(states, figures, None)
+        densities = self._factors.densities()
+        frames = FrameInterpolation.of(segment.stamps_ns, segment.keyframes, densities)
         poses = np.array([state.world_T_body.matrix() for state in states])
         rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
         covariances = frame_covariances(known, frames, rotations)
         states = [
             replace(state, covariance=P) for state, P in zip(states, covariances, strict=True)
         ]
-        return states, aligned_covariances(known, frames, rotations, positions)
+        aligned = aligned_covariances(known, frames, rotations, positions)
+        return AdjustedSegment(states, figures, aligned)
 
     def _states(self) -> list[NavState]:
         """The states of all frames."""

@@ -43,16 +43,20 @@ _LEAST_EXTENT_M = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeCovariances:
-    """What is known of the errors of K keyframes, with axes of the world.
+    """What is known of the errors of K keyframes.
 
     Attributes:
-        pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes.
-        alignment: (K, 6, 4) covariances of poses and g, the part of all errors that an alignment
-            in position and yaw takes away; None if positions determine no yaw.
+        rotations: (K, 3, 3) world_R_body.
+        pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes, in the order of
+            `NavState.covariance`.
+        alignment: (K, 6, 4) covariances of poses, with axes of the world, and g, the part of all
+            errors that an alignment in position and yaw takes away; None if positions determine no
+            yaw.
         aligned_away: (4, 4) covariance of g: position, yaw.
         centre: (3,) mean position, about which the yaw of g turns.
     """
 
+    rotations: FloatArray
     pairs: FloatArray
     alignment: FloatArray | None
     aligned_away: FloatArray
@@ -115,24 +119,24 @@ def keyframe_covariances(
     numbers = {key(k): k for key in (X, V, B) for k in range(count)}
     cliques = cliques_of(graph.linearize(values), ordering, numbers)
     rotations, positions = stacked_poses(values, range(count))
-    pairs = _pairs(cliques, numbers, rotations)
+    pairs = _pairs(cliques, numbers, count)
     centre = weights @ positions
     arms = np.cross([0.0, 0.0, 1.0], positions - centre)
     extent = float(weights @ np.sum(arms**2, axis=1))
     if extent < _LEAST_EXTENT_M**2:
-        return KeyframeCovariances(pairs, None, np.zeros((4, 4)), centre)
+        return KeyframeCovariances(rotations, pairs, None, np.zeros((4, 4)), centre)
     W = np.zeros((count, 6, 4))  # g = Wᵀ e of all errors e, with axes of the world
     W[:, 3:, :3] = weights[:, None, None] * np.eye(3)
     W[:, 3:, 3] = weights[:, None] * arms / extent
     turned = _turned(rotations, W, transpose=True)
     found = solved(cliques, {X(k): turned[k] for k in range(count)})
     C = _turned(rotations, np.array([found[X(k)] for k in range(count)]))
-    return KeyframeCovariances(pairs, C, np.einsum("kij,kil->jl", W, C), centre)
+    return KeyframeCovariances(rotations, pairs, C, np.einsum("kij,kil->jl", W, C), centre)
 
 
-def _pairs(cliques: list[Clique], numbers: Mapping[int, int], rotations: FloatArray) -> FloatArray:
-    """The joint covariances (K-1, 30, 30) of neighbouring keyframes, with axes of the world."""
-    pairs = np.full((len(rotations) - 1, 2 * _ERROR, 2 * _ERROR), np.nan)
+def _pairs(cliques: list[Clique], numbers: Mapping[int, int], count: int) -> FloatArray:
+    """The joint covariances (K-1, 30, 30) of neighbouring keyframes."""
+    pairs = np.full((count - 1, 2 * _ERROR, 2 * _ERROR), np.nan)
     missing = np.ones(len(pairs), np.bool_)
     for clique, P in joint_covariances(cliques):
         ours = {numbers[key] for key in clique.frontals if key in numbers}
@@ -145,12 +149,6 @@ def _pairs(cliques: list[Clique], numbers: Mapping[int, int], rotations: FloatAr
                 rows = np.concatenate([np.arange(c.start, c.stop) for c in own])
                 pairs[k] = P[np.ix_(rows, rows)]
                 missing[k] = False
-    T = np.zeros((len(rotations), _ERROR, _ERROR))
-    T[:, _ROTATION, _ROTATION] = T[:, _POSITION, _POSITION] = rotations
-    T[:, 6:, 6:] = np.eye(9)
-    for half, turn in ((slice(0, 15), T[:-1]), (slice(15, 30), T[1:])):
-        pairs[:, half] = turn @ pairs[:, half]
-        pairs[:, :, half] = pairs[:, :, half] @ turn.transpose(0, 2, 1)
     return pairs
 
 
@@ -251,9 +249,21 @@ def _moved(state: NavState, unknown: FloatArray, link: NavState) -> NavState:
     return replace(state, covariance=state.covariance + N @ unknown @ N.T)
 
 
+def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
+    """The joint covariances (K-1, 30, 30) of neighbouring keyframes, with axes of the world."""
+    T = np.zeros((len(known.rotations), _ERROR, _ERROR))
+    T[:, _ROTATION, _ROTATION] = T[:, _POSITION, _POSITION] = known.rotations
+    T[:, 6:, 6:] = np.eye(9)
+    pairs = known.pairs.copy()
+    for half, turn in ((slice(0, 15), T[:-1]), (slice(15, 30), T[1:])):
+        pairs[:, half] = turn @ pairs[:, half]
+        pairs[:, :, half] = pairs[:, :, half] @ turn.transpose(0, 2, 1)
+    return pairs
+
+
 def _in_world(known: KeyframeCovariances, frames: FrameInterpolation) -> FloatArray:
     """Covariances (N, 15, 15) of all frames, with axes of the world."""
-    a, pairs = frames.part[:, None, None], known.pairs[frames.before]
+    a, pairs = frames.part[:, None, None], _with_axes_of_the_world(known)[frames.before]
     first, second = slice(0, _ERROR), slice(_ERROR, 2 * _ERROR)
     cross = pairs[:, first, second]
     P = (1.0 - a) ** 2 * pairs[:, first, first] + a**2 * pairs[:, second, second]
