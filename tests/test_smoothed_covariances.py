@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 
+from benchmarks.policy_product import FLIGHT
+from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.smoothing.bayes_tree import cliques_of, joint_covariances, solved
 from slam_graph.backend.smoothing.state_covariances import (
@@ -20,8 +22,17 @@ from slam_graph.backend.smoothing.state_covariances import (
     keyframe_covariances,
 )
 from slam_graph.backend.solve.state import dim, stacked_poses
+from slam_graph.config import load_config
+from slam_graph.evaluation.consistency import mean_bounds
+from slam_graph.experiment.tasks import find_sources
+from slam_graph.pipeline.run_recording import run
+from slam_graph.results.run_result import RunResult
 
 KEYFRAMES, FEATURES = 6, 8
+FLIGHTS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 5)
+DURATION_S = 5.0
+FALSE_ALARMS = 1e-3
+"""Probability that a mean leaves its band although all covariances are right."""
 
 
 def random_values(rng: np.random.Generator) -> gtsam.Values:
@@ -148,3 +159,43 @@ def test_between_keyframes_errors_are_interpolated_and_the_imu_adds_a_bridge() -
     for row, errors in ((0, walk), (3, place), (6, speed)):
         sampled = np.var(errors - part * errors[:, -1:], axis=0)
         np.testing.assert_allclose(P[1:, row, row], sampled, rtol=0.15, atol=1e-5 * sampled.max())
+
+
+def flown(seed: int) -> RunResult:
+    """A run on a simulated flight with stereo cameras, and exactly the noise that is assumed."""
+    (source,) = find_sources(["sim:figure8"], DURATION_S, FLIGHT)
+    return run(source.open(seed, 2), load_config(algorithm="msckf", overrides=["cameras=2"]))
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[RunResult]:
+    return [flown(seed) for seed in FLIGHTS]
+
+
+@pytest.mark.parametrize("part", ["orientation", "position"])
+def test_errors_are_as_large_as_the_covariances_say(flights: list[RunResult], part: str) -> None:
+    """Frames of one flight are correlated, so the flights are the samples."""
+    low, high = mean_bounds(3, len(FLIGHTS), 1.0 - FALSE_ALARMS)
+    means = [flight.metrics["final_ba"]["nees"][part]["mean"] for flight in flights]
+    assert low < np.mean(means) < high, means
+
+
+def test_the_whole_recording_leaves_no_more_uncertain_than_its_past(
+    flights: list[RunResult],
+) -> None:
+    """Relative to the first state, from a second on, as the smoothed one is exact at a keyframe.
+
+    Biases are left out: the adjustment does not know those of the given start.
+    """
+    ratios = []
+    for flight in flights:
+        smoothed, sigmas = flight.smoothed, flight.smoothed_sigmas
+        assert smoothed is not None
+        assert sigmas is not None
+        late = flight.trajectory.stamps_ns > flight.trajectory.stamps_ns[0] + 10**9
+        causal = flight.sigmas[late]
+        rows = np.isin(smoothed.stamps_ns, flight.trajectory.stamps_ns[late])
+        for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+            before = np.linalg.norm(causal[:, part], axis=1)
+            ratios.append(np.linalg.norm(sigmas[rows][:, part], axis=1) / before)
+    assert np.max(ratios) < 1.1
