@@ -39,9 +39,8 @@ from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
     KeyframeCovariances,
-    aligned_covariances,
-    frame_covariances,
     keyframe_covariances,
+    with_covariances,
 )
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
@@ -183,6 +182,7 @@ class BundleAdjustment:
         Raises:
             EstimationError: if there is no minimum.
         """
+        keyframes = self._segment.keyframes
         before = self._minimize_loosely()
         points, good = self._triangulated(self._candidates)
         points, good = self._with_estimates(self._candidates, points, good)
@@ -196,19 +196,23 @@ class BundleAdjustment:
             points = stacked_points(self._values, obs.ids.tolist())
             _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
             known = self._covariances()
-        dynamics = 15 * max(len(self._segment.keyframes) - 1, 1)
         figures = AdjustmentFigures(
-            keyframes=len(self._segment.keyframes),
+            keyframes=len(keyframes),
             features=len(obs.ids),
             observations=len(obs),
             iterations=self.iterations,
             cost_before=before,
             cost_after=cost,
-            imu_residual=float(np.sqrt(2.0 * imu_cost / dynamics)),
+            imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        return self._adjusted(figures, known)
+        states, aligned = self._states(), None
+        if known is not None:
+            densities = self._factors.densities()
+            frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
+            states, aligned = with_covariances(states, known, frames)
+        return AdjustedSegment(states, figures, aligned)
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -335,24 +339,6 @@ class BundleAdjustment:
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None
-
-    def _adjusted(
-        self, figures: AdjustmentFigures, known: KeyframeCovariances | None
-    ) -> AdjustedSegment:
-        """The states of all frames, with their covariances if they are known."""
-        states, segment = self._states(), self._segment
-        if known is None:
-            return AdjustedSegment(states, figures, None)
-        densities = self._factors.densities()
-        frames = FrameInterpolation.of(segment.stamps_ns, segment.keyframes, densities)
-        poses = np.array([state.world_T_body.matrix() for state in states])
-        rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
-        covariances = frame_covariances(known, frames, rotations)
-        states = [
-            replace(state, covariance=P) for state, P in zip(states, covariances, strict=True)
-        ]
-        aligned = aligned_covariances(known, frames, rotations, positions)
-        return AdjustedSegment(states, figures, aligned)
 
     def _states(self) -> list[NavState]:
         """The states of all frames."""

@@ -158,6 +158,26 @@ def _turned(rotations: FloatArray, columns: FloatArray, transpose: bool = False)
     return np.concatenate([turn @ columns[:, :3], turn @ columns[:, 3:]], axis=1)
 
 
+def with_covariances(
+    states: list[NavState], known: KeyframeCovariances, frames: FrameInterpolation
+) -> tuple[list[NavState], FloatArray | None]:
+    """The states of all frames with their covariances; pose covariances after an alignment.
+
+    Args:
+        states: of N frames.
+        known: of the keyframes.
+        frames: where the frames are among them.
+
+    Returns:
+        The states, and what `aligned_covariances` returns.
+    """
+    poses = np.array([state.world_T_body.matrix() for state in states])
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    covariances = frame_covariances(known, frames, rotations)
+    states = [replace(state, covariance=P) for state, P in zip(states, covariances, strict=True)]
+    return states, aligned_covariances(known, frames, rotations, positions)
+
+
 def frame_covariances(
     known: KeyframeCovariances, frames: FrameInterpolation, rotations: FloatArray
 ) -> FloatArray:
