@@ -3,6 +3,7 @@
 """Covariances of the smoothed trajectory: those the dense inverse, and honest."""
 
 from itertools import combinations, pairwise
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -12,7 +13,17 @@ from gtsam.symbol_shorthand import B, L, V, X
 from benchmarks.policy_product import FLIGHT
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.bayes_tree import cliques_of, joint_covariances, solved
+from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.recording_problem import (
+    BundleAdjustment,
+    SegmentStart,
+    SmoothingTask,
+)
+from slam_graph.backend.smoothing.recording_segment import read_segment
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
     KeyframeCovariances,
@@ -27,6 +38,13 @@ from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.experiment.tasks import find_sources
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
+from slam_graph.simulation.simulation_config import (
+    FlightConfig,
+    SimulatedImuConfig,
+    SimulationConfig,
+    TrackConfig,
+)
+from slam_graph.simulation.simulator import simulate
 
 KEYFRAMES, FEATURES = 6, 8
 FLIGHTS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 5)
@@ -199,3 +217,32 @@ def test_the_whole_recording_leaves_no_more_uncertain_than_its_past(
             before = np.linalg.norm(causal[:, part], axis=1)
             ratios.append(np.linalg.norm(sigmas[rows][:, part], axis=1) / before)
     assert np.max(ratios) < 1.1
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_the_noise_of_the_imu_is_found_from_the_residuals(scale: float, tmp_path: Path) -> None:
+    """With noise as assumed and four times as large; walks are held by the prior redundancy."""
+    tracks = TrackConfig(features=100, pixel_sigma=0.3)
+    imu = SimulatedImuConfig(noise_scale=scale)
+    flight = SimulationConfig(
+        cameras=2,
+        duration_s=20.0,
+        rate_hz=10.0,
+        tracks=tracks,
+        imu=imu,
+        flight=FlightConfig(hover_s=0.0),
+    )
+    sequence, config = simulate(flight), FinalBaConfig()
+    backend = BackendConfig()
+    with FrameLog.recording(sequence.rig, config, tmp_path) as log:
+        for packet in sequence.packets():
+            log.add(packet.imu, packet.frame, (1.0, 1.0))
+    segment = read_segment(log, log.keyframes, sequence.rig, backend.zero_velocity)
+    task = SmoothingTask(sequence.rig, backend, config)
+    truth = sequence.groundtruth()
+    stamps_ns = segment.keyframe_stamps_ns
+    states = states_at(truth, stamps_ns, segment.imu, task.preintegration)
+    problem = BundleAdjustment(SegmentStart(segment, states, 0), task, lambda _: None)
+    problem.solve()
+    found = problem.imu_noise
+    np.testing.assert_allclose([found.gyro, found.accel], scale, rtol=0.25)

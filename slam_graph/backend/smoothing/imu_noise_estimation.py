@@ -13,6 +13,7 @@ whose denominator, the redundancy, is how many of the residuals the images can c
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +26,8 @@ from slam_graph.sensors import ImuNoise
 
 _ROWS = (slice(0, 3), slice(6, 9), slice(9, 12), slice(12, 15))
 """Rows of a residual that show each kind of noise: rotation, velocity, both biases."""
+_SAME_FACTOR = 1.2
+"""Noise densities whose ratio is below this are taken for the same."""
 _PRIOR_REDUNDANCY = 10.0
 """Redundancy that the assumed noise counts for: what the images cannot tell stays as it is."""
 
@@ -59,6 +62,19 @@ class ImuNoiseFactors:
         """Factors on white noise, given those that were learned on the way; at least one."""
         found = np.clip([self.gyro * gyro, self.accel * accel], 1.0, MAX_FACTOR)
         return float(found[0]), float(found[1])
+
+    def near(self, other: ImuNoiseFactors, learned: list[float]) -> bool:
+        """Whether two sets of factors are the same but for what residuals can tell.
+
+        Args:
+            other: the other set.
+            learned: factors on white noise of gyroscope and accelerometer from the causal run.
+        """
+        own, others = (
+            np.array([*noise.white(*learned), noise.accel_walk, noise.gyro_walk])
+            for noise in (self, other)
+        )
+        return bool(np.all(np.abs(np.log(own / others)) < math.log(_SAME_FACTOR)))
 
     def walks(self, imu: ImuNoise) -> ImuNoise:
         """The noise with the factors on random walks."""

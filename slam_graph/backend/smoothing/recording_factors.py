@@ -204,19 +204,34 @@ class RecordingFactors:
 
     def learn_noise(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, pairs: FloatArray
-    ) -> None:
+    ) -> bool:
         """Estimate the noise of the IMU from the residuals at the minimum.
+
+        Intervals of standstill say nothing: the zero-velocity factors are looser than it is.
 
         Args:
             graph: the cost, with the factors of `inertial`.
             values: the minimum.
             pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes.
+
+        Returns:
+            Whether it is another one than assumed; otherwise what was assumed stays.
         """
         found = [graph.at(i) for i in range(graph.size())]
         factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
-        used = [k for k in range(len(factors)) if not self._in_gap(k)]
-        ratios = variance_ratios([factors[k] for k in used], values, [pairs[k] for k in used])
-        self.noise = self.noise.times(ratios)
+        moving = [k for k in range(len(factors)) if not self._in_gap(k) and not self._still(k)]
+        ratios = variance_ratios([factors[k] for k in moving], values, [pairs[k] for k in moving])
+        noise = self.noise.times(ratios)
+        learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
+        if noise.near(self.noise, learned):
+            return False
+        self.noise = noise
+        return True
+
+    def _still(self, k: int) -> bool:
+        """Whether the platform stands still at any time between keyframe k and the next one."""
+        i, j = self._segment.keyframes[k : k + 2]
+        return bool(self._segment.still[i : j + 1].any())
 
     def _in_gap(self, k: int) -> bool:
         """Whether IMU samples are missing after keyframe k."""

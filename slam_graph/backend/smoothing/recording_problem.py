@@ -22,6 +22,7 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
@@ -59,6 +60,8 @@ _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _MAX_LAMBDA = 1e5
 """Steps end when the damping of Levenberg-Marquardt exceeds this."""
+_NOISE_ROUNDS = 3
+"""The noise of the IMU is estimated this many times at most, each at the minimum with the last."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -176,6 +179,11 @@ class BundleAdjustment:
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
             self._values.insert(B(k), bias)
 
+    @property
+    def imu_noise(self) -> ImuNoiseFactors:
+        """Estimated factors on the noise of the IMU, beyond those that the causal run learned."""
+        return self._factors.noise
+
     def solve(self) -> AdjustedSegment:
         """Minimise, remove outliers, and minimise again.
 
@@ -191,8 +199,11 @@ class BundleAdjustment:
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
         known = self._covariances()
-        if known is not None and self._config.learn_imu_noise:
-            self._factors.learn_noise(self._solved[0], self._values, known.pairs)
+        for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
+            if known is None or not self._factors.learn_noise(
+                self._solved[0], self._values, known.pairs
+            ):
+                break
             points = stacked_points(self._values, obs.ids.tolist())
             _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
             known = self._covariances()
