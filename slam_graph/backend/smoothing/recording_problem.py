@@ -198,15 +198,6 @@ class BundleAdjustment:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
-        known = self._covariances()
-        for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
-            if known is None or not self._factors.learn_noise(
-                self._solved[0], self._values, known.pairs
-            ):
-                break
-            points = stacked_points(self._values, obs.ids.tolist())
-            _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
-            known = self._covariances()
         figures = AdjustmentFigures(
             keyframes=len(keyframes),
             features=len(obs.ids),
@@ -219,11 +210,30 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
         )
         states, aligned = self._states(), None
+        known = self._with_learned_noise(obs, variances)
         if known is not None:
             densities = self._factors.densities()
             frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
             states, aligned = with_covariances(states, known, frames)
         return AdjustedSegment(states, figures, aligned)
+
+    def _with_learned_noise(
+        self, obs: Observations, variances: FloatArray
+    ) -> KeyframeCovariances | None:
+        """Covariances at the minimum under the noise of the IMU that residuals show.
+
+        The states that are reported are those under the noise that the causal run learned.
+        """
+        known = self._covariances()
+        for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
+            if known is None or not self._factors.learn_noise(
+                self._solved[0], self._values, known.pairs
+            ):
+                break
+            points = stacked_points(self._values, obs.ids.tolist())
+            self._minimize(obs, points, variances, self._config.tolerance)
+            known = self._covariances()
+        return known
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.

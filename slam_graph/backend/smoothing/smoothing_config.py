@@ -46,8 +46,8 @@ class FinalBaConfig(Settings):
     learn_pixel_sigma: bool = expert(True)
     """Whether the noise of the tracks is estimated; noise.pixel_sigma is then an upper bound."""
     learn_imu_noise: bool = expert(True)
-    """Whether the noise of the IMU is estimated from the residuals at the minimum, which is then
-    sought anew; the noise of the calibration is a lower bound."""
+    """Whether covariances use the noise of the IMU that residuals show; the calibrated one is a
+    lower bound. The trajectory does not change."""
     max_iterations: int = expert(20, ge=1)
     """Largest number of Levenberg-Marquardt steps, before outliers are removed and after."""
     tolerance: float = expert(1e-4, gt=0)
