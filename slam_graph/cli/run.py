@@ -67,6 +67,10 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
+    smoothed_nees = (metrics["final_ba"] or {}).get("nees")
+    if smoothed_nees and "unavailable" not in smoothed_nees:
+        typer.echo("")
+        echo_table(_consistency(smoothed_nees, "NEES smoothed"))
     if metrics["nis"]:
         typer.echo("")
         echo_table(_innovations(metrics["nis"]))
@@ -154,9 +158,9 @@ def _accuracy(accuracy: _Table, title: str = "alignment") -> Iterator[tuple[str,
         )
 
 
-def _consistency(nees: _Table) -> Iterator[tuple[str, ...]]:
+def _consistency(nees: _Table, title: str = "NEES") -> Iterator[tuple[str, ...]]:
     """Mean NEES beside its ideal."""
-    yield "NEES", "mean", "ideal", "inside 95% bounds"
+    yield title, "mean", "ideal", "inside 95% bounds"
     for name in ("orientation", "position", "pose"):
         row = nees[name]
         yield name, number(row["mean"], 2), str(row["ideal_mean"]), f"{row['inside_bounds']:.0%}"

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
 from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nees, ratio_bounds
@@ -46,7 +47,12 @@ def accuracy_report(reference: Trajectory, estimate: Trajectory) -> Table:
     }
 
 
-def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) -> Table | None:
+def consistency_report(
+    truth: Trajectory,
+    history: StateHistory,
+    aligned: bool,
+    after_alignment: FloatArray | None = None,
+) -> Table | None:
     """NEES of orientation, position and pose, or None without covariances.
 
     Args:
@@ -54,8 +60,9 @@ def consistency_report(truth: Trajectory, history: StateHistory, aligned: bool) 
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
             given); otherwise it is aligned as `nees_of_run` says.
+        after_alignment: see `nees_of_run`.
     """
-    result, alignment = nees_of_run(truth, history, aligned)
+    result, alignment = nees_of_run(truth, history, aligned, after_alignment)
     if len(result.stamps_ns) == 0:
         return None
     table: Table = {"alignment": alignment, "states": len(result.pose)}
@@ -111,7 +118,10 @@ def innovation_report(columns: Mapping[str, NDArray[np.float64]]) -> Table | Non
 
 
 def nees_of_run(
-    truth: Trajectory, history: StateHistory, aligned: bool
+    truth: Trajectory,
+    history: StateHistory,
+    aligned: bool,
+    after_alignment: FloatArray | None = None,
 ) -> tuple[Nees, AlignmentMode | Literal["first_pose"]]:
     """NEES of the states of a run, and the alignment under which it was taken.
 
@@ -123,13 +133,19 @@ def nees_of_run(
         truth: the true trajectory.
         history: estimated states.
         aligned: whether the estimate lives in the world of the truth already.
+        after_alignment: (N, 6, 6) pose covariances of what is left after an alignment in yaw and
+            position over the whole run, in the body frame. Those of the states are relative to the
+            first one, where they vanish, while an error after alignment does not.
 
     Raises:
         DataError: if the two share no time.
     """
     estimate = history.trajectory()
     similarity, alignment = _truth_from_estimate(truth, estimate, aligned)
-    return nees(estimate, history.pose_covariances(), truth, similarity), alignment
+    covariances = history.pose_covariances()
+    if alignment == "yaw" and after_alignment is not None:
+        covariances = after_alignment
+    return nees(estimate, covariances, truth, similarity), alignment
 
 
 def _truth_from_estimate(

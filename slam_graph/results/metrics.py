@@ -17,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from slam_graph.arrays import FloatArray
 from slam_graph.backend import FinalBa
 from slam_graph.errors import DataError
 from slam_graph.evaluation import accuracy_report, consistency_report
@@ -81,18 +82,24 @@ def accuracy_table(truth: Trajectory | None, trajectory: Trajectory) -> Table | 
     return accuracy_report(truth, trajectory)
 
 
-def consistency_table(truth: Trajectory | None, history: StateHistory, given: bool) -> Table | None:
+def consistency_table(
+    truth: Trajectory | None,
+    history: StateHistory,
+    given: bool,
+    after_alignment: FloatArray | None = None,
+) -> Table | None:
     """NEES against ground truth, or None where there is nothing to compare.
 
     Args:
         truth: the true trajectory.
         history: the estimate with its covariances.
         given: whether the start was given in the world of the truth.
+        after_alignment: pose covariances after an alignment, as `nees_of_run` takes them.
     """
     if truth is None or len(history) == 0:
         return None
     try:
-        return consistency_report(truth, history, aligned=given)
+        return consistency_report(truth, history, given, after_alignment)
     except DataError as error:
         return {"unavailable": str(error)}
 
@@ -131,11 +138,12 @@ def coverage(start_ns: int, end_ns: int, trajectory: Trajectory) -> float:
 
 
 def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table | None:
-    """Size, cost and accuracy of the final bundle adjustment, if there was one."""
+    """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one."""
     if final_ba is None:
         return None
     accuracy = None if truth is None else accuracy_report(truth, final_ba.trajectory)
-    return {**asdict(final_ba.summary), "accuracy": accuracy}
+    nees = consistency_table(truth, final_ba.history, given=False, after_alignment=final_ba.aligned)
+    return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees}
 
 
 def loop_closure_table(

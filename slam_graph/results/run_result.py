@@ -152,6 +152,11 @@ class RunResult:
         return None if self.final_ba is None else self.final_ba.trajectory
 
     @property
+    def smoothed_sigmas(self) -> FloatArray | None:
+        """(N, 15) standard deviations of the smoothed states, as `sigmas`, if there are any."""
+        return None if self.final_ba is None else self.final_ba.history.sigmas()
+
+    @property
     def best_trajectory(self) -> Trajectory:
         """The smoothed trajectory if there is one, else the causal one."""
         return self.trajectory if self.smoothed is None else self.smoothed
@@ -252,8 +257,9 @@ class RunResult:
         files = ResultFolder(folder)
         files.text(names.TRAJECTORY, self.trajectory.tum_lines())
         files.text(names.STATES, names.state_lines(self.history))
-        if self.smoothed is not None:
-            files.text(names.SMOOTHED, self.smoothed.tum_lines())
+        if self.final_ba is not None:
+            files.text(names.SMOOTHED, self.final_ba.trajectory.tum_lines())
+            files.text(names.SMOOTHED_STATES, names.state_lines(self.final_ba.history))
         if self.loops is not None and self.loop_closed is not None:
             files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
             files.text("loops.csv", self.loops.csv_lines())

@@ -128,6 +128,12 @@ class SavedRun:
         """The trajectory of the final bundle adjustment, if there is one."""
         return _trajectory(self.folder, names.SMOOTHED)
 
+    @cached_property
+    def smoothed_sigmas(self) -> FloatArray | None:
+        """(N, 15) standard deviations of the smoothed states, as `sigmas`, if there are any."""
+        path = self.folder / names.SMOOTHED_STATES
+        return _columns(names.read_states(path)[1], names.SIGMAS) if path.is_file() else None
+
     @property
     def best_trajectory(self) -> Trajectory:
         """The smoothed trajectory if there is one, else the causal one."""

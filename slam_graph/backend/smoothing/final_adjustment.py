@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
@@ -31,6 +31,7 @@ from slam_graph.backend.smoothing.recording_problem import (
 )
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.state_covariances import in_gauge_of
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
@@ -78,12 +79,22 @@ class FinalBa:
     """The smoothed trajectory of a recording.
 
     Attributes:
-        trajectory: of all frames, with velocities and biases.
+        history: states of all frames with their covariances, which are relative to position and yaw
+            of the first state of the causal estimate; NaN if they could not be computed.
         summary: figures.
+        aligned: (N, 6, 6) pose covariances of what is left after an alignment in position and yaw
+            over all frames, in the body frame, rotation before position; None where positions
+            determine no yaw, and of a recording in several segments.
     """
 
-    trajectory: Trajectory
+    history: StateHistory
     summary: FinalBaSummary
+    aligned: FloatArray | None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames, with velocities and biases."""
+        return self.history.trajectory()
 
 
 def adjust_recording(
@@ -127,7 +138,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     longest = task.config.max_keyframes
     causal = _extended_backward(log, causal, task, report)
-    parts: list[Trajectory] = []  # final, as compact arrays
+    history = StateHistory()
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):
@@ -137,23 +148,29 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             continue
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
-        begin = 0
+        begin, link = 0, None
         if states:
             anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
             begin = int(segment.keyframes[anchor])
             joint = bisect_left(states, stamps_ns[anchor], key=_stamp_ns)
-            parts.append(_trajectory(states[:joint]))
-            start = _aligned(start, start[anchor], states[joint])
+            for state in states[:joint]:
+                history.append(state)
+            link = states[joint]
+            start = _aligned(start, start[anchor], link)
         steps = sum(part.figures.iterations for part in solved)
         progress = _progress(report, first, len(keyframes), steps)
         adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
         states = adjusted.states[begin:]
+        if link is not None:
+            states = in_gauge_of(link, states)
         solved.append(replace(adjusted, states=[]))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")
-    trajectory = _concatenated([*parts, _trajectory(states)])
+    for state in states:
+        history.append(state)
     figures = [part.figures for part in solved]
-    return FinalBa(trajectory, _summary(figures, len(trajectory), began))
+    aligned = solved[0].aligned if len(solved) == 1 else None
+    return FinalBa(history, _summary(figures, len(history), began), aligned)
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:

@@ -32,6 +32,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors, variance_ratios
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.sensors import Rig
@@ -112,6 +113,8 @@ def _key(
 
 _ANCHOR_SIGMA = 1e-3
 """Prior on position (m) and yaw (rad) of the anchor, which are unobservable: it fixes the gauge."""
+DEFINED_SIGMA = 1e-5
+"""The same where position and yaw of the anchor define the world."""
 _UNKNOWN_TILT_RAD = 10.0
 """Prior on roll and pitch of the anchor, which gravity determines: none."""
 GYRO_BIAS_SIGMA = 0.05
@@ -129,6 +132,9 @@ class RecordingFactors:
         rig: calibrated sensors, with cameras that GTSAM has (`with_gtsam_cameras`).
         backend: noise.
         config: the robust loss.
+
+    Attributes:
+        noise: factors on the noise of the IMU beyond those that the causal run learned.
     """
 
     def __init__(
@@ -141,6 +147,7 @@ class RecordingFactors:
     ) -> None:
         self._segment, self._anchor, self._rig = segment, anchor, rig
         self._backend, self._config = backend, config
+        self.noise = ImuNoiseFactors()
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
@@ -163,33 +170,91 @@ class RecordingFactors:
             factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
         return _graph(factors)
 
-    def _prior(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
-        """Priors on position and yaw of the anchor, and a loose one on the first bias."""
-        pose, bias = values.atPose3(X(self._anchor)), values.atConstantBias(B(0))
-        sigmas = np.diag([_UNKNOWN_TILT_RAD, _UNKNOWN_TILT_RAD, _ANCHOR_SIGMA])
+    def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
+        """A prior that fixes position and yaw of the anchor.
+
+        Args:
+            values: with the pose of the anchor.
+            sigma: of position (m) and yaw (rad); by default so small that they define the world.
+        """
+        pose = values.atPose3(X(self._anchor))
+        sigmas = np.diag([_UNKNOWN_TILT_RAD, _UNKNOWN_TILT_RAD, sigma])
         root = pose.rotation().matrix().T @ sigmas
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = root @ root.T
-        covariance[3:, 3:] = np.eye(3) * _ANCHOR_SIGMA**2
-        gauge = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        covariance[3:, 3:] = np.eye(3) * sigma**2
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        return gtsam.PriorFactorPose3(X(self._anchor), pose, noise)
+
+    def densities(self) -> FloatArray:
+        """(K-1, 2) noise densities of gyroscope and accelerometer between the keyframes."""
+        imu, count = self._rig.imu, len(self._segment.keyframes) - 1
+        factors = np.array([self._noise_factors(k) for k in range(count)]).reshape(-1, 3)
+        white = np.array([imu.gyro_noise_density, imu.accel_noise_density])
+        return np.asarray(factors[:, :1] * factors[:, 1:] * white)
+
+    def _prior(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
+        """Priors on position and yaw of the anchor, and a loose one on the first bias."""
+        bias = values.atConstantBias(B(0))
         loose = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3))
         return [
-            gtsam.PriorFactorPose3(X(self._anchor), pose, gauge),
+            self.gauge(values, _ANCHOR_SIGMA),
             gtsam.PriorFactorConstantBias(B(0), bias, loose),
         ]
+
+    def learn_noise(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, pairs: FloatArray
+    ) -> bool:
+        """Estimate the noise of the IMU from the residuals at the minimum.
+
+        Intervals of standstill say nothing: the zero-velocity factors are looser than it is.
+
+        Args:
+            graph: the cost, with the factors of `inertial`.
+            values: the minimum.
+            pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes.
+
+        Returns:
+            Whether it is another one than assumed; otherwise what was assumed stays.
+        """
+        found = [graph.at(i) for i in range(graph.size())]
+        factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
+        moving = [k for k in range(len(factors)) if not self._in_gap(k) and not self._still(k)]
+        ratios = variance_ratios([factors[k] for k in moving], values, [pairs[k] for k in moving])
+        noise = self.noise.times(ratios)
+        learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
+        if noise.near(self.noise, learned):
+            return False
+        self.noise = noise
+        return True
+
+    def _still(self, k: int) -> bool:
+        """Whether the platform stands still at any time between keyframe k and the next one."""
+        i, j = self._segment.keyframes[k : k + 2]
+        return bool(self._segment.still[i : j + 1].any())
+
+    def _in_gap(self, k: int) -> bool:
+        """Whether IMU samples are missing after keyframe k."""
+        start_ns, end_ns = self._segment.keyframe_stamps_ns[k : k + 2].tolist()
+        return self._segment.imu.largest_gap_s(start_ns, end_ns) > self._backend.noise.max_imu_gap_s
+
+    def _noise_factors(self, k: int) -> tuple[float, float, float]:
+        """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
+        scale = self._backend.noise.imu_scale * (IMU_GAP_SCALE if self._in_gap(k) else 1.0)
+        i, j = self._segment.keyframes[k : k + 2]
+        # variances of non-stationary noise add up
+        learned = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
+        return (scale, *self.noise.white(*learned.tolist()))
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
         factors: list[gtsam.NonlinearFactor] = []
         imu, noise = self._segment.imu, self._backend.noise
+        imu_noise = self.noise.walks(self._rig.imu)
         stamps_ns = self._segment.keyframe_stamps_ns.tolist()
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
-            gap = imu.largest_gap_s(start_ns, end_ns) > noise.max_imu_gap_s
-            scale = noise.imu_scale * (IMU_GAP_SCALE if gap else 1.0)
-            # variances of non-stationary noise add up
-            gyro, accel = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-            params = self._rig.imu.preintegration_params(noise.gravity, scale, gyro, accel)
+            params = imu_noise.preintegration_params(noise.gravity, *self._noise_factors(k))
             pim = imu.between(start_ns, end_ns).preintegrated(values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():

@@ -9,6 +9,7 @@ without outliers, with features triangulated and IMU samples preintegrated anew.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
@@ -35,10 +37,18 @@ from slam_graph.backend.smoothing.recording_segment import (
     with_gtsam_cameras,
 )
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.state_covariances import (
+    FrameInterpolation,
+    KeyframeCovariances,
+    keyframe_covariances,
+    with_covariances,
+)
 from slam_graph.backend.solve.state import stacked_points, stacked_poses
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
+
+logger = logging.getLogger(__name__)
 
 OUTLIER_WIDTH = 3.7
 """Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
@@ -50,6 +60,8 @@ _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _MAX_LAMBDA = 1e5
 """Steps end when the damping of Levenberg-Marquardt exceeds this."""
+_NOISE_ROUNDS = 3
+"""The noise of the IMU is estimated this many times at most, each at the minimum with the last."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -124,12 +136,15 @@ class AdjustedSegment:
     """The minimum of the cost of a segment.
 
     Attributes:
-        states: of every frame.
+        states: of every frame, with covariances relative to position and yaw of the anchor if they
+            could be computed.
         figures: of the minimum.
+        aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
+    aligned: FloatArray | None
 
 
 class BundleAdjustment:
@@ -164,12 +179,18 @@ class BundleAdjustment:
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
             self._values.insert(B(k), bias)
 
+    @property
+    def imu_noise(self) -> ImuNoiseFactors:
+        """Estimated factors on the noise of the IMU, beyond those that the causal run learned."""
+        return self._factors.noise
+
     def solve(self) -> AdjustedSegment:
         """Minimise, remove outliers, and minimise again.
 
         Raises:
             EstimationError: if there is no minimum.
         """
+        keyframes = self._segment.keyframes
         before = self._minimize_loosely()
         points, good = self._triangulated(self._candidates)
         points, good = self._with_estimates(self._candidates, points, good)
@@ -177,19 +198,42 @@ class BundleAdjustment:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
         _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
-        dynamics = 15 * max(len(self._segment.keyframes) - 1, 1)
         figures = AdjustmentFigures(
-            keyframes=len(self._segment.keyframes),
+            keyframes=len(keyframes),
             features=len(obs.ids),
             observations=len(obs),
             iterations=self.iterations,
             cost_before=before,
             cost_after=cost,
-            imu_residual=float(np.sqrt(2.0 * imu_cost / dynamics)),
+            imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        return AdjustedSegment(self._states(), figures)
+        states, aligned = self._states(), None
+        known = self._with_learned_noise(obs, variances)
+        if known is not None:
+            densities = self._factors.densities()
+            frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
+            states, aligned = with_covariances(states, known, frames)
+        return AdjustedSegment(states, figures, aligned)
+
+    def _with_learned_noise(
+        self, obs: Observations, variances: FloatArray
+    ) -> KeyframeCovariances | None:
+        """Covariances at the minimum under the noise of the IMU that residuals show.
+
+        The states that are reported are those under the noise that the causal run learned.
+        """
+        known = self._covariances()
+        for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
+            if known is None or not self._factors.learn_noise(
+                self._solved[0], self._values, known.pairs
+            ):
+                break
+            points = stacked_points(self._values, obs.ids.tolist())
+            self._minimize(obs, points, variances, self._config.tolerance)
+            known = self._covariances()
+        return known
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -286,7 +330,8 @@ class BundleAdjustment:
         graph = gtsam.NonlinearFactorGraph(inertial)
         graph.push_back(self._factors.projections(obs, variances, self._sigma_px))
         params = gtsam.LevenbergMarquardtParams()
-        params.setOrdering(gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
+        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+        params.setOrdering(ordering)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
         before = cost = optimizer.error()
         for _ in range(self._config.max_iterations):
@@ -300,7 +345,21 @@ class BundleAdjustment:
         if not math.isfinite(cost):
             raise EstimationError("the cost of the bundle adjustment is not finite")
         self._values = optimizer.values()
+        self._solved = graph, ordering
         return before, cost, inertial.error(self._values)
+
+    def _covariances(self) -> KeyframeCovariances | None:
+        """Covariances at the minimum; None if it does not determine all variables."""
+        segment, (graph, ordering) = self._segment, self._solved
+        graph = gtsam.NonlinearFactorGraph(graph)
+        graph.push_back(self._factors.gauge(self._values))
+        nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
+        weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
+        try:
+            return keyframe_covariances(graph, self._values, ordering, weights)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
+            return None
 
     def _states(self) -> list[NavState]:
         """The states of all frames."""

@@ -45,6 +45,9 @@ class FinalBaConfig(Settings):
     """Whether tracks that are found to be of the same point become one feature."""
     learn_pixel_sigma: bool = expert(True)
     """Whether the noise of the tracks is estimated; noise.pixel_sigma is then an upper bound."""
+    learn_imu_noise: bool = expert(True)
+    """Whether covariances use the noise of the IMU that residuals show; the calibrated one is a
+    lower bound. The trajectory does not change."""
     max_iterations: int = expert(20, ge=1)
     """Largest number of Levenberg-Marquardt steps, before outliers are removed and after."""
     tolerance: float = expert(1e-4, gt=0)

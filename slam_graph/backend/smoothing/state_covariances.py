@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Covariances of smoothed states, from the information of the bundle adjustment's own problem.
+
+Neighbouring keyframes share a clique of the Bayes tree, as an IMU factor connects them, so that
+their joint covariance is known (`bayes_tree.py`). A frame in between is interpolated in
+`keyframe_states.py`, and so is its error: with axes of the world, where the errors of neighbouring
+frames are nearly the same,
+
+    e_m = (1 - α) e_k + α e_{k+1} + n_m,
+
+n_m being what the noise of the IMU adds in between, a Brownian bridge.
+
+**The gauge.** Position and yaw of a visual-inertial problem are only known relative to something
+(Kelly & Sukhatme 2011), and a covariance depends on what that is. There are two here. Covariances
+of states are relative to position and yaw of the anchor, which define the world. Errors against a
+ground truth are what is left after alignment, where no pose is special; their covariance is that of
+e - N g, where g = Wᵀ e is what the alignment takes away and N its effect on the frame (an
+S-transformation: Baarda 1973; Triggs et al. 2000, sec. 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, joint_covariances, solved
+from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.geometry import NavState
+
+_ERROR = 15
+"""Components of the error of a state."""
+_POSE = slice(0, 6)
+_ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+_LEAST_EXTENT_M = 0.01
+"""Positions that scatter less than this around their mean determine no yaw."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeCovariances:
+    """What is known of the errors of K keyframes.
+
+    Attributes:
+        rotations: (K, 3, 3) world_R_body.
+        pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes, in the order of
+            `NavState.covariance`.
+        alignment: (K, 6, 4) covariances of poses, with axes of the world, and g, the part of all
+            errors that an alignment in position and yaw takes away; None if positions determine no
+            yaw.
+        aligned_away: (4, 4) covariance of g: position, yaw.
+        centre: (3,) mean position, about which the yaw of g turns.
+    """
+
+    rotations: FloatArray
+    pairs: FloatArray
+    alignment: FloatArray | None
+    aligned_away: FloatArray
+    centre: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameInterpolation:
+    """Where N frames are among K keyframes.
+
+    Attributes:
+        before: (N,) the last keyframe before each frame, at most K-2.
+        part: (N,) the part α of the way to the next one, from 0 to 1.
+        interval_s: (K-1,) time between keyframes.
+        densities: (K-1, 2) noise densities of gyroscope and accelerometer.
+    """
+
+    before: IntArray
+    part: FloatArray
+    interval_s: FloatArray
+    densities: FloatArray
+
+    @classmethod
+    def of(
+        cls, stamps_ns: IntArray, keyframes: IntArray, densities: FloatArray
+    ) -> FrameInterpolation:
+        """Between frames at given times.
+
+        Args:
+            stamps_ns: (N,) of all frames.
+            keyframes: (K,) numbers of those that are keyframes, the first and the last among them.
+            densities: (K-1, 2) noise densities of gyroscope and accelerometer.
+        """
+        before = np.searchsorted(keyframes, np.arange(len(stamps_ns)), side="right") - 1
+        before = np.minimum(before, len(keyframes) - 2)
+        times = stamps_ns[keyframes]
+        interval_ns = np.diff(times)
+        part = (stamps_ns - times[before]) / interval_ns[before]
+        return cls(before, part, interval_ns * 1e-9, densities)
+
+
+def keyframe_covariances(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    ordering: gtsam.Ordering,
+    weights: FloatArray,
+) -> KeyframeCovariances:
+    """Covariances of the keyframes 0 to K-1.
+
+    Args:
+        graph: the cost; its gauge is what the covariances are relative to.
+        values: the minimum.
+        ordering: of the elimination.
+        weights: (K,) of the keyframes in an alignment; their sum is one.
+
+    Raises:
+        RuntimeError: if the cost does not determine all variables.
+    """
+    count = len(weights)
+    numbers = {key(k): k for key in (X, V, B) for k in range(count)}
+    cliques = cliques_of(graph.linearize(values), ordering, numbers)
+    rotations, positions = stacked_poses(values, range(count))
+    pairs = _pairs(cliques, numbers, count)
+    centre = weights @ positions
+    arms = np.cross([0.0, 0.0, 1.0], positions - centre)
+    extent = float(weights @ np.sum(arms**2, axis=1))
+    if extent < _LEAST_EXTENT_M**2:
+        return KeyframeCovariances(rotations, pairs, None, np.zeros((4, 4)), centre)
+    W = np.zeros((count, 6, 4))  # g = Wᵀ e of all errors e, with axes of the world
+    W[:, 3:, :3] = weights[:, None, None] * np.eye(3)
+    W[:, 3:, 3] = weights[:, None] * arms / extent
+    turned = _turned(rotations, W, transpose=True)
+    found = solved(cliques, {X(k): turned[k] for k in range(count)})
+    C = _turned(rotations, np.array([found[X(k)] for k in range(count)]))
+    return KeyframeCovariances(rotations, pairs, C, np.einsum("kij,kil->jl", W, C), centre)
+
+
+def _pairs(cliques: list[Clique], numbers: Mapping[int, int], count: int) -> FloatArray:
+    """The joint covariances (K-1, 30, 30) of neighbouring keyframes."""
+    pairs = np.full((count - 1, 2 * _ERROR, 2 * _ERROR), np.nan)
+    missing = np.ones(len(pairs), np.bool_)
+    for clique, P in joint_covariances(cliques):
+        ours = {numbers[key] for key in clique.frontals if key in numbers}
+        for k in sorted({k - 1 for k in ours} | ours):
+            if not 0 <= k < len(pairs) or not missing[k]:
+                continue
+            keys = [key(i) for i in (k, k + 1) for key in (X, V, B)]
+            if all(key in clique.columns for key in keys):
+                own = [clique.columns[key] for key in keys]
+                rows = np.concatenate([np.arange(c.start, c.stop) for c in own])
+                pairs[k] = P[np.ix_(rows, rows)]
+                missing[k] = False
+    return pairs
+
+
+def _turned(rotations: FloatArray, columns: FloatArray, transpose: bool = False) -> FloatArray:
+    """Pose errors (K, 6, m) turned from the body frame into the world; or back."""
+    turn = rotations.transpose(0, 2, 1) if transpose else rotations
+    return np.concatenate([turn @ columns[:, :3], turn @ columns[:, 3:]], axis=1)
+
+
+def with_covariances(
+    states: list[NavState], known: KeyframeCovariances, frames: FrameInterpolation
+) -> tuple[list[NavState], FloatArray | None]:
+    """The states of all frames with their covariances; pose covariances after an alignment.
+
+    Args:
+        states: of N frames.
+        known: of the keyframes.
+        frames: where the frames are among them.
+
+    Returns:
+        The states, and what `aligned_covariances` returns.
+    """
+    poses = np.array([state.world_T_body.matrix() for state in states])
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    covariances = frame_covariances(known, frames, rotations)
+    states = [replace(state, covariance=P) for state, P in zip(states, covariances, strict=True)]
+    return states, aligned_covariances(known, frames, rotations, positions)
+
+
+def frame_covariances(
+    known: KeyframeCovariances, frames: FrameInterpolation, rotations: FloatArray
+) -> FloatArray:
+    """Covariances (N, 15, 15) of the states of all frames, in the order of `NavState.covariance`.
+
+    Args:
+        known: of the keyframes.
+        frames: where the frames are among them.
+        rotations: (N, 3, 3) world_R_body of the frames.
+    """
+    P = _in_world(known, frames)
+    for rows in (_ROTATION, _POSITION):
+        P[:, rows] = rotations.transpose(0, 2, 1) @ P[:, rows]
+        P[:, :, rows] = P[:, :, rows] @ rotations
+    return P
+
+
+def aligned_covariances(
+    known: KeyframeCovariances,
+    frames: FrameInterpolation,
+    rotations: FloatArray,
+    positions: FloatArray,
+) -> FloatArray | None:
+    """Pose covariances (N, 6, 6) of all frames after an alignment in position and yaw.
+
+    Args:
+        known: of the keyframes.
+        frames: where the frames are among them.
+        rotations: (N, 3, 3) world_R_body of the frames.
+        positions: (N, 3) world_p_body.
+
+    Returns:
+        In the body frame, rotation before position; None if positions determine no yaw.
+    """
+    if known.alignment is None:
+        return None
+    part = frames.part[:, None, None]
+    C = (1.0 - part) * known.alignment[frames.before] + part * known.alignment[frames.before + 1]
+    N = gauge_motion(positions - known.centre)
+    moved = C @ N.transpose(0, 2, 1)
+    P = _in_world(known, frames)[:, _POSE, _POSE] - moved - moved.transpose(0, 2, 1)
+    P += N @ known.aligned_away @ N.transpose(0, 2, 1)
+    P = _turned(rotations, P, transpose=True)
+    return _turned(rotations, P.transpose(0, 2, 1), transpose=True)
+
+
+def gauge_motion(arms: FloatArray) -> FloatArray:
+    """How (N, 6, 4) poses move with position and yaw of the world, with axes of the world.
+
+    Args:
+        arms: (N, 3) positions relative to the point about which the yaw turns.
+    """
+    motion = np.zeros((len(arms), 6, 4))
+    motion[:, 2, 3] = 1.0
+    motion[:, 3:, :3] = np.eye(3)
+    motion[:, 3:, 3] = np.cross([0.0, 0.0, 1.0], arms)
+    return motion
+
+
+def in_gauge_of(link: NavState, states: list[NavState]) -> list[NavState]:
+    """States of a segment with covariances relative to what those of an earlier one are.
+
+    What is not known of position and yaw at the state where the segments join is added to all
+    others, as if the two segments had independent errors.
+
+    Args:
+        link: the state of the earlier segment whose position and yaw the later one was given.
+        states: of the later segment, with covariances relative to these.
+    """
+    if link.covariance is None:
+        return states
+    R = link.world_T_body.rotation().matrix()
+    given = np.zeros((4, _ERROR))
+    given[:3, _POSITION] = R
+    given[3, _ROTATION] = R[2]
+    unknown = given @ link.covariance @ given.T
+    return [_moved(state, unknown, link) for state in states]
+
+
+def _moved(state: NavState, unknown: FloatArray, link: NavState) -> NavState:
+    """A state with the uncertainty (4, 4) of position and yaw at `link` added."""
+    if state.covariance is None:
+        return state
+    turn = state.world_T_body.rotation().matrix().T
+    arm = state.world_T_body.translation() - link.world_T_body.translation()
+    N = np.zeros((_ERROR, 4))
+    N[_POSE] = _turned(turn[None], gauge_motion(arm[None]))[0]
+    N[_VELOCITY, 3] = np.cross([0.0, 0.0, 1.0], state.velocity)
+    return replace(state, covariance=state.covariance + N @ unknown @ N.T)
+
+
+def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
+    """The joint covariances (K-1, 30, 30) of neighbouring keyframes, with axes of the world."""
+    T = np.zeros((len(known.rotations), _ERROR, _ERROR))
+    T[:, _ROTATION, _ROTATION] = T[:, _POSITION, _POSITION] = known.rotations
+    T[:, 6:, 6:] = np.eye(9)
+    pairs = known.pairs.copy()
+    for half, turn in ((slice(0, 15), T[:-1]), (slice(15, 30), T[1:])):
+        pairs[:, half] = turn @ pairs[:, half]
+        pairs[:, :, half] = pairs[:, :, half] @ turn.transpose(0, 2, 1)
+    return pairs
+
+
+def _in_world(known: KeyframeCovariances, frames: FrameInterpolation) -> FloatArray:
+    """Covariances (N, 15, 15) of all frames, with axes of the world."""
+    a, pairs = frames.part[:, None, None], _with_axes_of_the_world(known)[frames.before]
+    first, second = slice(0, _ERROR), slice(_ERROR, 2 * _ERROR)
+    cross = pairs[:, first, second]
+    P = (1.0 - a) ** 2 * pairs[:, first, first] + a**2 * pairs[:, second, second]
+    P += a * (1.0 - a) * (cross + cross.transpose(0, 2, 1))
+    gyro, accel = (frames.densities[frames.before] ** 2).T
+    T, a = frames.interval_s[frames.before], frames.part
+    # white noise integrated once or twice over α T, less the part α of its integral over T
+    once, twice = a * (1.0 - a) * T, (a**3 - a**3 * (3.0 - a) + a**2) * T**3 / 3.0
+    for rows, variance in (
+        (_ROTATION, gyro * once),
+        (_POSITION, accel * twice),
+        (_VELOCITY, accel * once),
+    ):
+        P[:, rows, rows] += variance[:, None, None] * np.eye(3)
+    return P
