@@ -127,7 +127,7 @@ class PointPredictor:
     def __init__(self, mounted: RigCamera, motion: ImuMotion, config: FrontendConfig) -> None:
         self._camera = mounted.camera
         self._body_T_camera = mounted.body_T_camera
-        self._offset_ns = round(mounted.time_offset_s * 1e9)
+        self._offset_ns = round((mounted.time_offset_s + mounted.middle_s) * 1e9)
         self._motion = motion
         self._mode = config.prediction
         self.camera_R: FloatArray = np.eye(3)
