@@ -143,7 +143,7 @@ class CalibratedProjection(RigProjection):
     ) -> FloatArray:
         """Derivatives (N, 2) of the pixels by the times at which their rows were exposed."""
         R, p = self.body_R_camera[obs.camera], self.body_p_camera[obs.camera]
-        rates = self._row_motions(obs)[2]
+        rates = self._row_motions(obs).rates_after(self.row_times_s(obs))
         in_body = np.einsum("nij,nj->ni", R, in_camera) + p  # of the body at the time of the row
         flow = -np.cross(rates[:, :3], in_body) - rates[:, 3:]
         by_time: FloatArray = np.einsum("nij,nkj,nk->ni", by_camera_point, R, flow)

@@ -87,6 +87,7 @@ class RigProjection:
         self.rolling = rig.rolling
         self._rig = rig
         self._motions = motions or {}
+        self._mounts: tuple[Observations, tuple[FloatArray, FloatArray]] | None = None  # the last
         self._taken_by = taken_by or rig
 
     # --- overridden where the calibration is estimated (see `calibrated_projection`) --------------
@@ -125,11 +126,15 @@ class RigProjection:
         For a rolling shutter this is where the camera was at the time of the observed row, in the
         frame of the body at the pose.
         """
+        if self._mounts is not None and self._mounts[0] is obs:
+            return self._mounts[1]
         R, p = self.body_R_camera[obs.camera], self.body_p_camera[obs.camera]
-        if not self.rolling:
+        if not self.rolling or len(obs) == 0:
             return R, p
-        turn, move, _ = self._row_motions(obs)
-        return turn @ R, move + np.einsum("nij,nj->ni", turn, p)
+        turn, move = self._row_motions(obs).after(self.row_times_s(obs))
+        mounts = turn @ R, move + np.einsum("nij,nj->ni", turn, p)
+        self._mounts = obs, mounts
+        return mounts
 
     def mount_poses(self, obs: Observations) -> list[gtsam.Pose3]:
         """`mounts` as poses, as GTSAM's projection factors take them."""
@@ -170,15 +175,15 @@ class RigProjection:
             none = np.zeros(len(seen), np.int64)
             camera = np.full(len(seen), c)
             obs = Observations(seen.ids, (index,), none, none, camera, seen.pixels, seen.normalized)
-            turns.append(self._row_motions(obs)[0])
+            turns.append(self._row_motions(obs).after(self.row_times_s(obs))[0])
         return turns
 
-    def _row_motions(self, obs: Observations) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Motion of the body from the pose to each observed row (see `FrameMotion.after`)."""
+    def _row_motions(self, obs: Observations) -> FrameMotion:
+        """Motion of the body at the pose of each observation, N of them in one."""
         motions = [self._motions.get(i, _STILL) for i in obs.frames]
         rate = np.array([motion.rate for motion in motions])[obs.frame]
         change = np.array([motion.change for motion in motions])[obs.frame]
-        return FrameMotion(rate, 0.0, change).after(self.row_times_s(obs))
+        return FrameMotion(rate, 0.0, change)
 
     def _camera_R_body(self, obs: Observations) -> FloatArray:
         """Rotations (N, 3, 3) from the body at the pose to the camera at the observed row."""

@@ -90,8 +90,8 @@ class FrameMotion:
     time_offset_s: float
     change: FloatArray = field(default_factory=lambda: np.zeros(6))
 
-    def after(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Where the body was at N times, in its frame at the pose, and how it moved there.
+    def after(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the body was at N times, in its frame at the pose.
 
         `rate` and `change` may be (N, 6) too: those of N frames, each at one time.
 
@@ -99,15 +99,21 @@ class FrameMotion:
             seconds: (N,) since the pose; so short that rates are linear over it.
 
         Returns:
-            rotation (3, 3) and position of the body then, and (6,) angular rate and velocity in its
-            frame then, N of each.
+            Rotations (N, 3, 3) and positions (N, 3).
         """
         t = seconds[:, None]
-        half = 0.5 * t * t * self.change
-        turn = Rotation.from_rotvec(self.rate[..., :3] * t + half[:, :3])
+        moved = self.rate * t + 0.5 * t * t * self.change
+        return Rotation.from_rotvec(moved[:, :3]).as_matrix(), moved[:, 3:]
+
+    def rates_after(self, seconds: FloatArray) -> FloatArray:
+        """Angular rate and velocity (N, 6) of the body at N times, in its frame then."""
+        t = seconds[:, None]
         rates = self.rate + self.change * t
-        rates[:, 3:] = turn.apply(rates[:, 3:], inverse=True)
-        return turn.as_matrix(), self.rate[..., 3:] * t + half[:, 3:], rates
+        angles = (self.rate * t + 0.5 * t * t * self.change)[:, :3]
+        # from the derivative of the rotation vector, to first order in it
+        rates[:, :3] -= 0.5 * np.cross(angles, rates[:, :3])
+        rates[:, 3:] = np.einsum("nji,nj->ni", self.after(seconds)[0], rates[:, 3:])
+        return rates
 
 
 class State:
