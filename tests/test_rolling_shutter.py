@@ -118,7 +118,7 @@ def test_rows_are_seen_from_where_the_body_was_then(camera: Camera, readout_s: f
 def test_derivatives_are_the_numerical_ones_and_factors_are_gtsams() -> None:
     mounted, step = rolling(), 1e-6
     obs, at, state = seen_by(mounted, room(60, np.random.default_rng(1)))
-    variables = CalibrationVariables(mounted, CalibrationConfig(time_offset=True, extrinsics=True))
+    variables = CalibrationVariables(mounted, CalibrationConfig(time_offset=True, readout=True))
     prior = variables.enter(state, SquareRootInformation.empty())
     projection = CalibratedProjection(variables, state)
     assert projection.rolling
@@ -282,3 +282,19 @@ def test_the_bundle_adjustment_knows_the_rows() -> None:
     sequence = flown(READOUT_S)
     result = run(sequence, load_config(algorithm="msckf"))
     assert ate(sequence, result, smoothed=True) < 0.006
+
+
+def test_the_readout_time_is_found() -> None:
+    sequence = flown(READOUT_S)
+    cameras = (replace(c, readout_s=READOUT_S - 0.005) for c in sequence.rig.cameras)
+    sequence.rig = replace(sequence.rig, cameras=tuple(cameras))
+    overrides = ["backend.calibration.readout=true", "final_ba.enabled=false"]
+    result = run(sequence, load_config(None, overrides, algorithm="msckf"))
+    result.check()
+    latest = result.logs.calibration.latest
+    assert latest is not None
+    (found,) = latest.parameters()
+    assert found.name == "readout_s"
+    assert found.start == pytest.approx(READOUT_S - 0.005)
+    assert found.value == pytest.approx(READOUT_S, abs=max(4 * found.sigma, 2e-4))
+    assert found.sigma < 1e-3

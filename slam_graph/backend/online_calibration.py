@@ -3,8 +3,9 @@
 """Online calibration: which parameters of the rig are variables of the state, and their prior.
 
 `E(c)` is the pose body_T_camera of camera c, `K(c)` its (fx, fy, cx, cy), `distortion_key(c, n)`
-the n coefficients of its distortion, and `T(0)` the time offset t_imu - t_camera in seconds, one
-for the rig. They are in the state and in its prior from the start and are never marginalized.
+the n coefficients of its distortion, `T(0)` the time offset t_imu - t_camera in seconds and `T(1)`
+the readout time of rolling shutters, one for the rig. They are in the state and in its prior from
+the start and are never marginalized.
 """
 
 from __future__ import annotations
@@ -51,12 +52,16 @@ class CalibrationVariables:
         nominal: the rig as it was calibrated before.
         keys: of the variables, camera by camera, the time offset last; empty if there are none.
         estimates_offset: whether the time offset is one of them.
+        estimates_readout: whether the readout time is one of them.
+        rolling: whether a shutter rolls.
     """
 
     def __init__(self, nominal: Rig, config: CalibrationConfig) -> None:
         self.nominal = nominal
         self.config = config
         self.estimates_offset = config.time_offset
+        self.estimates_readout = config.readout
+        self.rolling = nominal.rolling or config.readout
         self.keys = tuple(self._keys())
 
     def _keys(self) -> Iterator[int]:
@@ -69,6 +74,8 @@ class CalibrationVariables:
                 yield distortion_key(c, len(mounted.camera.coefficients))
         if self.config.time_offset:
             yield T(0)
+        if self.config.readout:
+            yield T(1)
 
     # --- prior ------------------------------------------------------------------------------------
 
@@ -96,15 +103,17 @@ class CalibrationVariables:
         values = gtsam.Values()
         for key in self.keys:
             kind, c = letter_and_index(key)
+            if kind == "t":
+                first = self.nominal.cameras[0]
+                values.insert(key, np.array([first.readout_s if c else first.time_offset_s]))
+                continue
             mounted = self.nominal.cameras[c]
             if kind == "e":
                 values.insert(key, mounted.body_T_camera)
             elif kind == "k":
                 values.insert(key, mounted.camera.intrinsics)
-            elif kind == "d":
-                values.insert(key, np.array(mounted.camera.coefficients))
             else:
-                values.insert(key, np.array([mounted.time_offset_s]))
+                values.insert(key, np.array(mounted.camera.coefficients))
         return values
 
     def _sigmas(self, key: int) -> FloatArray:
@@ -116,8 +125,9 @@ class CalibrationVariables:
         if kind == "k":
             focal = config.focal_length_sigma * self.nominal.cameras[c].camera.intrinsics[:2]
             return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
-        sigma = config.distortion_sigma if kind == "d" else config.time_offset_sigma_s
-        return np.full(dim(key), sigma)
+        if kind == "t":
+            return np.array([config.readout_sigma_s if c else config.time_offset_sigma_s])
+        return np.full(dim(key), config.distortion_sigma)
 
     def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
         """Whether a step (n,) moved the parameters far, compared to their standard deviations.
@@ -157,8 +167,16 @@ class CalibrationVariables:
         distortion = distortion_key(c, len(camera.coefficients))
         if distortion in self.keys:
             camera = replace(camera, coefficients=tuple(values.atVector(distortion).tolist()))
-        offset_s = mounted.time_offset_s + shift_s
-        return replace(mounted, camera=camera, body_T_camera=body_T_camera, time_offset_s=offset_s)
+        readout_s = mounted.readout_s
+        if self.estimates_readout:
+            readout_s += float(values.atVector(T(1))[0]) - self.nominal.cameras[0].readout_s
+        return replace(
+            mounted,
+            camera=camera,
+            body_T_camera=body_T_camera,
+            time_offset_s=mounted.time_offset_s + shift_s,
+            readout_s=readout_s,
+        )
 
     def estimate(
         self, stamp_ns: int, state: State, information: SquareRootInformation
@@ -194,8 +212,8 @@ class CalibrationVariables:
         Extrapolating the IMU instead would leave an error in the dynamics that no later sample
         corrects.
         """
-        offset_s, rolling = self.nominal.pose_offset_s, self.nominal.rolling
-        if state is None or not (self.estimates_offset or rolling):
+        offset_s = self.nominal.pose_offset_s
+        if state is None or not (self.estimates_offset or self.rolling):
             return frame_ns + round(offset_s * 1e9)
         if self.estimates_offset:
             offset_s = float(state.estimate.atVector(T(0))[0]) + self.nominal.cameras[0].middle_s
@@ -218,7 +236,7 @@ class CalibrationVariables:
             frame_ns: its stamp on the clock of the cameras.
             imu: samples up to the frame.
         """
-        if self.nominal.rolling:
+        if self.rolling:
             now = state.nav_state(frame, stamp_ns, None)
             state.motions[frame] = rolling_motion(now, frame_ns, imu, self.nominal)
             return
@@ -243,7 +261,7 @@ class CalibrationVariables:
         """
         motions: dict[int, FrameMotion] = {}
         for k, (stamp_ns, frame) in enumerate(zip(stamps_ns, frames, strict=True)):
-            if self.nominal.rolling:
+            if self.rolling:
                 gyro, slope, _ = imu.trend(stamp_ns, _around_ns(self.nominal))
                 rate, change = (np.concatenate([x, np.zeros(3)]) for x in (gyro, slope))
                 motions[k] = FrameMotion(rate, (stamp_ns - frame.stamp_ns) * 1e-9, change)
@@ -261,7 +279,7 @@ class CalibrationVariables:
             stamp_ns: time of its pose on the clock of the IMU.
             imu: samples up to the frame.
         """
-        if self.nominal.rolling and frame in state.motions:
+        if self.rolling and frame in state.motions:
             lead_ns = round(state.motions[frame].time_offset_s * 1e9)
             self.note_motion(state, frame, stamp_ns, stamp_ns - lead_ns, imu)
 

@@ -98,8 +98,12 @@ class RigCamera:
 
     def row_times_s(self, rows: FloatArray) -> FloatArray:
         """Times (N,) of the exposure of rows (N,), in pixels, since the stamp of the frame."""
-        part = rows / self.camera.height - _STAMPED_ROWS[self.stamped_row]
-        return np.asarray(part * self.readout_s, dtype=np.float64)
+        return self.row_parts(rows) * self.readout_s
+
+    def row_parts(self, rows: FloatArray) -> FloatArray:
+        """The same times (N,) as parts of the readout time."""
+        parts: FloatArray = rows / self.camera.height - _STAMPED_ROWS[self.stamped_row]
+        return parts
 
     @property
     def middle_s(self) -> float:
@@ -177,8 +181,8 @@ class CalibrationEstimate:
         rig: with the estimated parameters.
         covariances: of each variable that was estimated: `e0` (6, 6) of the pose of camera 0, in
             its tangent (rad and m, camera frame); `k0` (4, 4) of its intrinsics in pixels; `d0`
-            (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset in
-            seconds.
+            (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset and
+            `t1` of the readout time in seconds.
     """
 
     stamp_ns: int
@@ -206,6 +210,9 @@ class CalibrationEstimate:
     def _values(self, variable: str) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of a variable's parameters, their calibrated values, and their estimates."""
         kind, c = variable[0], int(variable[1:])
+        if variable == "t1":
+            readouts = [np.array([rig.cameras[0].readout_s]) for rig in (self.nominal, self.rig)]
+            return ["readout_s"], readouts[0], readouts[1]
         before, now = self.nominal.cameras[c], self.rig.cameras[c]
         if kind == "t":
             offsets = [np.array([mounted.time_offset_s]) for mounted in (before, now)]

@@ -69,6 +69,7 @@ class CalibratedProjection(RigProjection):
         """Take the calibration of a state; the nominal one without a state."""
         rig = variables.nominal if state is None else variables.rig(state.estimate)
         super().__init__(rig, None if state is None else state.motions)
+        self.rolling = variables.rolling
         self.variables = variables
         self.calibration_keys = variables.keys
         self._state = state
@@ -128,9 +129,13 @@ class CalibratedProjection(RigProjection):
             if distortion in self._columns:
                 by_coefficients = camera.by_coefficients(normalized[rows])
                 by_calibration[rows, :, self._columns[distortion]] = by_coefficients
-        if self.rolling and self._state is not None and self.variables.estimates_offset:
+        if self.rolling and self._state is not None:
             by_time = self._by_time(obs, by_camera_point, in_camera)
-            by_calibration[:, :, self._columns[T(0)].start] = by_time
+            if self.variables.estimates_offset:
+                by_calibration[:, :, self._columns[T(0)].start] = by_time
+            if self.variables.estimates_readout:
+                part = self.row_parts(obs)[:, None]
+                by_calibration[:, :, self._columns[T(1)].start] = by_time * part
         shift = self._shift(obs.frames)
         if shift is not None:
             by_offset = np.einsum("nij,nj->ni", by_pose, shift.rate[obs.frame])

@@ -142,21 +142,27 @@ class RigProjection:
 
     def row_times_s(self, obs: Observations) -> FloatArray:
         """Times (N,) from the poses of frames to the exposures of the observed rows."""
-        seconds = np.zeros(len(obs))
         if not self.rolling:
-            return seconds
-        for c, mounted in enumerate(self._rig.cameras):
-            rows, lens = obs.camera == c, self._taken_by.cameras[c].camera
-            pixels = obs.pixels[rows]
-            if lens is not mounted.camera:
-                pixels = lens.distort(obs.normalized[rows])[0]
-            seconds[rows] = mounted.row_times_s(pixels[:, 1])
+            return np.zeros(len(obs))
+        readouts = np.array([mounted.readout_s for mounted in self._rig.cameras])
+        seconds: FloatArray = self.row_parts(obs) * readouts[obs.camera]
         leads = [
             self._motions[i].time_offset_s if i in self._motions else self._rig.pose_offset_s
             for i in obs.frames
         ]
         seconds += self._rig.cameras[0].time_offset_s - np.array(leads)[obs.frame]
         return seconds
+
+    def row_parts(self, obs: Observations) -> FloatArray:
+        """Derivatives (N,) of the times of the observed rows by the readout time: from -1 to 1."""
+        parts = np.zeros(len(obs))
+        for c, mounted in enumerate(self._rig.cameras):
+            rows, lens = obs.camera == c, self._taken_by.cameras[c].camera
+            pixels = obs.pixels[rows]
+            if lens is not mounted.camera and self._taken_by is not self._rig:
+                pixels = lens.distort(obs.normalized[rows])[0]
+            parts[rows] = mounted.row_parts(pixels[:, 1])
+        return parts
 
     def row_turns(self, index: int, frame: FeatureFrame) -> list[FloatArray | None]:
         """Rotations (N, 3, 3) of the body from the pose to the rows of the features of each camera.
