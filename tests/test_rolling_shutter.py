@@ -40,7 +40,7 @@ from slam_graph.simulation.simulator import simulate
 
 READOUT_S = 0.03
 FAST = Flight(angle_rate=np.array([3.8, 2.6, 3.0]))
-"""Turns at up to 3 rad/s."""
+"""Turns at up to 2.6 rad/s."""
 
 TIMES = np.linspace(0.0, 3.0, 8)
 ROLLING = {"seed": 5, "rate_hz": 20.0, "trajectory": "random"}
@@ -278,7 +278,6 @@ def test_estimates_know_the_rows(name: str) -> None:
 
 
 def test_the_bundle_adjustment_knows_the_rows() -> None:
-    """Also with a camera that GTSAM does not have, whose pixels are replaced."""
     sequence = flown(READOUT_S)
     result = run(sequence, load_config(algorithm="msckf"))
     assert ate(sequence, result, smoothed=True) < 0.006
