@@ -9,7 +9,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 import pytest
-from flight import FISHEYE, RADTAN, Flight, rig, room
+from flight import FISHEYE, RADTAN, Flight, features, rig, room
 from gtsam.symbol_shorthand import L, X
 from recordings import edit_text
 from test_backend_reprojection import native_factor
@@ -29,6 +29,8 @@ from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.errors import DataError
 from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.prediction import ImuMotion, PointPredictor
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.camera import Camera
@@ -166,6 +168,25 @@ def test_a_motion_bends_as_its_rates_change() -> None:
     skewed = turn[1].T @ (turn[2] - turn[0]) / (2 * step)
     rate = np.array([skewed[2, 1], skewed[0, 2], skewed[1, 0]])
     np.testing.assert_allclose(motion.rates_after(at)[1, :3], rate, atol=1e-3)
+
+
+def test_the_front_end_turns_rows_to_one_time_and_back() -> None:
+    """Seen from afar only rotation counts, which the gyroscope knows."""
+    (mounted,) = rolling(1).cameras
+    far = 1e4 * room(300, np.random.default_rng(3))
+    motion = ImuMotion(rig().imu, 9.81)
+    motion.add(FAST.imu(0.0, 2.0))
+    predictor = PointPredictor(mounted, motion, FrontendConfig())
+    seen = rows_of(FAST, rolling(1), far, 1.0)
+    at_once = features(FAST, rig(1), far, 1.0).cameras[0]
+    rows = seen.cameras[0]
+    _, a, b = np.intersect1d(rows.ids, at_once.ids, return_indices=True)
+    assert len(a) > 20
+    found = predictor.unrolled(rows.pixels, rows.normalized, seen.stamp_ns)
+    assert np.max(np.abs(rows.normalized[a] - at_once.normalized[b])) > 5e-3
+    np.testing.assert_allclose(found[a], at_once.normalized[b], atol=2e-4)
+    back = predictor._rolled(found, seen.stamp_ns)
+    np.testing.assert_allclose(back, rows.pixels, atol=0.05)
 
 
 # --- files ----------------------------------------------------------------------------------------

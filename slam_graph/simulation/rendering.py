@@ -216,8 +216,7 @@ class Renderer:
     def _sharp(self, number: int, world: World, stamp_ns: int, motion: Motion) -> Grey:
         """Noise-free grey values of a camera, (height · width,), without blur.
 
-        With a rolling shutter every row is seen from where the camera was then; a moving board
-        stays where it is at the middle row's time.
+        Rows of a rolling shutter are seen from where the camera was; a moving board does not move.
         """
         camera = self._cameras[number]
         stamps, rows = np.array([stamp_ns]), [slice(None)]
@@ -226,8 +225,8 @@ class Renderer:
             seconds = camera.mounted.row_times_s(v.astype(np.float64)) - self._middle_s
             stamps = stamp_ns + np.round(seconds * 1e9).astype(np.int64)
             rows = [slice(row * camera.width, (row + 1) * camera.width) for row in v.tolist()]
-        R, p = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
-        parts = zip(R, p, rows, strict=True)
+        poses = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
+        parts = zip(*poses, rows, strict=True)
         return np.concatenate([self._radiance(number, world, *part) for part in parts])
 
     def _radiance(
