@@ -199,8 +199,7 @@ class Renderer:
         stamps = self._instants(motion, exposure_ns)
         gain = self._gain(exposure_ns - motion.start_ns)
         images = []
-        worlds = [self._world_at(stamp_ns) for stamp_ns in stamps.tolist()]
-        instants = list(zip(worlds, stamps.tolist(), strict=True))
+        instants = [(self._world_at(stamp_ns), stamp_ns) for stamp_ns in stamps.tolist()]
         for number, camera in enumerate(self._cameras):
             sharp = [self._sharp(number, *instant, motion) for instant in instants]
             values = gain * np.mean(sharp, axis=0)
