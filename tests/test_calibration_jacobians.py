@@ -18,9 +18,10 @@ from test_estimator_first_estimates import CONFIG, WEAK, claimed_information
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
+from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import CalibratedProjection, Geometry, RigProjection
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.marginalization.marginalize import relinearized, unobservable_directions
 from slam_graph.backend.online_calibration import CalibrationVariables

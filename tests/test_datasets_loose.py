@@ -293,7 +293,7 @@ def test_without_imu_it_can_be_looked_at_but_not_run_on(tmp_path: Path, kind: st
 
 def test_a_check_tells_what_was_noticed_on_opening(tmp_path: Path) -> None:
     path = write_video(tmp_path)
-    edit_text(path.with_suffix(".yaml"), "camera_model", "readout_time: 0.02\n  camera_model")
+    edit_text(path.with_suffix(".yaml"), "camera_model", "shutter: rolling\n  camera_model")
     findings = [found.what for found in check_sequence(open_dataset(path))]
     for kind in ("stamps_assumed", "rolling_shutter"):
         assert any(what.startswith(f"{kind}: 1 times") for what in findings)

@@ -183,6 +183,11 @@ class CalibrationConfig(Settings):
     distortion: bool = False
     """Estimate the distortion coefficients of each camera. Use it with `intrinsics`, and if
     features cover the whole image."""
+    readout: bool = expert(False)
+    """Estimate the readout time of rolling shutters, one for all cameras. Use it where it is known
+    to some milliseconds only; it needs fast turns."""
+    readout_sigma_s: float = expert(0.005, gt=0)
+    """Readout time."""
     rotation_sigma_rad: float = expert(0.02, gt=0)
     """Rotation of a camera."""
     position_sigma_m: float = expert(0.02, gt=0)
@@ -199,7 +204,8 @@ class CalibrationConfig(Settings):
     @property
     def anything(self) -> bool:
         """Whether any parameter is estimated."""
-        return self.extrinsics or self.time_offset or self.intrinsics or self.distortion
+        lens = self.intrinsics or self.distortion
+        return self.extrinsics or self.time_offset or self.readout or lens
 
 
 class BackendConfig(Settings):

@@ -53,6 +53,7 @@ class SquareRootEngine:
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
+        context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
         return state

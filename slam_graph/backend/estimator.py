@@ -17,9 +17,10 @@ from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation
-from slam_graph.backend.cost.reprojection import CalibratedProjection, RigProjection
+from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport

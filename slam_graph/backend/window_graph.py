@@ -146,12 +146,8 @@ class _Projections:
     def __init__(self, rig: RigProjection, state: State, sigma_px: float, loss: RobustLoss) -> None:
         self._rig, self._motions = rig, dict(state.motions)
         self._noise = pixel_noise(sigma_px, loss)
-        nominal = rig.at(state)
-        self._models = [camera.gtsam_calibration() for camera in nominal.cameras]
-        self._mounts = [
-            gtsam.Pose3(gtsam.Rot3(R), p)
-            for R, p in zip(nominal.body_R_camera, nominal.body_p_camera, strict=True)
-        ]
+        self._now = rig.at(state)
+        self._models = [camera.gtsam_calibration() for camera in self._now.cameras]
 
     def add(self, graph: gtsam.NonlinearFactorGraph, obs: Observations) -> None:
         """One factor for each observation."""
@@ -164,7 +160,7 @@ class _Projections:
     def _native(self, single: Observations, model: object) -> gtsam.NonlinearFactor:
         kind = getattr(gtsam, f"GenericProjectionFactor{type(model).__name__}")
         pose, point = _keys(single)
-        mount = self._mounts[int(single.camera[0])]
+        mount = self._now.mount_poses(single)[0]  # of a rolling shutter that of the observed row
         factor: gtsam.NonlinearFactor = kind(
             single.pixels[0], self._noise, pose, point, model, False, False, mount
         )

@@ -120,6 +120,7 @@ def _describe(sequence: Sequence) -> dict[str, Any]:
             "distortion": mounted.camera.distortion,
             "time_offset_s": mounted.time_offset_s,
             "shutter": "rolling" if mounted.rolling_shutter else "global",
+            "readout_s": mounted.readout_s,
         }
         for index, mounted in enumerate(sequence.rig.cameras)
     ]

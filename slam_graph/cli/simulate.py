@@ -42,6 +42,10 @@ def simulate(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Kalibr YAML of the rig.")
     ] = None,
+    shutter_readout: Annotated[
+        float | None,
+        typer.Option("--shutter-readout", help="Readout time of rolling shutters, seconds."),
+    ] = None,
     start: Annotated[
         float | None, typer.Option("--start", help="Seconds into a recorded trajectory.")
     ] = None,
@@ -86,6 +90,7 @@ def simulate(
         "real_imu": real_imu,
         "cameras": cameras,
         "calibration": calibration,
+        "shutter_readout_s": shutter_readout,
         "start_s": start,
         "duration_s": duration,
         "rate_hz": rate,

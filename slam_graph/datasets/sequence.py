@@ -240,10 +240,10 @@ class RecordedSequence(ABC):
         self.rig = rig
         self.groundtruth_path: Path | None = None
         self.diagnostics = options.diagnostics
-        rolling = [mounted.name for mounted in rig.cameras if mounted.rolling_shutter]
+        rolling = [c.name for c in rig.cameras if c.rolling_shutter and not c.readout_s]
         if rolling:
             what = f"{name}: {', '.join(rolling)}: rows are taken as exposed at one time"
-            self.diagnostics.warn("rolling_shutter", f"{what}; expect errors in fast motion")
+            self.diagnostics.warn("rolling_shutter", f"{what}, as readout_time is not given")
         source = options.groundtruth or own_groundtruth
         self._truth = None if source is None or isinstance(source, Path) else source
         if isinstance(source, Path):
@@ -313,7 +313,7 @@ class RecordedSequence(ABC):
         """Frames in the order of time, each with the IMU samples that lead up to it.
 
         Where the clock of the IMU is ahead by the rig's time offset, they lead up to the time of
-        the frame on that clock.
+        the frame on that clock; of a rolling shutter, to that of its last row.
 
         Args:
             start_ns: first frame time to deliver; the first packet then carries the IMU samples of
@@ -328,7 +328,7 @@ class RecordedSequence(ABC):
             self.imu_blocks(after_ns),
             self.diagnostics,
             None if start_ns is None else _HISTORY_NS,
-            max(0, round(self.rig.cameras[0].time_offset_s * 1e9)),
+            max(0, round(self.rig.end_offset_s * 1e9)),
         )
 
     def imu(self) -> ImuData:

@@ -107,7 +107,7 @@ class TrackQuality:
         """world_T_body at a frame, or None."""
         if self._truth is None:
             return None
-        offset_ns = round(self._rig.cameras[0].time_offset_s * 1e9)
+        offset_ns = round(self._rig.pose_offset_s * 1e9)
         true, _ = interpolate(self._truth, np.array([stamp_ns + offset_ns]))
         return true.pose(0) if len(true) else None
 

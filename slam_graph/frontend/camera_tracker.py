@@ -80,7 +80,7 @@ class CameraTracker:
         with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(found.points[keep].astype(np.float64))
             after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
-            motions = self._rigid_motions(before.normalized[keep], normalized)
+            motions = self._rigid_motions(self._unrolled(before)[keep], self._unrolled(after))
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = np.zeros(len(after), np.bool_)
             inlier[np.concatenate(motions)] = True
@@ -113,9 +113,12 @@ class CameraTracker:
             if candidates.origins is not None:
                 origins = self._camera.undistort(candidates.origins.astype(np.float64))
                 motions = self._motions(before.select(there), after.select(here))
-                good = self._fits_motion(origins, normalized, candidates.tolerance_scale, motions)
+                unrolled = self._predictor.unrolled
+                origins = unrolled(candidates.origins, origins, before.stamp_ns)
+                ends = unrolled(points, normalized, after.stamp_ns)
+                good = self._fits_motion(origins, ends, candidates.tolerance_scale, motions)
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-                flow = self._predictor.residual_flow(origins, normalized, seconds)
+                flow = self._predictor.residual_flow(origins, ends, seconds)
             self._stats.count(rejected_new=~good, new=good)
             ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
             self._associator.accept(ids, good)
@@ -126,6 +129,10 @@ class CameraTracker:
     def forget(self, ids: IntArray) -> None:
         """Do not look for these features any more."""
         self._associator.forget(ids)
+
+    def _unrolled(self, tracks: Tracks) -> FloatArray:
+        """Normalised coordinates (N, 2) of features as all rows would see them at one time."""
+        return self._predictor.unrolled(tracks.pixels, tracks.normalized, tracks.stamp_ns)
 
     def _rigid_motions(self, before: FloatArray, after: FloatArray) -> list[IntArray]:
         """The rows of the matches (N, 2) that fit each rigid motion, the largest group first."""
@@ -172,9 +179,10 @@ class CameraTracker:
         """The fundamental matrix (3, 3) of each rigid motion of the features in both images."""
         others = [np.isin(after.ids, ids) for ids in self._motion_ids[1:]]
         groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
-        matches = ((before.normalized[rows], after.normalized[rows]) for rows in groups)
+        start, end = self._unrolled(before), self._unrolled(after)
+        matches = ((start[rows], end[rows]) for rows in groups)
         motions = [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
-        return motions or [eight_point(before.normalized, after.normalized)]
+        return motions or [eight_point(start, end)]
 
     def _fits_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> BoolArray:
         """Which features (N,) fit the map of the back end, or are not in it."""
@@ -188,7 +196,7 @@ class CameraTracker:
         points = feedback.points[np.searchsorted(feedback.ids, tracks.ids[known])]
         camera_T_world = (world_T_body * self._body_T_camera).inverse()
         fits[known] = map_inliers(
-            points, tracks.normalized[known], camera_T_world, self._camera.fx, self._config
+            points, self._unrolled(tracks)[known], camera_T_world, self._camera.fx, self._config
         )
         return fits
 
@@ -208,7 +216,7 @@ class CameraTracker:
         here, there = after.common(before)
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
         after.residual_flow[here] = self._predictor.residual_flow(
-            before.normalized[there], after.normalized[here], seconds
+            self._unrolled(before)[there], self._unrolled(after)[here], seconds
         )
         return after
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_graph.arrays import FloatArray
 from slam_graph.sensors.measurements import ImuData
 
 _FAR_FUTURE_NS = 2**62
@@ -77,3 +78,23 @@ class ImuBuffer:
             for values in (self.data.gyro, self.data.accel)
         )
         return ImuData(stamps, gyro, accel)
+
+    def trend(self, stamp_ns: int, around_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Angular rate, its derivative, and specific force at a time, by lines fitted around it.
+
+        Args:
+            stamp_ns: the time.
+            around_ns: how far samples before and after it count; the part after the last sample
+                does not.
+
+        Returns:
+            (3,) rad/s, (3,) rad/s² and (3,) m/s².
+        """
+        newest_ns = max(self.newest_ns(), stamp_ns - around_ns)
+        samples = self.between(stamp_ns - around_ns, min(stamp_ns + around_ns, newest_ns))
+        seconds = (samples.stamps_ns - stamp_ns) * 1e-9
+        if seconds[-1] - seconds[0] < around_ns * 1e-9:  # too short for a slope
+            return samples.gyro[-1], np.zeros(3), samples.accel[-1]
+        line = np.column_stack([np.ones(len(seconds)), seconds])
+        found = np.linalg.lstsq(line, np.hstack([samples.gyro, samples.accel]), rcond=None)[0]
+        return found[0, :3], found[1, :3], found[0, 3:]

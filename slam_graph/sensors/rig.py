@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -16,6 +17,9 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
+
+_STAMPED_ROWS = {"first": 0.0, "middle": 0.5, "last": 1.0}
+"""Rows of a rolling shutter that a stamp may be the time of, as parts of the height."""
 
 _INTEGRATION_SIGMA = 1e-5
 """Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
@@ -75,8 +79,13 @@ class RigCamera:
         body_T_camera: pose of the camera in the body (IMU) frame.
         time_offset_s: t_imu = t_camera + time_offset_s (Kalibr's `timeshift_cam_imu`).
         name: of the camera in its data set, e.g. ``cam0``.
-        rolling_shutter: whether its rows are exposed one after the other. The estimator takes them
-            as exposed at one time all the same.
+        rolling_shutter: whether its rows are exposed one after the other. Where `readout_s` is not
+            known, the estimator takes them as exposed at one time all the same.
+        readout_s: time from the exposure of row 0 to that of a row below the last, which is
+            Kalibr's `line_delay` times the height; 0 for a global shutter, or where it is not
+            known; negative if the last row is read first.
+        stamped_row: the row that is exposed at the stamp of a frame: the first, as with Kalibr and
+            most drivers, or the `middle` or the `last` one.
     """
 
     camera: Camera
@@ -84,6 +93,28 @@ class RigCamera:
     time_offset_s: float = 0.0
     name: str = ""
     rolling_shutter: bool = False
+    readout_s: float = 0.0
+    stamped_row: Literal["first", "middle", "last"] = "first"
+
+    def row_times_s(self, rows: FloatArray) -> FloatArray:
+        """Times (N,) of the exposure of rows (N,), in pixels, since the stamp of the frame."""
+        return self.row_parts(rows) * self.readout_s
+
+    def row_parts(self, rows: FloatArray) -> FloatArray:
+        """The same times (N,) as parts of the readout time."""
+        parts: FloatArray = rows / self.camera.height - _STAMPED_ROWS[self.stamped_row]
+        return parts
+
+    @property
+    def middle_s(self) -> float:
+        """Time of the exposure of the middle row since the stamp of the frame."""
+        return (0.5 - _STAMPED_ROWS[self.stamped_row]) * self.readout_s
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last exposure of a row since the stamp of the frame."""
+        start = -_STAMPED_ROWS[self.stamped_row] * self.readout_s
+        return max(start, start + self.readout_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +128,24 @@ class Rig:
 
     cameras: tuple[RigCamera, ...]
     imu: ImuNoise = field(default_factory=ImuNoise)
+
+    @property
+    def rolling(self) -> bool:
+        """Whether any camera has a rolling shutter with a known readout time."""
+        return any(mounted.readout_s != 0.0 for mounted in self.cameras)
+
+    @property
+    def pose_offset_s(self) -> float:
+        """Time of the pose of a frame, on the clock of the IMU, since the frame's stamp.
+
+        The pose is that at the exposure of the middle row of the first camera.
+        """
+        return self.cameras[0].time_offset_s + self.cameras[0].middle_s
+
+    @property
+    def end_offset_s(self) -> float:
+        """Time of the last exposure of a frame, on the clock of the IMU, since its stamp."""
+        return self.cameras[0].time_offset_s + max(c.end_s for c in self.cameras)
 
     def select(self, count: int) -> Rig:
         """The same rig with its first `count` cameras only."""
@@ -132,8 +181,8 @@ class CalibrationEstimate:
         rig: with the estimated parameters.
         covariances: of each variable that was estimated: `e0` (6, 6) of the pose of camera 0, in
             its tangent (rad and m, camera frame); `k0` (4, 4) of its intrinsics in pixels; `d0`
-            (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset in
-            seconds.
+            (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset and
+            `t1` of the readout time in seconds.
     """
 
     stamp_ns: int
@@ -161,6 +210,9 @@ class CalibrationEstimate:
     def _values(self, variable: str) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of a variable's parameters, their calibrated values, and their estimates."""
         kind, c = variable[0], int(variable[1:])
+        if variable == "t1":
+            readouts = [np.array([rig.cameras[0].readout_s]) for rig in (self.nominal, self.rig)]
+            return ["readout_s"], readouts[0], readouts[1]
         before, now = self.nominal.cameras[c], self.rig.cameras[c]
         if kind == "t":
             offsets = [np.array([mounted.time_offset_s]) for mounted in (before, now)]

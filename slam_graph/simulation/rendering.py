@@ -178,6 +178,7 @@ class Renderer:
         board: MovingBoard | None = None,
     ) -> None:
         self._cameras = [_RayCamera(mounted) for mounted in rig.cameras]
+        self._middle_s = rig.cameras[0].middle_s
         self._world = world
         self._board = board
         self._atlas = atlas
@@ -191,17 +192,16 @@ class Renderer:
 
         Args:
             motion: of the platform.
-            exposure_ns: middle of the exposure on the clock of the IMU.
+            exposure_ns: middle of the exposure on the clock of the IMU; of rolling shutters, of the
+                middle row of the first camera.
             offset_ns: time of the IMU clock minus time of the camera clock.
         """
         stamps = self._instants(motion, exposure_ns)
-        rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
         gain = self._gain(exposure_ns - motion.start_ns)
         images = []
-        worlds = [self._world_at(stamp_ns) for stamp_ns in stamps.tolist()]
-        instants = list(zip(worlds, rotations, positions, strict=True))
+        instants = [(self._world_at(stamp_ns), stamp_ns) for stamp_ns in stamps.tolist()]
         for number, camera in enumerate(self._cameras):
-            sharp = [self.radiance(number, *instant) for instant in instants]
+            sharp = [self._sharp(number, *instant, motion) for instant in instants]
             values = gain * np.mean(sharp, axis=0)
             if self._config.noise_sigma > 0:
                 since_ns = exposure_ns - motion.start_ns
@@ -212,20 +212,41 @@ class Renderer:
             images.append(image.reshape(camera.height, camera.width))
         return CameraFrame(exposure_ns - offset_ns, tuple(images))
 
-    def radiance(
-        self, camera: int, world: World, world_R_body: FloatArray, position: FloatArray
+    def _sharp(self, number: int, world: World, stamp_ns: int, motion: Motion) -> Grey:
+        """Noise-free grey values of a camera, (height · width,), without blur.
+
+        Rows of a rolling shutter are seen from where the camera was; a moving board does not move.
+        """
+        camera = self._cameras[number]
+        stamps, rows = np.array([stamp_ns]), [slice(None)]
+        if camera.mounted.readout_s:
+            v = np.arange(camera.height)
+            seconds = camera.mounted.row_times_s(v.astype(np.float64)) - self._middle_s
+            stamps = stamp_ns + np.round(seconds * 1e9).astype(np.int64)
+            rows = [slice(row * camera.width, (row + 1) * camera.width) for row in v.tolist()]
+        poses = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
+        parts = zip(*poses, rows, strict=True)
+        return np.concatenate([self._radiance(number, world, *part) for part in parts])
+
+    def _radiance(
+        self,
+        camera: int,
+        world: World,
+        world_R_body: FloatArray,
+        position: FloatArray,
+        pixels: slice,
     ) -> Grey:
-        """Noise-free grey values of a camera, (height · width,), for a pose of the body."""
+        """Noise-free grey values of some pixels of a camera, for a pose of the body."""
         lens = self._cameras[camera]
         R = world_R_body @ lens.body_R_camera
         eye = position + world_R_body @ lens.position
-        rays = lens.rays @ R.T.astype(np.float32)
+        rays = lens.rays[pixels] @ R.T.astype(np.float32)
         hit = cast(world, eye, rays)
         # a pixel covers distance / focal length, and more on a wall at a slant
-        footprint = hit.distance * lens.stretch / (lens.focal_px * np.sqrt(hit.slant))
+        footprint = hit.distance * lens.stretch[pixels] / (lens.focal_px * np.sqrt(hit.slant))
         shade = np.array([_shade(panel) for panel in world.panels], np.float32)
         grey = shade[hit.panel] * self._atlas.sample(hit.panel, footprint, hit.a, hit.b)
-        return np.where(lens.lit, grey, np.float32(0.0))
+        return np.where(lens.lit[pixels], grey, np.float32(0.0))
 
     def _world_at(self, stamp_ns: int) -> World:
         """The walls, and the board at a time."""
@@ -260,6 +281,7 @@ class _RayCamera:
 
     def __init__(self, mounted: RigCamera) -> None:
         camera, pose = mounted.camera, mounted.body_T_camera
+        self.mounted = mounted
         self.width, self.height = camera.width, camera.height
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)

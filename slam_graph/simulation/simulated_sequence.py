@@ -67,7 +67,8 @@ class Flight:
 class SimulatedSequence(RecordedSequence):
     """The measurements of a simulated flight, generated while they are read.
 
-    Where the rig has a time offset, frames are stamped by the clock of its first camera.
+    Where the rig has a time offset, frames are stamped by the clock of its first camera; where its
+    shutter rolls, the exposures of the flight are those of the middle row.
 
     Attributes:
         config: all settings.
@@ -86,7 +87,7 @@ class SimulatedSequence(RecordedSequence):
         super().__init__(name, flight.rig, ReaderOptions(diagnostics=diagnostics or Diagnostics()))
         self.config = config
         self.flight = flight
-        self._offset_ns = round(flight.rig.cameras[0].time_offset_s * 1e9)
+        self._offset_ns = round(flight.rig.pose_offset_s * 1e9)
 
     @property
     def has_groundtruth(self) -> bool:

@@ -182,6 +182,10 @@ class SimulationConfig(Settings):
     """Kalibr camera chain; if not given that of the recorded trajectory, else EuRoC's."""
     cameras: int | None = Field(None, ge=1)
     """Number of cameras of the rig to use; all if not given."""
+    shutter_readout_s: float | None = expert(None, ge=0, le=0.1)
+    """Time that rolling shutters take from the first row to the last; 0 for global shutters, that
+    of the rig if not given. Frames are stamped at the first row, and the ground truth is that of
+    the middle row."""
     start_s: float = expert(0.0, ge=0)
     """Where in a recorded trajectory to start."""
     duration_s: float | None = Field(None, gt=0)

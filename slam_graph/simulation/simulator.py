@@ -9,6 +9,7 @@ IMU, and a world with landmarks or textures.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +179,16 @@ def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
         rig = read_kalibr(config.calibration)
     else:
         rig = recorded if recorded is not None else euroc_rig()
-    return rig if config.cameras is None else rig.select(config.cameras)
+    if config.cameras is not None:
+        rig = rig.select(config.cameras)
+    if config.shutter_readout_s is None:
+        return rig
+    readout_s = config.shutter_readout_s
+    cameras = (
+        replace(c, readout_s=readout_s, rolling_shutter=readout_s > 0, stamped_row="first")
+        for c in rig.cameras
+    )
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _positions(motion: Motion) -> FloatArray:

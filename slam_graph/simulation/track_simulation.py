@@ -29,6 +29,10 @@ _POSES_AT_ONCE = 256
 
 _DESCRIPTOR_BYTES = 32
 
+_ROW_ITERATIONS = 6
+"""Iterations for the row at which a rolling shutter sees a point. At 3 rad/s and with a readout of
+30 ms the error falls to a tenth in each, and begins with 20 px."""
+
 BIT_FLIP_PROBABILITY = 0.08
 """Of each bit of an observed descriptor. Two observations of a landmark then differ in 38 of 256
 bits on average, below the matching threshold of ORB-SLAM (50)."""
@@ -65,11 +69,12 @@ class _Tracks:
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """Pose of the platform at a frame."""
+    """Pose of the platform at a frame, at the exposure of the middle row of the first camera."""
 
     stamp_ns: int
     rotation: FloatArray
     position: FloatArray
+    motion: Motion
 
 
 class TrackSimulator:
@@ -91,6 +96,7 @@ class TrackSimulator:
     ) -> None:
         self.views = [View.of(mounted) for mounted in rig.cameras]
         self.groups = camera_groups(rig, self.views)
+        self._middle_s = rig.cameras[0].middle_s
         self._world = world
         self._landmarks = landmarks
         self._config = config
@@ -109,14 +115,15 @@ class TrackSimulator:
 
         Args:
             motion: of the platform.
-            exposures_ns: (N,) times of exposure on the clock of the IMU.
+            exposures_ns: (N,) times of exposure on the clock of the IMU; of rolling shutters those
+                of the middle row of the first camera.
             offset_ns: time of the IMU clock minus time of the camera clock.
         """
         for first in range(0, len(exposures_ns), _POSES_AT_ONCE):
             stamps = exposures_ns[first : first + _POSES_AT_ONCE]
             rotations, positions = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
             for stamp_ns, R, p in zip(stamps.tolist(), rotations, positions, strict=True):
-                seen = self._observe(_Pose(stamp_ns, R, p))
+                seen = self._observe(_Pose(stamp_ns, R, p, motion))
                 yield FeatureFrame(stamp_ns - offset_ns, tuple(seen))
 
     def _observe(self, pose: _Pose) -> list[FeatureObservations]:
@@ -138,7 +145,26 @@ class TrackSimulator:
     def _see(self, view: View, pose: _Pose, landmarks: IntArray) -> tuple[IntArray, FloatArray]:
         """Which of some landmarks a camera sees (indices), and their pixels."""
         points, normals = self._landmarks.at(landmarks, pose.stamp_ns)
-        return view.see(pose.rotation, pose.position, points, normals, self._world)
+        index, pixels = view.see(pose.rotation, pose.position, points, normals, self._world)
+        if view.mounted.readout_s == 0.0 or len(index) == 0:
+            return index, pixels
+        return self._see_rolling(view, pose, index, points, pixels)
+
+    def _see_rolling(
+        self, view: View, pose: _Pose, index: IntArray, points: FloatArray, pixels: FloatArray
+    ) -> tuple[IntArray, FloatArray]:
+        """The same for a rolling shutter, of what is seen at the middle row's time.
+
+        The row at which a point is seen and the time of that row are solved for in turn. Moving
+        landmarks stay where they are at the middle row's time.
+        """
+        points = points[index]
+        for _ in range(_ROW_ITERATIONS):
+            seconds = view.mounted.row_times_s(pixels[:, 1]) - self._middle_s
+            stamps = pose.stamp_ns + np.round(seconds * 1e9).astype(np.int64)
+            R, p = pose.motion.rotations(stamps).as_matrix(), pose.motion.positions(stamps)
+            pixels, inside = view.project(R, p, points)
+        return index[inside], pixels[inside]
 
     def _follow(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
         """Keep the tracks that are still visible and not lost."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.sensors import Camera, Rig, RigCamera
 from slam_graph.simulation.world import World
 
@@ -29,6 +29,7 @@ class View:
 
     Attributes:
         camera: intrinsics.
+        mounted: the camera with its shutter.
         body_R_camera: (3, 3).
         position: (3,) of the camera in the body.
         reach: largest norm of a normalised point in the image; beyond it the distortion polynomial
@@ -36,6 +37,7 @@ class View:
     """
 
     camera: Camera
+    mounted: RigCamera
     body_R_camera: FloatArray
     position: FloatArray
     reach: float
@@ -48,7 +50,7 @@ class View:
         reach = float(np.max(np.linalg.norm(plane[valid], axis=1), initial=0.0))
         reach = reach if valid.all() else camera.max_tangent
         R, p = pose.rotation().matrix(), np.asarray(pose.translation())
-        return View(camera, R, p, 1.001 * reach)
+        return View(camera, mounted, R, p, 1.001 * reach)
 
     def pose(self, world_R_body: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """world_R_camera (3, 3) and position (3,) of the camera, for a pose of the body."""
@@ -84,12 +86,36 @@ class View:
         facing = np.einsum("ij,ij->i", from_eye[near], normals[near]) <= 0.0
         near, plane = near[facing], plane[facing]
         pixels = self.camera.distort(plane)[0]
-        low = BORDER_PX
-        high = np.array([self.camera.width - 1 - low, self.camera.height - 1 - low])
-        inside = np.all((pixels >= low) & (pixels <= high), axis=1)
+        inside = self._within_borders(pixels)
         near, pixels = near[inside], pixels[inside]
         clear = ~world.hidden(eye, points[near])
         return near[clear], pixels[clear]
+
+    def project(
+        self, world_R_body: FloatArray, positions: FloatArray, points: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Project points, each from its own pose; nothing hides them.
+
+        Args:
+            world_R_body: (N, 3, 3).
+            positions: (N, 3) of the body in the world.
+            points: (N, 3) in the world.
+
+        Returns:
+            Pixels (N, 2), and which of them (N,) are in the image.
+        """
+        R = world_R_body @ self.body_R_camera
+        local = np.einsum("nji,nj->ni", R, points - positions - world_R_body @ self.position)
+        plane = local[:, :2] / np.maximum(local[:, 2:], MIN_DEPTH_M)
+        pixels = self.camera.distort(plane)[0]
+        near = np.einsum("ij,ij->i", plane, plane) < self.reach**2
+        return pixels, near & (local[:, 2] > MIN_DEPTH_M) & self._within_borders(pixels)
+
+    def _within_borders(self, pixels: FloatArray) -> BoolArray:
+        """Which pixels (N, 2) are far enough from the border."""
+        low = BORDER_PX
+        high = np.array([self.camera.width - 1 - low, self.camera.height - 1 - low])
+        return np.asarray(np.all((pixels >= low) & (pixels <= high), axis=1))
 
 
 def _border(camera: Camera) -> FloatArray:

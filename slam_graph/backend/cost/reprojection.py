@@ -7,34 +7,33 @@ p = (body_T_camera)⁻¹ (world_T_body_i)⁻¹ f, in pixels. Jacobians are with 
 tangent (rotation, translation; body frame) and the world position of the feature; they agree with
 GTSAM's `GenericProjectionFactor`, but come for all observations in one pass.
 
-The parameters of the rig may be variables too (`CalibratedProjection`). They do not depend on the
-origin and heading of the world. So the projection may be linearised at the current
-calibration while poses and features stay at their first estimates: the unobservable directions
-remain unobservable (see `state`).
+The parameters of the rig may be variables too (`calibrated_projection`).
 
-The pose X(i) of a frame is that at the time t_i + τ_i, for the time offset τ_i that was known when
-the frame came. Under another offset τ the body is, to first order, at X(i) ⊕ (τ - τ_i) (ω_i, v_i),
-with its angular rate and velocity in the body frame then (Li and Mourikis 2014).
+The rows of a rolling shutter are exposed one after the other (Li, Kim and Mourikis 2013). The pose
+X(i) is that at the middle row, and at the time of another row, s later, the body is at X(i) ⊕
+m_i(s). So a row is a camera that is mounted elsewhere on the body, at m_i(s) body_T_camera. The
+motion m_i is that of the gyroscope and of the estimated velocity around the frame; it is linearised
+at its estimate like the calibration, and its own uncertainty is neglected: a velocity that is wrong
+by 0.05 m/s moves the first and the last row by 0.1 px at 3 m, with a readout of 30 ms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import E, K, T, X
-from scipy.spatial.transform import Rotation
+from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import FloatArray, skew
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.online_calibration import CalibrationVariables
-from slam_graph.backend.solve.square_root import Layout
-from slam_graph.backend.solve.state import State, dims_of, distortion_key, stacked_poses
-from slam_graph.sensors import Rig
+from slam_graph.backend.solve.state import FrameMotion, State, stacked_poses
+from slam_graph.sensors import FeatureFrame, Rig
 
-_MIN_DEPTH = 1e-3
+_STILL = FrameMotion(np.zeros(6), 0.0)
+
+MIN_DEPTH = 1e-3
 """Points nearer than this (m) are projected as if at this depth; depth checks reject them."""
 
 
@@ -59,22 +58,47 @@ class RigProjection:
     Attributes:
         body_R_camera: (C, 3, 3).
         body_p_camera: (C, 3).
+        rolling: whether a shutter rolls; observations are then projected from where their rows were
+            exposed, by the motions of their frames.
         calibration_keys: of the parameters of the rig that are variables.
     """
 
     calibration_keys: tuple[int, ...] = ()
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        motions: Mapping[int, FrameMotion] | None = None,
+        taken_by: Rig | None = None,
+    ) -> None:
+        """Take the calibration of a rig.
+
+        Args:
+            rig: the cameras.
+            motions: of frames, for rolling shutters; in frames without one the body stands still.
+            taken_by: the cameras in whose images features were found, if `rig` has simpler ones in
+                their place; pixels are then those of the simpler ones, and their rows are not those
+                of the images.
+        """
         self.cameras = [mounted.camera for mounted in rig.cameras]
         matrices = np.array([mounted.body_T_camera.matrix() for mounted in rig.cameras])
         self.body_R_camera = matrices[:, :3, :3]
         self.body_p_camera = matrices[:, :3, 3]
+        self.rolling = rig.rolling
+        self._rig = rig
+        self._motions = motions or {}
+        self._mounts: tuple[Observations, tuple[FloatArray, FloatArray]] | None = None  # the last
+        self._taken_by = taken_by or rig
 
     # --- overridden where the calibration is estimated (see `calibrated_projection`) --------------
 
     def at(self, state: State) -> RigProjection:
-        """The projection with the calibration of a state."""
-        return self
+        """The projection with the calibration of a state, and the motions of its frames."""
+        return self.moving(state.motions)
+
+    def moving(self, motions: Mapping[int, FrameMotion]) -> RigProjection:
+        """The projection with the motions of frames, which count for rolling shutters only."""
+        return RigProjection(self._rig, motions, self._taken_by) if self.rolling else self
 
     def keys_of(self, obs: Observations) -> list[int]:
         """Keys of all variables beside the features that observations depend on."""
@@ -94,6 +118,86 @@ class RigProjection:
         """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and calibration (N, 2, C)."""
         return (*self.jacobians(obs, at), np.zeros((len(obs), 2, 0)))
 
+    # --- rolling shutters -------------------------------------------------------------------------
+
+    def mounts(self, obs: Observations) -> tuple[FloatArray, FloatArray]:
+        """Rotations (N, 3, 3) and positions (N, 3) of cameras in the body, where they observed.
+
+        For a rolling shutter this is where the camera was at the time of the observed row, in the
+        frame of the body at the pose.
+        """
+        if self._mounts is not None and self._mounts[0] is obs:
+            return self._mounts[1]
+        R, p = self.body_R_camera[obs.camera], self.body_p_camera[obs.camera]
+        if not self.rolling or len(obs) == 0:
+            return R, p
+        turn, move = self._row_motions(obs).after(self.row_times_s(obs))
+        mounts = turn @ R, move + np.einsum("nij,nj->ni", turn, p)
+        self._mounts = obs, mounts
+        return mounts
+
+    def mount_poses(self, obs: Observations) -> list[gtsam.Pose3]:
+        """`mounts` as poses, as GTSAM's projection factors take them."""
+        return [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(*self.mounts(obs), strict=True)]
+
+    def row_times_s(self, obs: Observations) -> FloatArray:
+        """Times (N,) from the poses of frames to the exposures of the observed rows."""
+        if not self.rolling:
+            return np.zeros(len(obs))
+        readouts = np.array([mounted.readout_s for mounted in self._rig.cameras])
+        seconds: FloatArray = self.row_parts(obs) * readouts[obs.camera]
+        leads = [
+            self._motions[i].time_offset_s if i in self._motions else self._rig.pose_offset_s
+            for i in obs.frames
+        ]
+        seconds += self._rig.cameras[0].time_offset_s - np.array(leads)[obs.frame]
+        return seconds
+
+    def row_parts(self, obs: Observations) -> FloatArray:
+        """Derivatives (N,) of the times of the observed rows by the readout time: from -1 to 1."""
+        parts = np.zeros(len(obs))
+        for c, mounted in enumerate(self._rig.cameras):
+            rows, lens = obs.camera == c, self._taken_by.cameras[c].camera
+            pixels = obs.pixels[rows]
+            if lens is not mounted.camera and self._taken_by is not self._rig:
+                pixels = lens.distort(obs.normalized[rows])[0]
+            parts[rows] = mounted.row_parts(pixels[:, 1])
+        return parts
+
+    def row_turns(self, index: int, frame: FeatureFrame) -> list[FloatArray | None]:
+        """Rotations (N, 3, 3) of the body from the pose to the rows of the features of each camera.
+
+        Args:
+            index: of the frame in the motions.
+            frame: its features.
+
+        Returns:
+            One for each camera; None for global shutters.
+        """
+        if not self.rolling:
+            return [None] * len(frame.cameras)
+        turns: list[FloatArray | None] = []
+        for c, seen in enumerate(frame.cameras):
+            none = np.zeros(len(seen), np.int64)
+            camera = np.full(len(seen), c)
+            obs = Observations(seen.ids, (index,), none, none, camera, seen.pixels, seen.normalized)
+            turns.append(self._row_motions(obs).after(self.row_times_s(obs))[0])
+        return turns
+
+    def _row_motions(self, obs: Observations) -> FrameMotion:
+        """Motion of the body at the pose of each observation, N of them in one."""
+        motions = [self._motions.get(i, _STILL) for i in obs.frames]
+        rate = np.array([motion.rate for motion in motions])[obs.frame]
+        change = np.array([motion.change for motion in motions])[obs.frame]
+        return FrameMotion(rate, 0.0, change)
+
+    def _camera_R_body(self, obs: Observations) -> FloatArray:
+        """Rotations (N, 3, 3) from the body at the pose to the camera at the observed row."""
+        if self.rolling:
+            return np.ascontiguousarray(self.mounts(obs)[0].transpose(0, 2, 1))
+        camera_R_body = np.ascontiguousarray(self.body_R_camera.transpose(0, 2, 1))
+        return camera_R_body[obs.camera]
+
     # --- geometry ---------------------------------------------------------------------------------
 
     def in_body(self, obs: Observations, at: Geometry) -> FloatArray:
@@ -104,13 +208,13 @@ class RigProjection:
 
     def in_camera(self, obs: Observations, in_body: FloatArray) -> FloatArray:
         """Points (N, 3) of the body frame in the frame of the observing camera."""
-        difference = in_body - self.body_p_camera[obs.camera]
-        points: FloatArray = np.einsum("nji,nj->ni", self.body_R_camera[obs.camera], difference)
+        R, p = self.mounts(obs)
+        points: FloatArray = np.einsum("nji,nj->ni", R, in_body - p)
         return points
 
     def pixels(self, obs: Observations, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""
-        depth = np.maximum(in_camera[:, 2:3], _MIN_DEPTH)
+        depth = np.maximum(in_camera[:, 2:3], MIN_DEPTH)
         normalized = in_camera[:, :2] / depth
         if len(self.cameras) == 1:
             return self.cameras[0].distort(normalized)
@@ -134,8 +238,7 @@ class RigProjection:
         """
         in_body = self.in_body(obs, at)
         by_camera_point = self.by_camera_point(obs, self.in_camera(obs, in_body))
-        camera_R_body = np.ascontiguousarray(self.body_R_camera.transpose(0, 2, 1))
-        by_body_point = by_camera_point @ camera_R_body[obs.camera]
+        by_body_point = by_camera_point @ self._camera_R_body(obs)
         by_pose = np.empty((len(obs), 2, 6))
         # rotating the body by θ moves the point by p × θ in the body frame
         by_pose[:, :, :3] = np.cross(by_body_point, in_body[:, None, :])
@@ -146,132 +249,10 @@ class RigProjection:
 
     def by_camera_point(self, obs: Observations, in_camera: FloatArray) -> FloatArray:
         """Derivatives (N, 2, 3) of the pixels of points (N, 3) by these, in the camera frame."""
-        depth = np.maximum(in_camera[:, 2], _MIN_DEPTH)
+        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
         _, slope = self.pixels(obs, in_camera)
         derivative = np.empty((len(obs), 2, 3))
         derivative[:, :, :2] = slope / depth[:, None, None]
         ratio = in_camera[:, :2] / depth[:, None] ** 2
         derivative[:, :, 2] = -np.einsum("nij,nj->ni", slope, ratio)
         return derivative
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Shift:
-    """Motion of the body from the poses of F frames to when the frames were taken.
-
-    Attributes:
-        turn: (F, 3, 3) rotation.
-        move: (F, 3) translation.
-        rate: (F, 6) its derivative by the time, in the body frame at the end.
-    """
-
-    turn: FloatArray
-    move: FloatArray
-    rate: FloatArray
-
-    def by_pose(self) -> FloatArray:
-        """Derivative (F, 6, 6) of the pose at the end by the pose at the start."""
-        back = self.turn.transpose(0, 2, 1)
-        derivative = np.zeros((len(back), 6, 6))
-        derivative[:, :3, :3] = derivative[:, 3:, 3:] = back
-        derivative[:, 3:, :3] = -back @ skew(self.move)
-        return derivative
-
-
-class CalibratedProjection(RigProjection):
-    """Projects by the calibration that is in a state.
-
-    Attributes:
-        variables: which parameters are in the state.
-    """
-
-    def __init__(self, variables: CalibrationVariables, state: State | None = None) -> None:
-        """Take the calibration of a state; the nominal one without a state."""
-        rig = variables.nominal if state is None else variables.rig(state.estimate)
-        super().__init__(rig)
-        self.variables = variables
-        self.calibration_keys = variables.keys
-        self._state = state
-        self._columns = Layout(dims_of(variables.keys)).columns
-
-    def at(self, state: State) -> CalibratedProjection:
-        """The projection with the calibration of a state."""
-        return CalibratedProjection(self.variables, state)
-
-    def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
-        """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""
-        frames = list(frames)
-        rotations, positions = stacked_poses(values, frames)
-        shift = self._shift(frames)
-        if shift is None:
-            return rotations, positions
-        moved = positions + np.einsum("fij,fj->fi", rotations, shift.move)
-        return rotations @ shift.turn, moved
-
-    def renormalized(self, obs: Observations) -> Observations:
-        """The observations with normalised coordinates by the calibration."""
-        if not (self.variables.config.intrinsics or self.variables.config.distortion):
-            return obs
-        normalized = np.empty_like(obs.normalized)
-        for c, camera in enumerate(self.cameras):
-            rows = obs.camera == c
-            normalized[rows] = camera.undistort(obs.pixels[rows], near=obs.normalized[rows])
-        return replace(obs, normalized=normalized)
-
-    def all_jacobians(
-        self, obs: Observations, at: Geometry
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and calibration (N, 2, C).
-
-        Args:
-            obs: N observations.
-            at: poses of the body when the frames were taken, as `poses` gives them.
-        """
-        by_pose, by_point = self.jacobians(obs, at)
-        by_calibration = np.zeros((len(obs), 2, sum(dims_of(self.calibration_keys).values())))
-        in_camera = self.in_camera(obs, self.in_body(obs, at))
-        by_camera_point = self.by_camera_point(obs, in_camera)
-        normalized = in_camera[:, :2] / np.maximum(in_camera[:, 2:3], _MIN_DEPTH)
-        for c, camera in enumerate(self.cameras):
-            rows = obs.camera == c
-            if E(c) in self._columns:
-                by_camera = _by_camera_pose(by_camera_point[rows], in_camera[rows])
-                by_calibration[rows, :, self._columns[E(c)]] = by_camera @ self._tangent(c)
-            if K(c) in self._columns:
-                by_intrinsics = camera.by_intrinsics(normalized[rows])
-                by_calibration[rows, :, self._columns[K(c)]] = by_intrinsics
-            distortion = distortion_key(c, len(camera.coefficients))
-            if distortion in self._columns:
-                by_coefficients = camera.by_coefficients(normalized[rows])
-                by_calibration[rows, :, self._columns[distortion]] = by_coefficients
-        shift = self._shift(obs.frames)
-        if shift is not None:
-            by_offset = np.einsum("nij,nj->ni", by_pose, shift.rate[obs.frame])
-            by_calibration[:, :, self._columns[T(0)].start] = by_offset
-            by_pose = by_pose @ shift.by_pose()[obs.frame]
-        return by_pose, by_point, by_calibration
-
-    def _tangent(self, c: int) -> FloatArray:
-        """Derivative (6, 6) of the pose of a camera by its offset from its first estimate."""
-        if self._state is None:
-            return np.eye(6)
-        return np.asarray(gtsam.Pose3.ExpmapDerivative(self._state.offsets[E(c)]))
-
-    def _shift(self, frames: Iterable[int]) -> _Shift | None:
-        """From the poses of frames to when they were taken; None if no offset is estimated."""
-        if self._state is None or not self.variables.estimates_offset:
-            return None
-        offset_s = float(self._state.estimate.atVector(T(0))[0])
-        motions = [self._state.motions[i] for i in frames]
-        rate = np.array([motion.rate for motion in motions]).reshape(-1, 6)
-        late_s = np.array([offset_s - motion.time_offset_s for motion in motions])[:, None]
-        turn = Rotation.from_rotvec(rate[:, :3] * late_s).as_matrix()
-        velocity = np.einsum("fji,fj->fi", turn, rate[:, 3:])
-        return _Shift(turn, rate[:, 3:] * late_s, np.hstack([rate[:, :3], velocity]))
-
-
-def _by_camera_pose(by_camera_point: FloatArray, in_camera: FloatArray) -> FloatArray:
-    """Derivatives (N, 2, 6) of pixels by the pose of the camera in the body, in its own tangent."""
-    # turning the camera by θ moves the point by p × θ in the camera frame
-    by_rotation = np.cross(by_camera_point, in_camera[:, None, :])
-    return np.concatenate([by_rotation, -by_camera_point], axis=2)

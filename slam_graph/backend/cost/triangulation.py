@@ -140,8 +140,9 @@ def _rays(
 ) -> _Rays:
     anchor = np.searchsorted(obs.feature, np.arange(len(obs.ids)))
     body_R = rotations[obs.frame]
-    world_R = body_R @ rig.body_R_camera[obs.camera]
-    world_p = positions[obs.frame] + np.einsum("nij,nj->ni", body_R, rig.body_p_camera[obs.camera])
+    body_R_camera, body_p_camera = rig.mounts(obs)
+    world_R = body_R @ body_R_camera
+    world_p = positions[obs.frame] + np.einsum("nij,nj->ni", body_R, body_p_camera)
     home = anchor[obs.feature]
     camera_R_world = world_R.transpose(0, 2, 1)
     return _Rays(

@@ -24,7 +24,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_features import (
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
 from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
+from slam_graph.backend.solve.state import FrameMotion, State, imu_state_keys, stacked_points
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import ConfigError
@@ -58,6 +58,7 @@ class SmootherEngine:
         self._solver: SmootherSolver | None = None
         self._estimate = gtsam.Values()
         self._frames: dict[int, int] = {}  # indices and stamps of the states in the lag
+        self._motions: dict[int, FrameMotion] = {}  # of the same states, for rolling shutters
         self._origin_ns = 0
 
     def information(self, window: Window) -> SquareRootInformation:
@@ -114,6 +115,7 @@ class SmootherEngine:
         """At a standstill images only add errors: no factors, and tracks begin again."""
         tracks.keep_frames([])
         tracks.add(ahead.frame, frame)
+        self._note_motion(ahead, frame)
         tracks.remove(Outcome.STANDSTILL, self._features.active)
         return NewObservations()
 
@@ -123,10 +125,22 @@ class SmootherEngine:
         """What the images add to the graph at the new state."""
         tracks.keep_frames(list(self._frames))
         tracks.add(ahead.frame, frame)
+        self._note_motion(ahead, frame)
         estimate = gtsam.Values(self._estimate)
         estimate.insert(X(ahead.frame), predicted.world_T_body)
         assert predicted.covariance is not None
         return self._features.observe(tracks, ahead.frame, estimate, predicted.covariance[:6, :6])
+
+    def _note_motion(self, ahead: Window, frame: FeatureFrame) -> None:
+        """Note how the body moves while the rows of a rolling shutter are exposed."""
+        context, state = self._context, ahead.state
+        context.calibration.note_motion(
+            state, ahead.frame, ahead.stamp_ns, frame.stamp_ns, context.imu
+        )
+        if ahead.frame in state.motions:
+            kept = {i: motion for i, motion in self._motions.items() if i in self._frames}
+            self._motions = kept | {ahead.frame: state.motions[ahead.frame]}
+            self._features.move(self._motions)
 
     # --- the smoother ----------------------------------------------------------------------------
 

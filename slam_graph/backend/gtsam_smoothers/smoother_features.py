@@ -9,6 +9,7 @@ that sees it adds one observation. It leaves when no state in the lag has seen i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,7 +26,7 @@ from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import stacked_points, stacked_poses
+from slam_graph.backend.solve.state import FrameMotion, stacked_points, stacked_poses
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError
 from slam_graph.sensors import Camera, Rig
@@ -64,22 +65,32 @@ class ProjectionFactors:
         self._noise = noise
         self._cameras = [(*calibration(c.camera), c.body_T_camera) for c in rig.cameras]
 
-    def of(self, obs: Observations) -> list[gtsam.NonlinearFactor]:
+    def of(
+        self, obs: Observations, rolling: RigProjection | None = None
+    ) -> list[gtsam.NonlinearFactor]:
         """One factor between `X(frame)` and `L(feature)` for each observation.
 
         For a point behind the camera the cost is constant; no exception is raised.
+
+        Args:
+            obs: the observations.
+            rolling: says where the cameras were at the observed rows, if it has rolling shutters.
         """
         factors = []
+        mounts = [self._cameras[c][2] for c in obs.camera.tolist()]
+        if rolling is not None and rolling.rolling:
+            mounts = rolling.mount_poses(obs)
         poses, points = [X(i) for i in obs.frames], [L(j) for j in obs.ids.tolist()]
         rows = zip(
             obs.pixels,
             obs.camera.tolist(),
             obs.frame.tolist(),
             obs.feature.tolist(),
+            mounts,
             strict=True,
         )
-        for pixel, c, i, j in rows:
-            model, factor, body_T_camera = self._cameras[c]
+        for pixel, c, i, j, body_T_camera in rows:
+            model, factor, _ = self._cameras[c]
             keys = (poses[i], points[j])
             factors.append(factor(pixel, self._noise, *keys, model, False, False, body_T_camera))
         return factors
@@ -150,6 +161,10 @@ class SmootherFeatures:
         kept = [j for j in self.active.tolist() if estimate.exists(L(j))]
         self.active = np.array(kept, np.int64)
 
+    def move(self, motions: Mapping[int, FrameMotion]) -> None:
+        """Take the motions of all frames in the lag, by which rows of rolling shutters moved."""
+        self._rig = self._rig.moving(motions)
+
     def observe(
         self, tracks: FeatureTracks, frame: int, estimate: gtsam.Values, covariance: FloatArray
     ) -> NewObservations:
@@ -178,7 +193,7 @@ class SmootherFeatures:
         return new
 
     def _add(self, new: NewObservations, obs: Observations, ids: IntArray) -> None:
-        new.factors += self._factors.of(obs)
+        new.factors += self._factors.of(obs, self._rig)
         new.seen += [L(j) for j in ids.tolist()]
 
     def _gate(self, obs: Observations, estimate: gtsam.Values, covariance: FloatArray) -> BoolArray:

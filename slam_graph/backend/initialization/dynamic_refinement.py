@@ -90,9 +90,11 @@ class DynamicRefinement:
         cost = self._batch_cost(frames, guess)
         try:
             minimize(cost, _BATCH)
+            self._refine_motions(cost, frames)
             if not self._remove_outliers(cost, frames):
                 return "features that fit the motion"
             minimize(cost, _BATCH)
+            self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
             final = minimize(cost, _FINAL)
             before, after = final.costs
@@ -143,6 +145,11 @@ class DynamicRefinement:
         result = self._triangulated(cost, obs)
         _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
         return cost
+
+    def _refine_motions(self, cost: Cost, frames: StartFrames) -> None:
+        """Take the velocities of the solution for the motion between rows of rolling shutters."""
+        for k, stamp_ns in enumerate(frames.stamps_ns):
+            self._context.calibration.refine_motion(cost.state, k, stamp_ns, self._context.imu)
 
     def _triangulated(self, cost: Cost, obs: Observations) -> Triangulation:
         """Features from the current estimates of the poses."""

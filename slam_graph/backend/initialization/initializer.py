@@ -107,10 +107,11 @@ class Initializer:
             return self.waiting_for
         self._tried_ns = stamp_ns
         frames = StartFrames.thinned(self._stamps_ns, self._frames, FRAME_SPACING_S)
+        turning = context.calibration.turning(frames.stamps_ns, frames.frames, context.imu)
         guess = guess_states(
             frames,
             context.imu,
-            context.projection,
+            context.projection.moving(turning),
             self._params,
             context.config.noise,
             self._rng,

@@ -112,14 +112,16 @@ def _pairs(
     bias: FloatArray,
 ) -> _Pairs | None:
     first, second, rotations, derivatives = [], [], [], []
-    for before, after, samples in zip(frames[:-1], frames[1:], imu, strict=True):
+    turns = [rig.row_turns(k, frame) for k, frame in enumerate(frames)]
+    for k, samples in enumerate(imu):
+        before, after = frames[k], frames[k + 1]
         R, by_bias = _rotation_by_bias(samples, bias, params)
         for camera, (one, two) in enumerate(zip(before.cameras, after.cameras, strict=True)):
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
             if len(i) >= _MIN_COMMON:
                 mounting = rig.body_R_camera[camera]
-                first.append(_bearings(one, i, mounting))
-                second.append(_bearings(two, j, mounting))
+                first.append(_bearings(one, i, mounting, turns[k][camera]))
+                second.append(_bearings(two, j, mounting, turns[k + 1][camera]))
                 rotations.append(R)
                 derivatives.append(by_bias)
     if not first:
@@ -168,10 +170,12 @@ def _rotation(
     return np.asarray(samples.preintegrated(bias, params).deltaRij().matrix())
 
 
-def _bearings(obs: FeatureObservations, rows: NDArray[np.intp], R: FloatArray) -> FloatArray:
+def _bearings(
+    obs: FeatureObservations, rows: NDArray[np.intp], R: FloatArray, turns: FloatArray | None
+) -> FloatArray:
     bearings = np.concatenate([obs.normalized[rows], np.ones((len(rows), 1))], axis=1)
     unit: FloatArray = (bearings / np.linalg.norm(bearings, axis=1, keepdims=True)) @ R.T
-    return unit
+    return unit if turns is None else np.einsum("nij,nj->ni", turns[rows], unit)
 
 
 _REWEIGHTINGS = 2
@@ -249,16 +253,21 @@ def alignment_equations(
     obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coefficients of f (N, 2, 3) and of (v₀, g) (N, 2, 6), and right-hand sides (N, 2)."""
-    camera_R_body = rig.body_R_camera[obs.camera].transpose(0, 2, 1)
+    body_R_camera, body_p_camera = rig.mounts(obs)
+    camera_R_body = body_R_camera.transpose(0, 2, 1)
     rows = np.zeros((len(obs), 2, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1.0
     rows[:, :, 2] = -obs.normalized
     in_body = rows @ camera_R_body * weights[:, None, None]
     by_point = in_body @ motion.rotations[obs.frame].transpose(0, 2, 1)
-    t = motion.times_s[obs.frame][:, None, None]
+    late_s = rig.row_times_s(obs)  # of the rows of a rolling shutter
+    t = (motion.times_s[obs.frame] + late_s)[:, None, None]
     by_motion = np.concatenate([-by_point * t, -0.5 * by_point * t**2], axis=2)
-    b = np.einsum("nij,nj->ni", by_point, motion.displacements[obs.frame])
-    b += np.einsum("nij,nj->ni", in_body, rig.body_p_camera[obs.camera])
+    displacements = motion.displacements[obs.frame]
+    if rig.rolling:
+        displacements = displacements + motion.velocities[obs.frame] * late_s[:, None]
+    b = np.einsum("nij,nj->ni", by_point, displacements)
+    b += np.einsum("nij,nj->ni", in_body, body_p_camera)
     return by_point, by_motion, b
 
 
@@ -282,8 +291,8 @@ def _depths(
     points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :3])[:, :, 0]
     p = found.positions(motion)[obs.frame]
     in_body = np.einsum("nji,nj->ni", motion.rotations[obs.frame], points[obs.feature] - p)
-    camera_axis = rig.body_R_camera[obs.camera][:, :, 2]
-    depths = np.einsum("ni,ni->n", camera_axis, in_body - rig.body_p_camera[obs.camera])
+    body_R_camera, body_p_camera = rig.mounts(obs)
+    depths = np.einsum("ni,ni->n", body_R_camera[:, :, 2], in_body - body_p_camera)
     return np.asarray(np.maximum(np.abs(depths), MIN_DEPTH_M), dtype=np.float64)
 
 

@@ -207,7 +207,7 @@ def _extended_backward(
     followed by a bundle adjustment of the frames around it.
     """
     keyframes = log.keyframes
-    stamps_ns = log.frames_ns[keyframes] + round(task.rig.cameras[0].time_offset_s * 1e9)
+    stamps_ns = log.frames_ns[keyframes] + round(task.rig.pose_offset_s * 1e9)
     while (before := int(np.searchsorted(stamps_ns, causal.stamps_ns[0]))) > _STRIDE:
         first = before - _STRIDE
         segment = _read(log, keyframes[first : before + _CONTEXT], task)

@@ -121,7 +121,7 @@ class FrameLog:
         """Whether a frame is later than the others and within the IMU samples."""
         if self._imu_ns is None or (len(self._frames) and frame_ns <= self._frames[-1]):
             return False
-        stamp_ns = frame_ns + round(self.rig.cameras[0].time_offset_s * 1e9)
+        stamp_ns = frame_ns + round(self.rig.pose_offset_s * 1e9)
         first_ns, last_ns = self._imu_ns
         return first_ns - _MAX_BEYOND_NS <= stamp_ns <= last_ns + _MAX_BEYOND_NS
 

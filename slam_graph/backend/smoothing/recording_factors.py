@@ -50,7 +50,7 @@ def averaged(
     seen: Observations,
     all_frames: Geometry,
     nearest: IntArray,
-    projection: RigProjection,
+    projections: tuple[RigProjection, RigProjection],
     limit_px: float,
 ) -> tuple[Observations, FloatArray]:
     """Observations of keyframes, averaged over the frames around them.
@@ -61,14 +61,16 @@ def averaged(
         seen: observations of the same features in all frames.
         all_frames: poses of all frames, points of the features of `obs`.
         nearest: (N,) number of the keyframe nearest to each frame.
-        projection: of the rig.
+        projections: of the rig; with the motions of keyframes, and with those of all frames, by
+            which rolling shutters moved.
         limit_px: observations with a larger reprojection error are outliers.
 
     Returns:
         The observations, and their variances (M,) relative to that of a single observation;
         infinite where all observations of the group are outliers.
     """
-    residuals, depths = projection.residuals(seen, all_frames)
+    projection, everywhere = projections
+    residuals, depths = everywhere.residuals(seen, all_frames)
     fits = (np.linalg.norm(residuals, axis=1) < limit_px) & (depths > 0.0)
     cameras = len(projection.cameras)
     key = _key(seen.feature, nearest[seen.frame], seen.camera, len(obs.frames), cameras)
@@ -154,7 +156,7 @@ class RecordingFactors:
         return _graph(self._prior(values) + self._dynamics(values))
 
     def projections(
-        self, obs: Observations, variances: FloatArray, sigma_px: float
+        self, obs: Observations, variances: FloatArray, sigma_px: float, rolling: RigProjection
     ) -> gtsam.NonlinearFactorGraph:
         """One projection factor for each observation.
 
@@ -162,12 +164,14 @@ class RecordingFactors:
             obs: of the keyframes; frame indices are those of keyframes.
             variances: (N,) relative to that of a single observation.
             sigma_px: standard deviation of a single observation.
+            rolling: with the motions of the keyframes, for rolling shutters.
         """
         loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
         factors: list[gtsam.NonlinearFactor] = []
         for variance in np.unique(variances).tolist():  # one noise model for each group size
             noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
-            factors += ProjectionFactors(self._rig, noise).of(obs.rows(variances == variance))
+            group = obs.rows(variances == variance)
+            factors += ProjectionFactors(self._rig, noise).of(group, rolling)
         return _graph(factors)
 
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:

@@ -32,6 +32,7 @@ from slam_graph.backend.smoothing.recording_factors import (
 from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     longest_tracks,
+    row_motions,
     triangulated,
     views,
     with_gtsam_cameras,
@@ -163,7 +164,7 @@ class BundleAdjustment:
         self._segment = segment = start.segment
         self._task = replace(task, rig=with_gtsam_cameras(task.rig))
         self._backend, self._config = backend, config = task.backend, task.config
-        self._projection = RigProjection(self._task.rig)
+        self._projection = RigProjection(self._task.rig, taken_by=task.rig)
         self._report = report
         self._factors = RecordingFactors(segment, start.anchor, self._task.rig, backend, config)
         seen = segment.seen_by_keyframes()
@@ -178,6 +179,7 @@ class BundleAdjustment:
             self._values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
             self._values.insert(B(k), bias)
+        self._note_motions()
 
     @property
     def imu_noise(self) -> ImuNoiseFactors:
@@ -194,6 +196,7 @@ class BundleAdjustment:
         before = self._minimize_loosely()
         points, good = self._triangulated(self._candidates)
         points, good = self._with_estimates(self._candidates, points, good)
+        self._note_motions()
         if self._config.learn_pixel_sigma:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
@@ -292,12 +295,17 @@ class BundleAdjustment:
         own = Geometry(*stacked_poses(self._values, obs.frames), points)
         limit_px = OUTLIER_WIDTH * self._sigma_px
         if self._config.average_frames:
-            matrices = np.array([s.world_T_body.matrix() for s in self._states()])
+            states = self._states()
+            matrices = np.array([s.world_T_body.matrix() for s in states])
             all_frames = Geometry(matrices[:, :3, :3], matrices[:, :3, 3], points)
             nearest = nearest_keyframe(self._segment.stamps_ns, self._segment.keyframes)
+            motions = row_motions(states, self._segment.imu, self._task.rig)
+            everywhere = self._projection.moving(motions)
         else:
             all_frames, nearest = own, np.arange(len(self._segment.keyframes))
-        obs, variances = averaged(obs, own, seen, all_frames, nearest, self._projection, limit_px)
+            everywhere = self._projection
+        projections = self._projection, everywhere
+        obs, variances = averaged(obs, own, seen, all_frames, nearest, projections, limit_px)
         used = np.isfinite(variances)
         obs, variances = obs.rows(used), variances[used]
         enough = np.bincount(views(obs)[0], minlength=len(obs.ids)) >= _MIN_KEYFRAMES
@@ -328,7 +336,8 @@ class BundleAdjustment:
             start.insert(L(j), point)
         inertial = self._factors.inertial(self._values)
         graph = gtsam.NonlinearFactorGraph(inertial)
-        graph.push_back(self._factors.projections(obs, variances, self._sigma_px))
+        projections = self._factors.projections(obs, variances, self._sigma_px, self._projection)
+        graph.push_back(projections)
         params = gtsam.LevenbergMarquardtParams()
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
         params.setOrdering(ordering)
@@ -361,8 +370,19 @@ class BundleAdjustment:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None
 
+    def _note_motions(self) -> None:
+        """Take the current velocities for the motion between the rows of rolling shutters."""
+        if self._projection.rolling:
+            motions = row_motions(self._keyframe_states(), self._segment.imu, self._task.rig)
+            self._projection = self._projection.moving(motions)
+
     def _states(self) -> list[NavState]:
         """The states of all frames."""
+        stamps_ns, imu = self._segment.stamps_ns, self._segment.imu
+        return fill_in(self._keyframe_states(), stamps_ns, imu, self._task.preintegration)
+
+    def _keyframe_states(self) -> list[NavState]:
+        """The states of the keyframes."""
         keyframes = []
         for k, stamp_ns in enumerate(self._segment.keyframe_stamps_ns.tolist()):
             bias = self._values.atConstantBias(B(k))
@@ -375,5 +395,4 @@ class BundleAdjustment:
                     gyro_bias=np.asarray(bias.gyroscope()),
                 )
             )
-        stamps_ns, imu = self._segment.stamps_ns, self._segment.imu
-        return fill_in(keyframes, stamps_ns, imu, self._task.preintegration)
+        return keyframes

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +15,30 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.online_calibration import rolling_motion
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.solve.state import FrameMotion
+from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
 
 _MAX_INITIAL_ERROR = 30.0
 """Features with a larger root-mean-square reprojection error are left out, in units of σ."""
 _RECENT_NS = 10_000_000_000
 """Length of the IMU buffer in which a standstill is detected."""
+
+
+def row_motions(states: Sequence[NavState], imu: ImuBuffer, rig: Rig) -> dict[int, FrameMotion]:
+    """How the body moves while the rows of rolling shutters are exposed; none for global ones.
+
+    Args:
+        states: of frames 0, 1, ….
+        imu: samples over all of these times.
+        rig: the cameras.
+    """
+    if not rig.rolling:
+        return {}
+    lead_ns = round(rig.pose_offset_s * 1e9)
+    return {k: rolling_motion(s, s.stamp_ns - lead_ns, imu, rig) for k, s in enumerate(states)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +87,7 @@ def read_segment(
         standstill: settings of the standstill detector.
     """
     first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
-    offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
+    offset_ns = round(rig.pose_offset_s * 1e9)
     detector, recent = StandstillDetector(standstill), ImuBuffer()
     samples, stamps, still = [], [], []
     columns: list[tuple[IntArray, ...]] = []

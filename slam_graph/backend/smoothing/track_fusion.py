@@ -39,6 +39,7 @@ from slam_graph.backend.smoothing.recording_problem import (
 )
 from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
+    row_motions,
     triangulated,
     views,
     with_gtsam_cameras,
@@ -110,7 +111,8 @@ def _labels(
     segment: RecordingSegment, states: list[NavState], rig: Rig, backend: BackendConfig
 ) -> IntArray:
     """The labels (J,) of the features of a segment."""
-    projection = RigProjection(with_gtsam_cameras(rig))
+    motions = row_motions(states, segment.imu, rig)
+    projection = RigProjection(with_gtsam_cameras(rig), motions, rig)
     seen = segment.seen_by_keyframes()
     often = np.bincount(views(seen)[0], minlength=len(seen.ids)) > 1
     label = np.arange(len(often))

@@ -17,11 +17,12 @@ information about unobservable directions (global position and yaw).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, D, L, V, X
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import Layout
@@ -75,15 +76,44 @@ def imu_state_keys(frame: int) -> tuple[int, int, int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMotion:
-    """How the body moved when a frame was taken, for the time offset of the cameras.
+    """How the body moved when a frame was taken, for the time offset and rolling shutters.
 
     Attributes:
         rate: (6,) angular rate (rad/s) and velocity (m/s), both in the body frame.
-        time_offset_s: the time offset under which the pose of the frame is the pose at its time.
+        time_offset_s: time of the pose, on the clock of the IMU, since the stamp of the frame. For
+            a global shutter the time offset under which the pose is that at the frame's time.
+        change: (6,) derivatives of the angular rate (rad/s²), and acceleration (m/s²) in the body
+            frame; used for rolling shutters only.
     """
 
     rate: FloatArray
     time_offset_s: float
+    change: FloatArray = field(default_factory=lambda: np.zeros(6))
+
+    def after(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the body was at N times, in its frame at the pose.
+
+        `rate` and `change` may be (N, 6) too: those of N frames, each at one time.
+
+        Args:
+            seconds: (N,) since the pose; so short that rates are linear over it.
+
+        Returns:
+            Rotations (N, 3, 3) and positions (N, 3).
+        """
+        t = seconds[:, None]
+        moved = self.rate * t + 0.5 * t * t * self.change
+        return Rotation.from_rotvec(moved[:, :3]).as_matrix(), moved[:, 3:]
+
+    def rates_after(self, seconds: FloatArray) -> FloatArray:
+        """Angular rate and velocity (N, 6) of the body at N times, in its frame then."""
+        t = seconds[:, None]
+        rates = self.rate + self.change * t
+        angles = (self.rate * t + 0.5 * t * t * self.change)[:, :3]
+        # from the derivative of the rotation vector, to first order in it
+        rates[:, :3] -= 0.5 * np.cross(angles, rates[:, :3])
+        rates[:, 3:] = np.einsum("nji,nj->ni", self.after(seconds)[0], rates[:, 3:])
+        return rates
 
 
 class State:
@@ -94,7 +124,7 @@ class State:
         offsets: tangent (dim,) of every variable at its linearisation point.
         estimate: current values, first ⊕ offsets.
         frozen: keys whose linearisation point no longer moves.
-        motions: of each frame with a pose, where a time offset is estimated.
+        motions: of each frame with a pose, where a time offset is estimated or a shutter rolls.
     """
 
     def __init__(self) -> None:

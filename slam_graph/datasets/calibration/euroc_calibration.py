@@ -5,14 +5,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.errors import DataError
 from slam_graph.sensors import CAMERA_MODELS, Camera, CameraModel, ImuNoise, Rig, RigCamera
+
+MAX_READOUT_S = 0.1
+"""Longest readout of a rolling shutter that a calibration may give."""
+
+_SAME_READOUT = 0.01
+"""Largest relative difference of `readout_time` from `line_delay` times the height."""
 
 
 def read_camera(entry: YamlValue) -> Camera:
@@ -108,20 +115,58 @@ def camera_entry(camera: Camera) -> CameraEntry:
     return CameraEntry(model.kalibr_camera, intrinsics, names[0], names[-1], rest)
 
 
-def has_rolling_shutter(entry: YamlValue) -> bool:
-    """Whether the calibration of a camera says that its rows are exposed one after the other.
+def with_shutter(mounted: RigCamera, entry: YamlValue) -> RigCamera:
+    """A camera with the shutter that its calibration describes.
 
-    Neither EuRoC nor Kalibr's camera chains have a key for it. Taken as such are `rolling_shutter`
-    (true), `shutter` or `shutter_type` (rolling), and `line_delay` or `readout_time` if they are
-    not zero.
+    A shutter rolls by `line_delay` (Kalibr's: seconds from row to row) or `readout_time` (ours:
+    `line_delay` times the height), if these are not zero. `stamped_row` (`first`, `middle` or
+    `last`) says of which row the stamps are; without it, of the first. Neither EuRoC nor Kalibr's
+    camera chains have a key that only says that a shutter rolls; `rolling_shutter` (true),
+    `shutter` and `shutter_type` (rolling) are taken as such.
+
+    Raises:
+        DataError: naming file and line of a value that makes no sense.
     """
     flag, kind = entry.get("rolling_shutter"), entry.get("shutter") or entry.get("shutter_type")
-    delays = [entry.get(key) for key in ("line_delay", "readout_time")]
-    return (
+    readout_s = _readout_s(mounted.camera, entry)
+    rolling = (
         (flag is not None and flag.text().lower() in ("true", "yes", "1"))
         or (kind is not None and "rolling" in kind.text().lower())
-        or any(delay is not None and delay.number() != 0.0 for delay in delays)
+        or readout_s != 0.0
     )
+    shutter = replace(mounted, rolling_shutter=rolling, readout_s=readout_s)
+    row = entry.get("stamped_row")
+    if row is None or row.text() == "first":
+        return shutter
+    if row.text() == "middle":
+        return replace(shutter, stamped_row="middle")
+    if row.text() == "last":
+        return replace(shutter, stamped_row="last")
+    raise DataError(f"{row.where}: '{row.text()}' is not first, middle or last")
+
+
+def _readout_s(camera: Camera, entry: YamlValue) -> float:
+    """The readout time of a shutter; 0 where it is not given."""
+    delay, readout = entry.get("line_delay"), entry.get("readout_time")
+    values_s = [delay.number() * camera.height] if delay is not None else []
+    values_s += [readout.number()] if readout is not None else []
+    if not values_s:
+        return 0.0
+    where = (readout or delay or entry).where
+    if abs(values_s[0] - values_s[-1]) > _SAME_READOUT * abs(values_s[-1]):
+        raise DataError(f"{where}: does not fit line_delay, which says {values_s[0]:.6g} s")
+    if abs(values_s[-1]) > MAX_READOUT_S:
+        raise DataError(f"{where}: a readout of {values_s[-1]:g} s; at most {MAX_READOUT_S:g} s")
+    return values_s[-1]
+
+
+def shutter_entry(mounted: RigCamera) -> dict[str, Any]:
+    """What a calibration file says of a rolling shutter; `with_shutter` reads it."""
+    values: dict[str, Any] = {"rolling_shutter": True} if mounted.rolling_shutter else {}
+    if mounted.readout_s:
+        values["readout_time"] = float(mounted.readout_s)
+        values["stamped_row"] = mounted.stamped_row
+    return values
 
 
 def read_imu_noise(entry: YamlValue) -> ImuNoise:
@@ -166,13 +211,11 @@ def read_euroc_rig(mav0: str | Path, cameras: Iterable[str], imu: str = "imu0") 
         entry = read_yaml(mav0 / name / "sensor.yaml")
         platform_T_camera = entry.require("T_BS").pose()
         shift = entry.get("timeshift_cam_imu")  # not EuRoC's; our writer adds it
-        mounted.append(
-            RigCamera(
-                read_camera(entry),
-                platform_T_imu.between(platform_T_camera),
-                0.0 if shift is None else shift.number(),
-                name,
-                has_rolling_shutter(entry),
-            )
+        camera = RigCamera(
+            read_camera(entry),
+            platform_T_imu.between(platform_T_camera),
+            0.0 if shift is None else shift.number(),
+            name,
         )
+        mounted.append(with_shutter(camera, entry))
     return Rig(tuple(mounted), noise)

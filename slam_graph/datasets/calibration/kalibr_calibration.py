@@ -21,9 +21,10 @@ import yaml
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, parse_yaml, read_yaml
 from slam_graph.datasets.calibration.euroc_calibration import (
     camera_entry,
-    has_rolling_shutter,
     read_camera,
     read_imu_noise,
+    shutter_entry,
+    with_shutter,
 )
 from slam_graph.errors import DataError
 from slam_graph.sensors import ImuNoise, Rig, RigCamera
@@ -93,13 +94,13 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) 
     body_T_camera = _body_T_camera(entry, previous, needs_imu)
     shift = entry.get("timeshift_cam_imu")
     name = entry.get("name")
-    return RigCamera(
+    mounted = RigCamera(
         read_camera(entry),
         body_T_camera,
         0.0 if shift is None else shift.number(),
         entry.key if name is None else name.text(),
-        has_rolling_shutter(entry),
     )
+    return with_shutter(mounted, entry)
 
 
 def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
@@ -156,8 +157,7 @@ def kalibr_text(rig: Rig) -> str:
 
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
     camera, entry = mounted.camera, camera_entry(mounted.camera)
-    shutter = {"rolling_shutter": True} if mounted.rolling_shutter else {}
-    return shutter | {
+    return shutter_entry(mounted) | {
         "name": mounted.name,
         "camera_model": entry.camera_model,
         "intrinsics": entry.intrinsics,

@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.calibration.euroc_calibration import camera_entry
+from slam_graph.datasets.calibration.euroc_calibration import camera_entry, shutter_entry
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
@@ -232,7 +232,7 @@ def _truth_rows(truth: Trajectory) -> FloatArray:
 
 
 def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
-    """What EuRoC's ``sensor.yaml`` holds, and Kalibr's key for the time offset, if there is one."""
+    """What EuRoC's ``sensor.yaml`` holds, and keys for time offset and rolling shutter, if any."""
     camera, entry = mounted.camera, camera_entry(mounted.camera)
     values: dict[str, object] = {
         "T_BS": _matrix(mounted.body_T_camera),
@@ -245,9 +245,7 @@ def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
     }
     if mounted.time_offset_s:
         values["timeshift_cam_imu"] = float(mounted.time_offset_s)
-    if mounted.rolling_shutter:
-        values["rolling_shutter"] = True
-    return values
+    return values | shutter_entry(mounted)
 
 
 def _imu_values(noise: ImuNoise) -> dict[str, object]:
