@@ -77,6 +77,8 @@ class RigCamera:
         name: of the camera in its data set, e.g. ``cam0``.
         rolling_shutter: whether its rows are exposed one after the other. The estimator takes them
             as exposed at one time all the same.
+        rotation_known: whether the rotation of `body_T_camera` is calibrated; otherwise it is
+            estimated before a start.
     """
 
     camera: Camera
@@ -84,6 +86,7 @@ class RigCamera:
     time_offset_s: float = 0.0
     name: str = ""
     rolling_shutter: bool = False
+    rotation_known: bool = True
 
 
 @dataclass(frozen=True, eq=False)
