@@ -48,6 +48,8 @@ _IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
 _LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame after a new beginning."""
+_ROUNDS, _REPEATED_S = 3, 1e-3
+"""Most beginnings with a corrected time offset; another is made if its estimate moved by more."""
 _MAX_AHEAD_NS = 10_000_000_000
 """A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
@@ -95,6 +97,7 @@ class Estimator:
         self.algorithm = algorithm
         self.config = config
         self.diagnostics = diagnostics
+        self.replayed: list[NavState] = []
         self._begin(ImuBuffer())
 
     def _begin(self, imu: ImuBuffer) -> None:
@@ -185,11 +188,10 @@ class Estimator:
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""
         self.diagnostics.warn("calibration_corrected", found.message)
-        frames, imu = self._check.recent, self._context.imu
         self.rig = found.rig
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
             self.config = found.config
-        given = self._given
+        given, frames = self._given, self._check.recent
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
             given = None  # too long ago: the IMU alone would have to lead from there to here
             change = {"mode": "auto"}
@@ -197,11 +199,23 @@ class Estimator:
             self.config = self.config.model_copy(update={"initialization": initialization})
         if self.window is not None:
             self._output_ns = self.window.stamp_ns
-        self._begin(imu)
-        if given is not None:
-            self.start(given)
-        self._held = deque(frames)
-        return self._take_held(self._held)
+        for _ in range(_ROUNDS):
+            self._begin(self._context.imu)
+            if given is not None:
+                self.start(given)
+            self._held, self.replayed = deque(frames), []
+            state = self._take_held(self._held)
+            better = self.calibration
+            if better is None or not self._moved_far(better.rig):
+                break
+            # the first linearisation points were those of an offset some milliseconds off
+            self.rig = better.rig
+        return state
+
+    def _moved_far(self, rig: Rig) -> bool:
+        """Whether the time offset of a rig is far from that which the start was made with."""
+        change_s = rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
+        return abs(change_s) > _REPEATED_S
 
     def _take_held(self, held: deque[FeatureFrame]) -> NavState | None:
         """The state at the last of the frames whose time the IMU has reached, if it is new."""
@@ -211,7 +225,10 @@ class Estimator:
             offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
             if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns():
                 break
-            newest = self._take(held.popleft()) or newest
+            state = self._take(held.popleft())
+            if state is not None:
+                newest = state
+                self.replayed.append(state)
         if newest is None or newest.stamp_ns <= self._output_ns:
             return None
         self._output_ns = newest.stamp_ns
