@@ -61,6 +61,9 @@ class Estimator:
 
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
+        rig: the sensors, as calibrated or corrected at the start.
+        replayed: where the last frame led to a beginning with another calibration, the states of
+            the frames of the last seconds, which supersede all states before; else empty.
     """
 
     def __init__(
@@ -155,7 +158,8 @@ class Estimator:
             if self._held is None:
                 return self._take(frame)
             self._held.append(frame)
-            return self._take_held(self._held)
+            self.replayed = []
+            return self._new(self._take_held(self._held))
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
@@ -203,23 +207,31 @@ class Estimator:
             self._begin(self._context.imu)
             if given is not None:
                 self.start(given)
-            self._held, self.replayed = deque(frames), []
-            state = self._take_held(self._held)
+            self._held = deque(frames)
+            self.replayed = self._take_held(self._held)
             better = self.calibration
             if better is None or not self._moved_far(better.rig):
                 break
             # the first linearisation points were those of an offset some milliseconds off
             self.rig = better.rig
-        return state
+        return self._new(self.replayed)
+
+    def _new(self, states: list[NavState]) -> NavState | None:
+        """The last of some states if it is later than those before."""
+        if not states or states[-1].stamp_ns <= self._output_ns:
+            return None
+        self._output_ns = states[-1].stamp_ns
+        return states[-1]
 
     def _moved_far(self, rig: Rig) -> bool:
         """Whether the time offset of a rig is far from that which the start was made with."""
         change_s = rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
         return abs(change_s) > _REPEATED_S
 
-    def _take_held(self, held: deque[FeatureFrame]) -> NavState | None:
-        """The state at the last of the frames whose time the IMU has reached, if it is new."""
-        newest, variables = None, self._context.calibration
+    def _take_held(self, held: deque[FeatureFrame]) -> list[NavState]:
+        """States at the frames whose time the IMU has reached."""
+        states: list[NavState] = []
+        variables = self._context.calibration
         while held:
             rig = self.rig if self.window is None else variables.rig(self.window.state.estimate)
             offset_ns = round(rig.cameras[0].time_offset_s * 1e9)
@@ -227,12 +239,8 @@ class Estimator:
                 break
             state = self._take(held.popleft())
             if state is not None:
-                newest = state
-                self.replayed.append(state)
-        if newest is None or newest.stamp_ns <= self._output_ns:
-            return None
-        self._output_ns = newest.stamp_ns
-        return newest
+                states.append(state)
+        return states
 
     def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible."""
@@ -266,6 +274,11 @@ class Estimator:
     def initialized(self) -> bool:
         """Whether there is a state."""
         return self.window is not None
+
+    @property
+    def corrected_rig(self) -> Rig | None:
+        """The rig, if the first motion has shown that its calibration does not fit; else None."""
+        return None if self._held is None else self.rig
 
     @property
     def waiting_for(self) -> str:

@@ -161,7 +161,7 @@ class _Problem:
         J = by_bias
         if free:  # C exp(θ) turns the vectors by θ × v
             vectors = Rotation.from_matrix(self._turns.R).as_rotvec()
-            by_mounting = np.broadcast_to(C @ skew(vectors), body.shape + (3,))
+            by_mounting = np.broadcast_to(C @ skew(vectors), (*body.shape, 3))
             J = np.concatenate([J, by_mounting], axis=-1)
         root = np.linalg.cholesky(C @ self._turns.information @ C.T).swapaxes(-1, -2)
         r, J = np.einsum("kij,dkj->dki", root, r), root @ J
@@ -202,7 +202,7 @@ def align_gyroscope(
     """
     problem = _Problem(turns, imu)
     steps = round(MAX_OFFSET_S / _COARSE_S)
-    grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1)
+    grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
     free, C = body_R_camera is None, body_R_camera
     if C is None:
         mountings, residuals = problem.rotation_by_wahba(problem.body_turns(grid))
@@ -218,7 +218,7 @@ def align_gyroscope(
     apart = np.abs(grid - grid[best]) > _APART_S
     margin = float(np.min(cost[apart]) - cost[best]) / scale
     fine = grid[best] + _FINE_S * np.arange(-5, 6)
-    cost, x, H, measured = problem.solve(fine, C, free, scale)
+    cost, x, H, _ = problem.solve(fine, C, free, scale)
     curve = np.polyfit(fine - grid[best], cost, 2)
     if curve[0] <= 0.0:
         return None

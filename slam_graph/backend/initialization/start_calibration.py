@@ -97,7 +97,6 @@ class StartCalibration:
         self._frames: deque[FeatureFrame] = deque()
         self._turns: deque[tuple[int, int, FloatArray, FloatArray]] = deque()
         self._seen, self._tried_ns = 0, 0
-        self._trace=None
         self.done = not config.initialization.check_calibration and self.mounted
         self.waiting_for = "rotation about two axes, to find how the camera is mounted"
 
@@ -122,7 +121,6 @@ class StartCalibration:
             return None
         found = self._estimate(imu)
         self._tried_ns = frame.stamp_ns
-        if self._trace is not None: self._trace.append((frame.stamp_ns,found))
         self.done = self._seen > _GIVE_UP_TURNS and self.mounted
         if found is None or found.margin < _CLEAR or found.misfit > _MAX_MISFIT:
             return None
@@ -139,7 +137,9 @@ class StartCalibration:
             common = len(np.intersect1d(before.cameras[0].ids, now.ids, assume_unique=True))
             if common < (_ENOUGH_COMMON if before is not self._frames[-1] else MIN_COMMON):
                 continue
-            turn = visual_rotation(before.cameras[0], now, self._noise, self._expected(frame, before))
+            turn = visual_rotation(
+                before.cameras[0], now, self._noise, self._expected(frame, before)
+            )
             if turn is not None:
                 row = (before.stamp_ns, frame.stamp_ns, turn.R, turn.information)
                 self._turns.append(row)

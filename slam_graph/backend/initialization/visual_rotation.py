@@ -156,5 +156,3 @@ def _linearized(
     variance += sigmas[:, 1] ** 2 * np.sum(across**2, axis=1)
     sigma = np.sqrt(np.maximum(variance, _TINY**2))
     return e, np.column_stack([by_rotation, by_direction]), sigma
-
-
