@@ -4,7 +4,7 @@
 
 Bearings f₁, f₂ of a feature at rest and the direction of the translation t lie in one plane:
 e = t · (f₁ × R f₂) = 0. Rotation and direction are found by Gauss-Newton on e divided by its
-standard deviation, which is that of the noise of both bearings (Sampson's error on the sphere), with
+standard deviation, that of the noise of both bearings (Sampson's error on the sphere), with
 Cauchy weights against wrong matches. The direction is eliminated from the information. No IMU takes
 part: the result is what a gyroscope is compared with.
 """
@@ -144,7 +144,7 @@ def _tangent(t: FloatArray) -> FloatArray:
 def _linearized(
     first: FloatArray, second: FloatArray, sigmas: FloatArray, R: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """e (N,), its Jacobian (N, 5) by R ⊕ δ and t ⊕ ε on the sphere, and its σ (N,)."""
+    """The e (N,), its Jacobian (N, 5) by R ⊕ δ and t ⊕ ε on the sphere, and its σ (N,)."""
     turned = second @ R.T
     across = np.cross(t, first)
     e = np.einsum("ni,ni->n", across, turned)
