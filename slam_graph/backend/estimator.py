@@ -174,7 +174,7 @@ class Estimator:
         self._latest_ns = stamp_ns
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
         frame = self._usable(frame)
-        found = self._check.add(frame, imu)
+        found = self._check.add(frame, imu, self.window is not None)
         if found is not None:
             return self._begin_anew(found)
         still = self._standstill.is_still(imu, stamp_ns, frame)

@@ -41,13 +41,15 @@ _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
 _MIN_TURNS = 15
 """Fewest rotations for an estimate."""
-_CLEAR = 30.0
-"""Smallest margin of the minimum: the second best has a probability of exp(-30) of the best."""
+_CLEAR, _CLEAR_WAITING = 30.0, 15.0
+"""Smallest margin of the minimum: the second best has a probability of exp(-30) of the best. Less
+is enough as long as there is no state that could be lost."""
 _MAX_MISFIT = 30.0
 """Rotations that fit worse, in units of their information, are of something else than offsets."""
-_ADOPTED_SIGMAS, _ADOPTED_S, _ADOPTED_SIGMA_S = 5.0, 4e-3, 4e-3
-"""An offset is adopted if it differs by more standard deviations, and by more, and is known to
-this."""
+_ADOPTED_SIGMAS, _ADOPTED_S = 5.0, 4e-3
+"""An offset is adopted if it differs by more standard deviations, and by more."""
+_ADOPTED_SIGMA_S, _WAITING_SIGMA_S = 4e-3, 1e-2
+"""It must be known to this; and as long as there is no state, to this."""
 _FITS_SIGMAS, _FITS_SIGMA_S = 3.0, 1e-3
 """A calibrated offset fits if it is within so many standard deviations, of at most this."""
 _PRIOR_SIGMAS = 3.0
@@ -92,7 +94,6 @@ class StartCalibration:
         self._rig, self._config = rig, config
         self._camera = rig.cameras[0]
         self.mounted = self._camera.rotation_known
-        self._noise = config.noise.pixel_sigma / self._camera.camera.fx
         self.recent: deque[FeatureFrame] = deque()
         self._frames: deque[FeatureFrame] = deque()
         self._turns: deque[tuple[int, int, FloatArray, FloatArray]] = deque()
@@ -100,12 +101,13 @@ class StartCalibration:
         self.done = not config.initialization.check_calibration and self.mounted
         self.waiting_for = "rotation about two axes, to find how the camera is mounted"
 
-    def add(self, frame: FeatureFrame, imu: ImuBuffer) -> FoundCalibration | None:
+    def add(self, frame: FeatureFrame, imu: ImuBuffer, started: bool) -> FoundCalibration | None:
         """Take the next frame.
 
         Args:
             frame: its features.
             imu: samples so far.
+            started: whether there is a state already.
 
         Returns:
             A calibration that the old one contradicts; None as long as there is none.
@@ -122,9 +124,10 @@ class StartCalibration:
         found = self._estimate(imu)
         self._tried_ns = frame.stamp_ns
         self.done = self._seen > _GIVE_UP_TURNS and self.mounted
-        if found is None or found.margin < _CLEAR or found.misfit > _MAX_MISFIT:
+        clear = _CLEAR if started else _CLEAR_WAITING
+        if found is None or found.margin < clear or found.misfit > _MAX_MISFIT:
             return None
-        return self._judged(found)
+        return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
     def _add_turn(self, frame: FeatureFrame) -> None:
         """The rotation since the oldest frame with enough of the same features."""
@@ -132,14 +135,12 @@ class StartCalibration:
             self._frames.popleft()
         while self._turns and frame.stamp_ns - self._turns[0][0] > _WINDOW_NS:
             self._turns.popleft()
-        now = frame.cameras[0]
+        now, model = frame.cameras[0], (self._camera.camera, self._config.noise.pixel_sigma)
         for before in self._frames:
             common = len(np.intersect1d(before.cameras[0].ids, now.ids, assume_unique=True))
             if common < (_ENOUGH_COMMON if before is not self._frames[-1] else MIN_COMMON):
                 continue
-            turn = visual_rotation(
-                before.cameras[0], now, self._noise, self._expected(frame, before)
-            )
+            turn = visual_rotation(before.cameras[0], now, *model, self._expected(frame, before))
             if turn is not None:
                 row = (before.stamp_ns, frame.stamp_ns, turn.R, turn.information)
                 self._turns.append(row)
@@ -176,12 +177,12 @@ class StartCalibration:
         R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
         return align_gyroscope(turns, samples, R, self._camera.time_offset_s)
 
-    def _judged(self, found: GyroAlignment) -> FoundCalibration | None:
-        """The new calibration, if what was found contradicts the old one."""
+    def _judged(self, found: GyroAlignment, largest_sigma_s: float) -> FoundCalibration | None:
+        """The new calibration, if what was found is known and contradicts the old one."""
         calibration, sigma_s = self._config.calibration, found.offset_sigma_s
         difference_s = abs(found.offset_s - self._camera.time_offset_s)
         if not self.mounted:
-            known = sigma_s < _ADOPTED_SIGMA_S and found.rotation_sigma_rad < _ROTATION_SIGMA_RAD
+            known = sigma_s < largest_sigma_s and found.rotation_sigma_rad < _ROTATION_SIGMA_RAD
             return self._adopted(found) if known else None
         if difference_s < _FITS_SIGMAS * sigma_s and sigma_s < _FITS_SIGMA_S:
             self.done = True
@@ -189,7 +190,7 @@ class StartCalibration:
         least_s = _ADOPTED_S
         if calibration.time_offset:
             least_s = max(least_s, _PRIOR_SIGMAS * calibration.time_offset_sigma_s)
-        if sigma_s > _ADOPTED_SIGMA_S or difference_s < max(_ADOPTED_SIGMAS * sigma_s, least_s):
+        if sigma_s > largest_sigma_s or difference_s < max(_ADOPTED_SIGMAS * sigma_s, least_s):
             return None
         return self._adopted(found)
 

@@ -13,21 +13,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.sensors import FeatureObservations
+from slam_graph.sensors import Camera, FeatureObservations
 
 MIN_COMMON = 15
 """Fewest common features of two frames."""
-_STEPS = 6
+_MAX_COST = 0.6
+"""Largest accepted robust cost of a feature: noise gives 0.13, and each wrong match some 5."""
+_RANSAC_SIGMAS = 2.0
+"""Tolerance of the search for another start, in units of the noise."""
+_STEPS = 10
 """Most Gauss-Newton steps."""
 _CONVERGED_RAD = 1e-5
 """A smaller step of the rotation is the last."""
 _CAUCHY_WIDTH = 2.4
 """Residual with half the weight, in units of the noise."""
+_MEDIAN = 0.455 / _CAUCHY_WIDTH**2
+"""Median of the squared residuals if they are noise, in units of the width."""
 _MAX_STEP_RAD = 0.1
 """Longest step of the rotation."""
 _FLOOR_RAD = 0.5e-3
@@ -52,34 +59,61 @@ class VisualRotation:
 
 
 def visual_rotation(
-    one: FeatureObservations, two: FeatureObservations, noise: float, guess: FloatArray | None
+    one: FeatureObservations,
+    two: FeatureObservations,
+    camera: Camera,
+    pixel_sigma: float,
+    guess: FloatArray | None,
 ) -> VisualRotation | None:
     """The rotation between two frames of a camera; None without enough features.
 
     Args:
         one: features of the first frame.
         two: those of the second.
-        noise: standard deviation of an observation on the plane z = 1.
+        camera: which sees them.
+        pixel_sigma: standard deviation of an observation, pixels.
         guess: (3, 3) a rotation near; without it that of the bearings is taken, as if the camera
             only turned.
     """
     _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
     if len(i) < MIN_COMMON:
         return None
-    first, spread_1 = _bearings(one.normalized[i])
-    second, spread_2 = _bearings(two.normalized[j])
-    sigmas = noise * np.column_stack([spread_1, spread_2])
-    turned = Rotation.align_vectors(first, second)[0].as_matrix()
-    starts = [turned] if guess is None else [guess, turned]
-    found = [_refined(first, second, sigmas, R) for R in starts]
-    return min(found, key=lambda candidate: candidate[0])[1]
+    first, sigma_1 = _bearings(one.normalized[i], camera, pixel_sigma)
+    second, sigma_2 = _bearings(two.normalized[j], camera, pixel_sigma)
+    sigmas = np.column_stack([sigma_1, sigma_2])
+    worst = _MAX_COST * len(i)
+    best = None if guess is None else _refined(first, second, sigmas, guess)
+    if best is None or best[0] > 0.5 * worst:
+        # there are local minima, and no start is known to be near the global one
+        starts = [Rotation.align_vectors(first, second)[0].as_matrix()]
+        starts += _by_five_points(one.normalized[i], two.normalized[j], pixel_sigma / camera.fx)
+        found = [_refined(first, second, sigmas, R) for R in starts]
+        best = min(found if best is None else [best, *found], key=_cost)
+    return None if best[0] > worst else best[1]
 
 
-def _bearings(normalized: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit bearings (N, 3), and the mean factor (N,) from noise on z = 1 to noise on the sphere."""
+def _cost(candidate: tuple[float, VisualRotation]) -> float:
+    return candidate[0]
+
+
+def _by_five_points(one: FloatArray, two: FloatArray, noise: float) -> list[FloatArray]:
+    """The first_R_second of an essential matrix by RANSAC (Nistér 2004)."""
+    E, _ = cv2.findEssentialMat(one, two, np.eye(3), cv2.RANSAC, 0.999, _RANSAC_SIGMAS * noise)
+    if E is None or E.shape != (3, 3):
+        return []
+    R_1, R_2, _ = cv2.decomposeEssentialMat(E)
+    # the other of the two turns by another half turn about the translation
+    return [max((R_1.T, R_2.T), key=np.trace)]
+
+
+def _bearings(
+    normalized: FloatArray, camera: Camera, pixel_sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Unit bearings (N, 3) and their noise (N,), rad, by the area of a pixel on the sphere."""
     rays = np.column_stack([normalized, np.ones(len(normalized))])
     length = np.linalg.norm(rays, axis=1)
-    return rays / length[:, None], length**-1.5
+    pixels = np.abs(np.linalg.det(camera.distort(normalized)[1])) * length**3
+    return rays / length[:, None], pixel_sigma / np.sqrt(np.maximum(pixels, _TINY))
 
 
 def _refined(
@@ -91,9 +125,10 @@ def _refined(
     H, cost = np.zeros((5, 5)), np.inf
     for _ in range(_STEPS):
         e, J, sigma = _linearized(first, second, sigmas, R, t)
-        squares = (e / sigma) ** 2
-        weights = 1.0 / (1.0 + squares / _CAUCHY_WIDTH**2)
-        cost = float(np.sum(np.log1p(squares / _CAUCHY_WIDTH**2)))
+        squares = (e / (_CAUCHY_WIDTH * sigma)) ** 2
+        cost = float(np.sum(np.log1p(squares)))
+        # far from the solution all residuals are large: none is an outlier then
+        weights = 1.0 / (1.0 + squares / max(1.0, float(np.median(squares)) / _MEDIAN))
         white = J * (np.sqrt(weights) / sigma)[:, None]
         H = white.T @ white
         damped = H + (1e-6 * np.trace(H) + _TINY) * np.eye(5)
