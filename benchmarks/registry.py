@@ -26,6 +26,7 @@ from benchmarks import (
     real_imu,
     speed,
     starts,
+    time_offset,
     wheel,
 )
 from benchmarks.suite import Benchmark
@@ -40,6 +41,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **moving_object.BENCHMARKS,
     **real_imu.BENCHMARKS,
     **starts.BENCHMARKS,
+    **time_offset.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,

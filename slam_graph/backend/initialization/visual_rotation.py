@@ -23,8 +23,9 @@ from slam_graph.sensors import Camera, FeatureObservations
 
 MIN_COMMON = 15
 """Fewest common features of two frames."""
-_MAX_COST = 0.6
-"""Largest accepted robust cost of a feature: noise gives 0.13, and each wrong match some 5."""
+_SEARCH_COST, _MAX_COST = 0.3, 1.0
+"""Mean robust cost of a feature above which another start is searched for, and above which the
+rotation is refused. Noise gives 0.13, and 1 % of wrong matches 0.06."""
 _RANSAC_SIGMAS = 2.0
 """Tolerance of the search for another start, in units of the noise."""
 _STEPS = 10
@@ -35,6 +36,8 @@ _CAUCHY_WIDTH = 2.4
 """Residual with half the weight, in units of the noise."""
 _MEDIAN = 0.455 / _CAUCHY_WIDTH**2
 """Median of the squared residuals if they are noise, in units of the width."""
+_REWEIGHTINGS = 3
+"""How often the first direction is found again without wrong matches."""
 _MAX_STEP_RAD = 0.1
 """Longest step of the rotation."""
 _FLOOR_RAD = 0.5e-3
@@ -51,7 +54,9 @@ class VisualRotation:
 
     Attributes:
         R: (3, 3) first_R_second.
-        information: (3, 3) about it, in the tangent at the second frame, 1/rad².
+        information: (3, 3) about it, in the tangent at the second frame, 1/rad². It compares
+            directions and pairs; what is common to all is larger than noise alone says, and is
+            measured where rotations are used (`gyro_alignment.py`).
     """
 
     R: FloatArray
@@ -81,15 +86,14 @@ def visual_rotation(
     first, sigma_1 = _bearings(one.normalized[i], camera, pixel_sigma)
     second, sigma_2 = _bearings(two.normalized[j], camera, pixel_sigma)
     sigmas = np.column_stack([sigma_1, sigma_2])
-    worst = _MAX_COST * len(i)
     best = None if guess is None else _refined(first, second, sigmas, guess)
-    if best is None or best[0] > 0.5 * worst:
+    if best is None or best[0] > _SEARCH_COST * len(i):
         # there are local minima, and no start is known to be near the global one
         starts = [Rotation.align_vectors(first, second)[0].as_matrix()]
         starts += _by_five_points(one.normalized[i], two.normalized[j], pixel_sigma / camera.fx)
         found = [_refined(first, second, sigmas, R) for R in starts]
         best = min(found if best is None else [best, *found], key=_cost)
-    return None if best[0] > worst else best[1]
+    return None if best[0] > _MAX_COST * len(i) else best[1]
 
 
 def _cost(candidate: tuple[float, VisualRotation]) -> float:
@@ -103,7 +107,8 @@ def _by_five_points(one: FloatArray, two: FloatArray, noise: float) -> list[Floa
         return []
     R_1, R_2, _ = cv2.decomposeEssentialMat(E)
     # the other of the two turns by another half turn about the translation
-    return [max((R_1.T, R_2.T), key=np.trace)]
+    smaller = R_1 if np.trace(R_1) > np.trace(R_2) else R_2
+    return [np.asarray(smaller.T, np.float64)]
 
 
 def _bearings(
@@ -120,15 +125,19 @@ def _refined(
     first: FloatArray, second: FloatArray, sigmas: FloatArray, R: FloatArray
 ) -> tuple[float, VisualRotation]:
     """Robust cost and rotation from a start R; `sigmas` (N, 2) of the bearings, rad."""
-    weights = np.ones(len(first))
+    # normals of one length first: those of wrong matches are the longest
+    weights = 1.0 / np.maximum(np.sum(np.cross(first, second @ R.T) ** 2, axis=1), _TINY)
     t, of_t = _direction(first, second @ R.T, sigmas, weights)
+    for _ in range(_REWEIGHTINGS):
+        e, _, sigma = _linearized(first, second, sigmas, R, t)
+        weights = _weights((e / (_CAUCHY_WIDTH * sigma)) ** 2)
+        t, of_t = _direction(first, second @ R.T, sigmas, weights / sigma**2)
     H, cost = np.zeros((5, 5)), np.inf
     for _ in range(_STEPS):
         e, J, sigma = _linearized(first, second, sigmas, R, t)
         squares = (e / (_CAUCHY_WIDTH * sigma)) ** 2
         cost = float(np.sum(np.log1p(squares)))
-        # far from the solution all residuals are large: none is an outlier then
-        weights = 1.0 / (1.0 + squares / max(1.0, float(np.median(squares)) / _MEDIAN))
+        weights = _weights(squares)
         white = J * (np.sqrt(weights) / sigma)[:, None]
         H = white.T @ white
         damped = H + (1e-6 * np.trace(H) + _TINY) * np.eye(5)
@@ -141,6 +150,14 @@ def _refined(
             break
     information = H[:3, :3] - H[:3, 3:] @ np.linalg.solve(of_t, H[3:, :3])
     return cost, VisualRotation(R, _believable(information))
+
+
+def _weights(squares: FloatArray) -> FloatArray:
+    """Cauchy weights (N,) of squared residuals (N,) in units of the width.
+
+    Far from the solution all residuals are large, and none is an outlier.
+    """
+    return np.asarray(1.0 / (1.0 + squares / max(1.0, float(np.median(squares)) / _MEDIAN)))
 
 
 def _believable(information: FloatArray) -> FloatArray:

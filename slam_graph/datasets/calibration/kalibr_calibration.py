@@ -3,8 +3,8 @@
 """Kalibr's YAML, in and out: ``camchain-imucam`` files with the cameras, and the IMU's noise.
 
 Kalibr writes `T_cam_imu`, the pose of the IMU in the camera frame, which is the inverse of our
-`body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The first camera may say
-`T_cam_imu: unknown`; its mounting is then estimated. The IMU's
+`body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The first
+camera may say `T_cam_imu: unknown`; its mounting is then estimated. The IMU's
 noise stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the
 same file under ``imu0``, so that one file describes the rig.
 """
