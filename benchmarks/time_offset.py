@@ -40,7 +40,8 @@ SECONDS = 25.0
 """Length of each run, from the beginning of the flight."""
 
 FOUND_S, ATE_RATIO = 3e-3, 1.2
-"""Bars: error of the offset at the end of the start, and error of the run."""
+"""Bars: error of the offset that the start finds (largest, in units of this), and error of the run
+relative to that with the right stamps (median)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,8 @@ def figures_of(runs: list[_Run]) -> Iterator[Metric]:
     ratios = [run.ate_m / reference.ate_m for run in late]
     yield Metric("started", float(np.mean(started)), "share", "higher", 1.0, EXACT)
     yield Metric("false_alarm", float(reference.found_s != 0.0), "", "lower", 0.0, EXACT)
-    yield Metric("start_error_ms", 1e3 * float(np.max(errors)), "ms", "lower", 1e3 * FOUND_S, EXACT)
+    yield Metric("start_error", float(np.max(errors)) / FOUND_S, "", "lower", 1.0, EXACT)
+    yield info("start_error_ms", 1e3 * float(np.max(errors)), "ms")
     yield Metric("ate_ratio", float(np.nanmedian(ratios)), "", "lower", ATE_RATIO, EXACT)
     yield info("ate_ratio_worst", float(np.nanmax(ratios)), "")
     yield info("end_error_ms", 1e3 * max(abs(run.estimate_s - run.offset_s) for run in late), "ms")
