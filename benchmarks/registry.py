@@ -27,6 +27,7 @@ from benchmarks import (
     rolling_shutter,
     speed,
     starts,
+    time_offset,
     wheel,
 )
 from benchmarks.suite import Benchmark
@@ -42,6 +43,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **real_imu.BENCHMARKS,
     **starts.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,
+    **time_offset.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,

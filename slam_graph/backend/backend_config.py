@@ -149,6 +149,11 @@ class InitializationConfig(Settings):
     """Take the position and yaw of the first state as the definition of the world frame, so that
     covariances do not contain their uncertainty."""
 
+    check_calibration: bool = expert(True)
+    """Compare the camera's rotation with the gyroscope in the first motion, and take over a
+    camera-IMU time offset (up to 0.12 s) that clearly contradicts the calibration. Switch it off to
+    believe the calibration whatever the data say."""
+
     moved: ClassVar[Mapping[str, str]] = {
         name: f"is a constant now: {constant} in backend/initialization/{file}.py"
         for name, constant, file in (

@@ -9,6 +9,7 @@ step of its engine: this package's own loop (`engine.py`) or one of GTSAM's smoo
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import gtsam
@@ -27,6 +28,7 @@ from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.initializer import Initializer
+from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
@@ -34,10 +36,21 @@ from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CalibrationEstimate, FeatureFrame, FeatureObservations, ImuData, Rig
+from slam_graph.sensors import (
+    CalibrationEstimate,
+    FeatureFrame,
+    FeatureObservations,
+    ImuBuffer,
+    ImuData,
+    Rig,
+)
 
 _IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
+_LEAD_NS = 1_000_000_000
+"""A given state may be this much older than the first frame after a new beginning."""
+_ROUNDS, _REPEATED_S = 3, 1e-3
+"""Most beginnings with a corrected time offset; another is made if its estimate moved by more."""
 _MAX_AHEAD_NS = 10_000_000_000
 """A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
@@ -49,6 +62,9 @@ class Estimator:
 
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
+        rig: the sensors, as calibrated or corrected at the start.
+        replayed: where the last frame led to a beginning with another calibration, the states of
+            the frames of the last seconds, which supersede all states before; else empty.
     """
 
     def __init__(
@@ -70,21 +86,14 @@ class Estimator:
             ConfigError: if the engine cannot do what the settings ask for.
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
-        calibration = CalibrationVariables(rig, config.calibration)
-        projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
-        propagation = Propagation(rig.imu, config, diagnostics)
-        context = EngineContext(
-            rig, algorithm, config, diagnostics, calibration, projection, propagation
-        )
         own = algorithm.engine == "square_root"
         self._make_engine: Callable[[EngineContext], Engine] = (
             SquareRootEngine if own else SmootherEngine
         )
-        self._engine: Engine = self._make_engine(context)
-        self._context = context
-        self._initializer = Initializer(context)
-        self._standstill = StandstillDetector(config.zero_velocity)
-        self._latest_ns = np.iinfo(np.int64).min
+        self._check = StartCalibration(rig, config)
+        self._given: NavState | None = None
+        self._held: deque[FeatureFrame] | None = None
+        self._output_ns = np.iinfo(np.int64).min
         self._report = StepReport()
         # the matrices are small: waking threads for them costs many times what they save
         self._threads = ThreadpoolController()
@@ -92,6 +101,23 @@ class Estimator:
         self.algorithm = algorithm
         self.config = config
         self.diagnostics = diagnostics
+        self.replayed: list[NavState] = []
+        self._begin(ImuBuffer())
+
+    def _begin(self, imu: ImuBuffer) -> None:
+        """Begin without a state, with the rig and the settings as they are now."""
+        rig, config, diagnostics = self.rig, self.config, self.diagnostics
+        calibration = CalibrationVariables(rig, config.calibration)
+        projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
+        propagation = Propagation(rig.imu, config, diagnostics)
+        context = EngineContext(
+            rig, self.algorithm, config, diagnostics, calibration, projection, propagation, imu
+        )
+        self._engine: Engine = self._make_engine(context)
+        self._context = context
+        self._initializer = Initializer(context)
+        self._standstill = StandstillDetector(config.zero_velocity)
+        self._latest_ns = np.iinfo(np.int64).min
         self.window: Window | None = None
 
     # --- input -----------------------------------------------------------------------------------
@@ -107,6 +133,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
+        self._given = state
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
 
@@ -120,10 +147,23 @@ class Estimator:
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
         """Take the features of one time and estimate the state then.
 
+        In the first motion the time offset of the cameras is compared with the gyroscope. If it
+        contradicts the calibration, the estimator begins anew with the frames of the last seconds;
+        from then on a frame waits until the IMU has reached its time.
+
         Returns:
             The causal estimate with its covariance, stamped on the clock of the IMU. None as long
             as there is no state, and for a frame that does not follow those before.
         """
+        with self._threads.limit(limits=1, user_api="blas"):
+            if self._held is None:
+                return self._take(frame)
+            self._held.append(frame)
+            self.replayed = []
+            return self._new(self._take_held(self._held))
+
+    def _take(self, frame: FeatureFrame) -> NavState | None:
+        """Estimate the state at a frame."""
         self._report = StepReport()
         imu, calibration = self._context.imu, self._context.calibration
         state = self.window.state if self.window is not None else None
@@ -135,21 +175,78 @@ class Estimator:
         self._latest_ns = stamp_ns
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
         frame = self._usable(frame)
-        with self._threads.limit(limits=1, user_api="blas"):
-            still = self._standstill.is_still(imu, stamp_ns, frame)
-            frame = frame.without(self._standstill.dynamic)
-            if self.window is None:
-                self.window = self._try_to_start(stamp_ns, frame)
-            elif stamp_ns > self.window.stamp_ns:
-                return self._engine.step(self.window, stamp_ns, frame, still, self._report)
-            elif stamp_ns == self.window.stamp_ns:
-                self._context.add_observations(self.window, frame)
-            if self.window is None or stamp_ns < self.window.stamp_ns:
-                return None
-            return self.window.current(self.window.prior)
+        found = self._check.add(frame, imu, self.window is not None)
+        if found is not None:
+            return self._begin_anew(found)
+        still = self._standstill.is_still(imu, stamp_ns, frame)
+        frame = frame.without(self._standstill.dynamic)
+        if self.window is None:
+            self.window = self._try_to_start(stamp_ns, frame)
+        elif stamp_ns > self.window.stamp_ns:
+            return self._engine.step(self.window, stamp_ns, frame, still, self._report)
+        elif stamp_ns == self.window.stamp_ns:
+            self._context.add_observations(self.window, frame)
+        if self.window is None or stamp_ns < self.window.stamp_ns:
+            return None
+        return self.window.current(self.window.prior)
+
+    def _begin_anew(self, found: FoundCalibration) -> NavState | None:
+        """Start again with another calibration, from the frames of the last seconds."""
+        self.diagnostics.warn("calibration_corrected", found.message)
+        self.rig = found.rig
+        if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
+            self.config = found.config
+        given, frames = self._given, self._check.recent
+        if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
+            given = None  # too long ago: the IMU alone would have to lead from there to here
+            change = {"mode": "auto"}
+            initialization = self.config.initialization.model_copy(update=change)
+            self.config = self.config.model_copy(update={"initialization": initialization})
+        if self.window is not None:
+            self._output_ns = self.window.stamp_ns
+        for _ in range(_ROUNDS):
+            self._begin(self._context.imu)
+            if given is not None:
+                self.start(given)
+            self._held = deque(frames)
+            self.replayed = self._take_held(self._held)
+            better = self.calibration
+            if better is None or not self._moved_far(better.rig):
+                break
+            # the first linearisation points were those of an offset some milliseconds off
+            self.rig = better.rig
+        return self._new(self.replayed)
+
+    def _new(self, states: list[NavState]) -> NavState | None:
+        """The last of some states if it is later than those before."""
+        if not states or states[-1].stamp_ns <= self._output_ns:
+            return None
+        self._output_ns = states[-1].stamp_ns
+        return states[-1]
+
+    def _moved_far(self, rig: Rig) -> bool:
+        """Whether the time offset of a rig is far from that which the start was made with."""
+        change_s = rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
+        return abs(change_s) > _REPEATED_S
+
+    def _take_held(self, held: deque[FeatureFrame]) -> list[NavState]:
+        """States at the frames whose time the IMU has reached."""
+        states: list[NavState] = []
+        variables = self._context.calibration
+        while held:
+            rig = self.rig if self.window is None else variables.rig(self.window.state.estimate)
+            offset_ns = round(rig.cameras[0].clock_offset_s * 1e9)
+            if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns():
+                break
+            state = self._take(held.popleft())
+            if state is not None:
+                states.append(state)
+        return states
 
     def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible."""
+        if not self._check.mounted:
+            return None
         with self._report.timed("start"):
             window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
@@ -180,9 +277,14 @@ class Estimator:
         return self.window is not None
 
     @property
+    def corrected_rig(self) -> Rig | None:
+        """The rig, if the first motion has shown that its calibration does not fit; else None."""
+        return None if self._held is None else self.rig
+
+    @property
     def waiting_for(self) -> str:
         """What a start still needs."""
-        return self._initializer.waiting_for
+        return self._initializer.waiting_for if self._check.mounted else self._check.waiting_for
 
     @property
     def timings(self) -> dict[str, float]:

@@ -126,6 +126,11 @@ class CameraTracker:
         new.residual_flow[:] = flow[good]
         return after.joined(new)
 
+    def mount(self, mounted: RigCamera) -> None:
+        """Take the place and the clock of the camera as they are calibrated now."""
+        self._body_T_camera = mounted.body_T_camera
+        self._predictor.mount(mounted)
+
     def forget(self, ids: IntArray) -> None:
         """Do not look for these features any more."""
         self._associator.forget(ids)

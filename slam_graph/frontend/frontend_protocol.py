@@ -59,20 +59,26 @@ class Feedback:
         rejected: (N,) ids of features that its χ² gate rejected.
         ids: (M,) ids of features whose position is estimated, ascending.
         points: (M, 3) these positions in the world frame, in metres.
+        rig: the calibration, where the back end has corrected it; None otherwise.
     """
 
     state: NavState | None = None
     rejected: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    rig: Rig | None = None
 
     @staticmethod
     def of(
-        state: NavState | None, rejected: IntArray, ids: IntArray, points: FloatArray
+        state: NavState | None,
+        rejected: IntArray,
+        ids: IntArray,
+        points: FloatArray,
+        rig: Rig | None = None,
     ) -> Feedback:
         """The same from features in any order."""
         order = np.argsort(ids, kind="stable")
-        return Feedback(state, rejected, ids[order], points[order])
+        return Feedback(state, rejected, ids[order], points[order], rig)
 
 
 @runtime_checkable

@@ -157,6 +157,9 @@ class ImageFrontend:
         """Keep state and map of the back end, and drop what it rejected if so configured."""
         self._feedback = feedback
         self._motion.state = feedback.state or self._motion.state
+        if feedback.rig is not None:
+            for tracker, mounted in zip(self._trackers, feedback.rig.cameras, strict=True):
+                tracker.mount(mounted)
         if self._config.drop_rejected and len(feedback.rejected):
             followed = np.unique(np.concatenate([tracks.ids for tracks in self._tracks]))
             self._gated += int(np.count_nonzero(np.isin(followed, feedback.rejected)))

@@ -140,19 +140,27 @@ class PointPredictor:
     """
 
     def __init__(self, mounted: RigCamera, motion: ImuMotion, config: FrontendConfig) -> None:
-        self._mounted = mounted
         self._camera = mounted.camera
-        self._body_T_camera = mounted.body_T_camera
         self._trends: dict[int, tuple[FloatArray, FloatArray]] = {}  # at the last two images
-        self._offset_ns = round((mounted.time_offset_s + mounted.middle_s) * 1e9)
+        self.mount(mounted)
         self._motion = motion
         self._mode = config.prediction
         self.camera_R: FloatArray = np.eye(3)
         self.rotation_known = False
 
+    def mount(self, mounted: RigCamera) -> None:
+        """Take the place and the clock of the camera as they are calibrated now."""
+        self._mounted = mounted
+        self._body_T_camera = mounted.body_T_camera
+        self._offset_ns = round(mounted.clock_offset_s * 1e9)
+
     def advance(self, start_ns: int, end_ns: int) -> None:
         """Integrate the rotation between two frames (times of the camera)."""
         start_R_end = self._motion.rotation(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        if (
+            not self._mounted.rotation_known
+        ):  # the gyroscope says nothing of a camera that may be turned anyhow
+            start_R_end = None
         self.rotation_known = start_R_end is not None and self._mode != "flow"
         self.camera_R = np.eye(3)
         if start_R_end is not None:

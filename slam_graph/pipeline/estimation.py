@@ -155,6 +155,7 @@ class Estimation:
             estimator.rejected,
             estimator.imu_noise,
             estimator.initialized,
+            estimator.corrected_rig,
         )
         self._note(frame, tracked)
         return frame
@@ -190,10 +191,13 @@ class Estimation:
         if estimator.costs:
             logs.steps.append(stamp_ns, estimator.costs, estimator.columns)
         logs.innovations.append(stamp_ns, estimator.innovations)
+        if estimator.replayed:  # what was said of these frames so far is superseded
+            result.supersede(estimator.replayed)
         if frame.state is not None:
             check_sane(frame.state, result.config.limits)
             self._agreement.check(stamp_ns, estimator.innovations)
-            result.history.append(frame.state)
+            if not estimator.replayed:
+                result.history.append(frame.state)
             result.point_map.update(frame.landmark_ids, frame.landmarks)
             if estimator.calibration is not None:
                 logs.calibration.append(estimator.calibration)

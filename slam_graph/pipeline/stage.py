@@ -22,7 +22,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.frontend import Feedback
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 COMPLETED = ("ok", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
@@ -46,6 +46,7 @@ class EstimatedFrame:
         rejected: (M,) ids of the features that the χ² gate rejected.
         imu_noise: factors on the white noise of gyroscope and accelerometer that are assumed now.
         initialized: whether the estimator has started.
+        corrected_rig: the calibration, where the estimator has corrected it; None otherwise.
     """
 
     packet: Packet
@@ -56,6 +57,7 @@ class EstimatedFrame:
     rejected: IntArray
     imu_noise: tuple[float, float]
     initialized: bool
+    corrected_rig: Rig | None = None
 
     @property
     def image(self) -> np.ndarray | None:
@@ -70,7 +72,9 @@ class EstimatedFrame:
 
     def feedback(self) -> Feedback:
         """What the front end is told about the features."""
-        return Feedback.of(self.state, self.rejected, self.landmark_ids, self.landmarks)
+        return Feedback.of(
+            self.state, self.rejected, self.landmark_ids, self.landmarks, self.corrected_rig
+        )
 
 
 class Stage:

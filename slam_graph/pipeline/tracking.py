@@ -9,15 +9,18 @@ frame k reaches the front end before frame k + 2, in either mode: results are th
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from slam_graph.datasets import Sequence
 from slam_graph.frontend import Feedback, Frontend
 from slam_graph.results import RunInput
-from slam_graph.sensors import CameraFrame, FeatureFrame, Packet
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet
 
 
 class Stopwatch:
@@ -67,6 +70,43 @@ class TrackedPacket:
     clock: Stopwatch
 
 
+class _LeadingPackets:
+    """Packets whose IMU samples lead beyond the stamp of the frame, as soon as that is asked for.
+
+    A time offset that was found on the way wants the IMU up to a later time. A frame then waits
+    until the packets behind it have brought these samples.
+
+    Attributes:
+        lead_ns: how far beyond the stamp of its frame the samples of a packet lead.
+    """
+
+    def __init__(self, packets: Iterator[Packet]) -> None:
+        self.lead_ns = 0
+        self._packets = packets
+        self._frames: deque[CameraFrame | FeatureFrame] = deque()
+        self._imu: list[ImuData] = []
+        self._newest_ns = np.iinfo(np.int64).min
+
+    def __iter__(self) -> _LeadingPackets:
+        return self
+
+    def __next__(self) -> Packet:
+        if self.lead_ns == 0 and not self._frames:
+            return next(self._packets)
+        while not self._frames or self._newest_ns < self._frames[0].stamp_ns + self.lead_ns:
+            packet = next(self._packets, None)
+            if packet is None:
+                break
+            self._frames.append(packet.frame)
+            self._imu.append(packet.imu)
+            if len(packet.imu):
+                self._newest_ns = int(packet.imu.stamps_ns[-1])
+        if not self._frames:
+            raise StopIteration
+        imu, self._imu = ImuData.concatenate(self._imu), []
+        return Packet(imu, self._frames.popleft())
+
+
 class Tracking:
     """Tracks the packets of a sequence one after the other.
 
@@ -77,7 +117,7 @@ class Tracking:
     """
 
     def __init__(self, packets: Iterator[Packet], frontend: Frontend, overlap: bool) -> None:
-        self._packets = packets
+        self._packets = _LeadingPackets(packets)
         self._frontend = frontend
         self._overlap = overlap
         self._feedback: Feedback | None = None
@@ -113,6 +153,9 @@ class Tracking:
         clock = Stopwatch()
         if feedback is not None:
             self._frontend.receive_feedback(feedback)
+            if feedback.rig is not None:
+                offset_ns = round(feedback.rig.cameras[0].time_offset_s * 1e9)
+                self._packets.lead_ns = max(0, offset_ns)
         packet = next(self._packets, None)
         if packet is None:
             return None

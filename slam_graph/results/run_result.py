@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.evaluation import ape, innovation_report
-from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
+from slam_graph.geometry import AlignmentMode, NavState, StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
@@ -115,6 +116,12 @@ class RunResult:
             f"RunResult({self.input.info.name}, {self.config.algorithm.name}: {self.status}, "
             f"{len(self.history)} states of {self.logs.frames} frames)"
         )
+
+    def supersede(self, states: Sequence[NavState]) -> None:
+        """Put other states in the place of all so far; the map begins anew."""
+        self.history, self.point_map = StateHistory(), PointMap()
+        for state in states:
+            self.history.append(state)
 
     @property
     def config(self) -> RunConfig:

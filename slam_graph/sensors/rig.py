@@ -86,6 +86,8 @@ class RigCamera:
             known; negative if the last row is read first.
         stamped_row: the row that is exposed at the stamp of a frame: the first, as with Kalibr and
             most drivers, or the `middle` or the `last` one.
+        rotation_known: whether the rotation of `body_T_camera` is calibrated; otherwise it is
+            estimated before a start.
     """
 
     camera: Camera
@@ -95,6 +97,7 @@ class RigCamera:
     rolling_shutter: bool = False
     readout_s: float = 0.0
     stamped_row: Literal["first", "middle", "last"] = "first"
+    rotation_known: bool = True
 
     def row_times_s(self, rows: FloatArray) -> FloatArray:
         """Times (N,) of the exposure of rows (N,), in pixels, since the stamp of the frame."""
@@ -109,6 +112,11 @@ class RigCamera:
     def middle_s(self) -> float:
         """Time of the exposure of the middle row since the stamp of the frame."""
         return (0.5 - _STAMPED_ROWS[self.stamped_row]) * self.readout_s
+
+    @property
+    def clock_offset_s(self) -> float:
+        """From the stamp of a frame to when its middle row is exposed, on the clock of the IMU."""
+        return self.time_offset_s + self.middle_s
 
     @property
     def end_s(self) -> float:
@@ -140,7 +148,7 @@ class Rig:
 
         The pose is that at the exposure of the middle row of the first camera.
         """
-        return self.cameras[0].time_offset_s + self.cameras[0].middle_s
+        return self.cameras[0].clock_offset_s
 
     @property
     def end_offset_s(self) -> float:

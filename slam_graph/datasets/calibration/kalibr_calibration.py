@@ -3,7 +3,8 @@
 """Kalibr's YAML, in and out: ``camchain-imucam`` files with the cameras, and the IMU's noise.
 
 Kalibr writes `T_cam_imu`, the pose of the IMU in the camera frame, which is the inverse of our
-`body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The IMU's
+`body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The first
+camera may say `T_cam_imu: unknown`; its mounting is then estimated. The IMU's
 noise stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the
 same file under ``imu0``, so that one file describes the rig.
 """
@@ -30,6 +31,8 @@ from slam_graph.errors import DataError
 from slam_graph.sensors import ImuNoise, Rig, RigCamera
 
 _IMU_KEY = "imu0"
+_UNKNOWN = "unknown"
+"""Stands for `T_cam_imu` where nobody has measured how the camera is mounted."""
 
 
 def read_kalibr(
@@ -93,18 +96,34 @@ def _chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera,
 def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
     body_T_camera = _body_T_camera(entry, previous, needs_imu)
     shift = entry.get("timeshift_cam_imu")
+    known = not _is_unknown(entry)
+    if entry.get("T_cam_imu") is None and previous is not None:
+        known = previous.rotation_known
     name = entry.get("name")
     mounted = RigCamera(
         read_camera(entry),
         body_T_camera,
         0.0 if shift is None else shift.number(),
         entry.key if name is None else name.text(),
+        rotation_known=known,
     )
     return with_shutter(mounted, entry)
 
 
+def _is_unknown(entry: YamlValue) -> bool:
+    """Whether a camera says that its mounting is not known."""
+    direct = entry.get("T_cam_imu")
+    return (
+        direct is not None
+        and isinstance(direct.node, yaml.ScalarNode)
+        and direct.text() == _UNKNOWN
+    )
+
+
 def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
     direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
+    if _is_unknown(entry) and previous is None:
+        return gtsam.Pose3()
     if direct is not None:
         return direct.pose().inverse()
     if link is not None and previous is not None:
@@ -113,7 +132,7 @@ def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool
         return gtsam.Pose3()
     raise DataError(
         f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
-        "from calibrating cameras and IMU together"
+        f"from calibrating cameras and IMU together, or 'T_cam_imu: {_UNKNOWN}' to estimate it"
     )
 
 
@@ -164,6 +183,8 @@ def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
         "distortion_model": entry.kalibr_distortion,
         "distortion_coeffs": entry.coefficients,
         "resolution": [int(camera.width), int(camera.height)],
-        "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist(),
+        "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist()
+        if mounted.rotation_known
+        else _UNKNOWN,
         "timeshift_cam_imu": float(mounted.time_offset_s),
     }

@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Clock and mounting of a camera from its rotations and those of the gyroscope.
+
+The camera's rotation from one frame to another equals that of the body between the same times: with
+the time offset Δ (t_imu = t_camera + Δ), gyroscope bias b and mounting C = body_R_camera,
+
+    C Log(R_k) ≈ Log(G(t₁ + Δ)ᵀ G(t₂ + Δ)) - J_k b,
+
+G being the integrated gyroscope. For a given Δ this is linear in b, and in C it is Wahba's problem.
+So Δ is found by evaluating the least cost on a grid, twice, and by its curvature. Neither velocity
+nor gravity nor scale takes part, and a camera that turns fast shows Δ whatever else is unknown
+(Mair, Fleps, Suppa & Burschka 2011; Qin & Shen 2018 for the offset as a variable).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray, IntArray, skew
+from slam_graph.sensors import ImuData
+
+MAX_OFFSET_S = 0.12
+"""Largest time offset that is looked for, of either sign."""
+_COARSE_S, _FINE_S = 5e-3, 1e-3
+"""Steps of the two grids."""
+_BIAS_SIGMA = 0.1
+"""Prior standard deviation of the gyroscope bias, rad/s."""
+_CAUCHY_WIDTH = 2.4
+"""Residual with half the weight, in units of the noise."""
+_REWEIGHTINGS = 3
+"""How often wrong rotations lose weight."""
+_MEDIAN_CHI2_3 = 2.366
+"""Median of χ² with three degrees of freedom."""
+_CORRELATION = 2.0
+"""Rotations that share frames have errors in common: standard deviations are larger than those of
+independent ones by this factor (measured on simulated flights with real and simulated IMUs)."""
+_APART_S = 0.02
+"""A second minimum is one that is farther from the first than this."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turns:
+    """Rotations of a camera between pairs of frames.
+
+    Attributes:
+        first_ns, second_ns: (K,) stamps of the frames on the clock of the camera.
+        R: (K, 3, 3) first_R_second of the camera.
+        information: (K, 3, 3) about them, in the tangent at the second frame, 1/rad².
+    """
+
+    first_ns: IntArray
+    second_ns: IntArray
+    R: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GyroAlignment:
+    """How the camera's clock and mounting go with the gyroscope.
+
+    Attributes:
+        offset_s: t_imu - t_camera.
+        offset_sigma_s: its standard deviation.
+        margin: how much larger the least cost elsewhere is (half a χ² of one degree of freedom).
+        gyro_bias: (3,) rad/s.
+        body_R_camera: (3, 3).
+        rotation_sigma_rad: largest standard deviation of its rotation; 0 if it was given.
+        misfit: mean squared residual in units of what the rotations' own information allows.
+    """
+
+    offset_s: float
+    offset_sigma_s: float
+    margin: float
+    gyro_bias: FloatArray
+    body_R_camera: FloatArray
+    rotation_sigma_rad: float
+    misfit: float
+
+
+class _Gyroscope:
+    """The integrated gyroscope, at any time."""
+
+    def __init__(self, imu: ImuData) -> None:
+        self.start_ns = int(imu.stamps_ns[0])
+        self._t = (imu.stamps_ns - self.start_ns) * 1e-9
+        self._rate = imu.gyro
+        mean = 0.5 * (imu.gyro[1:] + imu.gyro[:-1])
+        steps = Rotation.from_rotvec(mean * np.diff(self._t)[:, None]).as_matrix()
+        R = np.empty((len(self._t), 3, 3))
+        R[0] = np.eye(3)
+        for k, step in enumerate(steps):
+            R[k + 1] = R[k] @ step
+        self._R = R
+
+    def orientation(self, t: FloatArray) -> FloatArray:
+        """start_R_body (..., 3, 3) at times (...) in seconds after the start."""
+        row = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, len(self._t) - 1)
+        rate = np.stack([np.interp(t, self._t, axis) for axis in self._rate.T], axis=-1)
+        turn = 0.5 * (self._rate[row] + rate) * (t - self._t[row])[..., None]
+        step = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
+        return np.asarray(self._R[row] @ step)
+
+
+class _Problem:
+    """The least cost over bias and mounting at each of many offsets."""
+
+    def __init__(self, turns: Turns, imu: ImuData) -> None:
+        self._gyro = _Gyroscope(imu)
+        self._t = 1e-9 * (np.stack([turns.first_ns, turns.second_ns]) - self._gyro.start_ns)
+        self._seconds = self._t[1] - self._t[0]
+        self._turns = turns
+
+    def body_turns(self, offsets: FloatArray) -> FloatArray:
+        """Rotation vectors (D, K, 3) of the body between the frames, for D offsets."""
+        one, two = (self._gyro.orientation(t + offsets[:, None]) for t in self._t)
+        R = one.swapaxes(-1, -2) @ two
+        vectors = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
+        return np.asarray(vectors.reshape(len(offsets), -1, 3))
+
+    def rotation_by_wahba(self, body: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mounting (D, 3, 3) and squared residual (D,) for rotation vectors (D, K, 3) of the body.
+
+        The bias moves all of them alike, so their means are left out.
+        """
+        camera = Rotation.from_matrix(self._turns.R).as_rotvec()
+        seconds = self._seconds / self._seconds.mean()
+        centred = camera - seconds[:, None] * camera.mean(axis=0)
+        moved = body - seconds[:, None] * body.mean(axis=1, keepdims=True)
+        U, _, Vt = np.linalg.svd(np.einsum("dki,kj->dij", moved, centred))
+        signs = np.ones((len(body), 3))
+        signs[:, 2] = np.linalg.det(U @ Vt)
+        C = (U * signs[:, None, :]) @ Vt
+        rest = moved - np.einsum("dij,kj->dki", C, centred)
+        return C, np.median(np.sum(rest**2, axis=2), axis=1)
+
+    def solve(
+        self, offsets: FloatArray, C: FloatArray, free: bool, scale: float | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Least robust cost at each of D offsets.
+
+        Args:
+            offsets: (D,) s.
+            C: (3, 3) mounting.
+            free: whether it is estimated as well.
+            scale: variance of the residuals in units of their information; None to measure it.
+
+        Returns:
+            Cost (D,), unknowns (D, 3 or 6), their information (D, n, n), and the scale (D,).
+        """
+        body = self.body_turns(offsets)
+        half = Rotation.from_rotvec(-0.5 * body.reshape(-1, 3)).as_matrix()
+        by_bias = -half.reshape(*body.shape, 3) * self._seconds[:, None, None]
+        seen = C @ self._turns.R @ C.T
+        back = Rotation.from_rotvec(-body.reshape(-1, 3)).as_matrix().reshape(*body.shape, 3)
+        rest = Rotation.from_matrix((back @ seen).reshape(-1, 3, 3)).as_rotvec()
+        r = -rest.reshape(body.shape)
+        J = by_bias
+        if free:  # C exp(θ) turns the vectors by θ × v
+            vectors = Rotation.from_matrix(self._turns.R).as_rotvec()
+            by_mounting = np.broadcast_to(C @ skew(vectors), (*body.shape, 3))
+            J = np.concatenate([J, by_mounting], axis=-1)
+        root = np.linalg.cholesky(C @ self._turns.information @ C.T).swapaxes(-1, -2)
+        r, J = np.einsum("kij,dkj->dki", root, r), root @ J
+        prior = np.diag([_BIAS_SIGMA**-2] * 3 + [0.0] * (J.shape[-1] - 3))
+        return _robust_least_squares(r, J, prior, scale)
+
+
+def _robust_least_squares(
+    r: FloatArray, J: FloatArray, prior: FloatArray, scale: float | None
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """D problems r + J x with K residuals of three rows each (see `_Problem.solve`)."""
+    weights = np.ones(r.shape[:2])
+    for _ in range(_REWEIGHTINGS):
+        weighted = J * weights[..., None, None]
+        H = np.einsum("dkri,dkrj->dij", weighted, J) + prior
+        x = -np.linalg.solve(H, np.einsum("dkri,dkr->di", weighted, r)[..., None])[..., 0]
+        squares = np.sum((r + np.einsum("dkri,di->dkr", J, x)) ** 2, axis=2)
+        measured = np.maximum(np.median(squares, axis=1) / _MEDIAN_CHI2_3, 1e-9)
+        width = _CAUCHY_WIDTH**2 * (measured if scale is None else np.full(len(r), scale))
+        weights = 1.0 / (1.0 + squares / (3.0 * width[:, None]))
+    cost = 0.5 * np.sum(np.log1p(squares / (3.0 * width[:, None])), axis=1) * 3.0 * width
+    return cost, x, H, measured
+
+
+def align_gyroscope(
+    turns: Turns, imu: ImuData, body_R_camera: FloatArray | None, nominal_s: float
+) -> GyroAlignment | None:
+    """Time offset, bias and, where it is not known, mounting.
+
+    Args:
+        turns: rotations of the camera.
+        imu: samples that cover them with `MAX_OFFSET_S` on both sides of `nominal_s`.
+        body_R_camera: (3, 3) mounting; None to estimate it.
+        nominal_s: offset in the middle of those looked for.
+
+    Returns:
+        None if the cost has no minimum within the range.
+    """
+    problem = _Problem(turns, imu)
+    steps = round(MAX_OFFSET_S / _COARSE_S)
+    grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
+    free, C = body_R_camera is None, body_R_camera
+    if C is None:
+        mountings, residuals = problem.rotation_by_wahba(problem.body_turns(grid))
+        C = mountings[np.argmin(residuals)]
+    for _ in range(_REWEIGHTINGS if free else 1):
+        scale = float(np.min(problem.solve(grid, C, free, None)[3]))
+        cost, x, H, _ = problem.solve(grid, C, free, scale)
+        best = int(np.argmin(cost))
+        if free:
+            C = C @ Rotation.from_rotvec(x[best, 3:]).as_matrix()
+    if not 0 < best < len(grid) - 1:
+        return None
+    apart = np.abs(grid - grid[best]) > _APART_S
+    margin = float(np.min(cost[apart]) - cost[best]) / scale
+    fine = grid[best] + _FINE_S * np.arange(-5, 6)
+    cost, x, H, _ = problem.solve(fine, C, free, scale)
+    curve = np.polyfit(fine - grid[best], cost, 2)
+    if curve[0] <= 0.0:
+        return None
+    away = float(np.clip(-0.5 * curve[1] / curve[0], fine[0] - grid[best], fine[-1] - grid[best]))
+    middle = int(np.argmin(cost))
+    covariance = np.linalg.inv(H[middle]) * scale * _CORRELATION**2
+    rotation_sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])) if free else 0.0
+    return GyroAlignment(
+        float(grid[best]) + away,
+        _CORRELATION * float(np.sqrt(0.5 * scale / curve[0])),
+        margin,
+        x[middle, :3],
+        C,
+        rotation_sigma,
+        scale,
+    )
