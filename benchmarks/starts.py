@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +24,7 @@ from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import is_held_out
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.arrays import skew
-from slam_graph.backend import Estimator
+from slam_graph.backend import Estimator, triangulate_frames
 from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, ImuData, Packet
@@ -53,8 +54,8 @@ WINDOW_S, ACCELERATED_M, MOVED_M, STILL_M = 1.0, 0.03, 0.05, 0.002
 camera: the scale follows from acceleration), or if it is as long as this (stereo); or if it stays
 within this, which is a start at rest."""
 
-SCALE_NEEDS_M = 0.1
-"""Scale is judged if the path of the second after the start is longer than this."""
+SCALE_NEEDS = 5
+"""Scale is judged by the median of at least so many distances to features."""
 
 BARS = {"good": 0.95, "wrong": 0.005}
 
@@ -65,8 +66,8 @@ class Start:
 
     Attributes:
         begun_s: where in the flight it was tried.
-        latency_s: from the moment at which motion was observed to the state; NaN if it never came.
-        velocity, gravity_deg, scale: errors one second later; scale NaN where it is not judged.
+        latency_s: from when motion was observed to the state; NaN if it never came.
+        velocity, gravity_deg, scale: errors one second later; scale NaN if too few features tell.
         chi2: normalised squared errors of velocity and gravity.
         reason: what the estimator waited for, if it did not start.
         cpu_ms: mean CPU time of a frame without a state.
@@ -206,7 +207,11 @@ def _start(
             continue
         states.append(state)
         if state.stamp_ns - states[0].stamp_ns >= JUDGED_AFTER_S * 1e9:
-            return _judged(states, truth, begun_s, observed_ns, 1e3 * waited / max(frames, 1))
+            cpu_ms = 1e3 * waited / max(frames, 1)
+            scale = _scale_error(
+                estimator, state, [p.frame for p in packets[first : row + 1]], truth
+            )
+            return _judged(states, truth, begun_s, observed_ns, cpu_ms, scale)
     nothing = (np.nan, np.nan, np.nan, np.nan, (np.nan, np.nan))
     cpu_ms = 1e3 * waited / max(frames, 1)
     return Start(begun_s, *nothing, reason=estimator.waiting_for, cpu_ms=cpu_ms)
@@ -236,13 +241,17 @@ def _observed_ns(truth: Trajectory, begun_ns: int, cameras: int) -> int:
 
 
 def _judged(
-    states: list[NavState], truth: Trajectory, begun_s: float, observed_ns: int, cpu_ms: float
+    states: list[NavState],
+    truth: Trajectory,
+    begun_s: float,
+    observed_ns: int,
+    cpu_ms: float,
+    scale: float,
 ) -> Start:
     """The errors of the last state, in the body frame: heading and position are free."""
     first, last = states[0], states[-1]
     # the truth is given at the frames, so that its rows are those of the states
-    rows = np.searchsorted(truth.stamps_ns, [first.stamp_ns - 1_000_000, last.stamp_ns - 1_000_000])
-    start, end = int(rows[0]), int(rows[1])
+    end = int(np.searchsorted(truth.stamps_ns, last.stamp_ns - 1_000_000))
     assert truth.velocities is not None
     assert last.covariance is not None
     world_R_body = Rotation.from_quat(truth.quaternions[end])
@@ -258,19 +267,36 @@ def _judged(
     tilt = across @ (up - true_up)
     tilt_jacobian = across @ skew(up[None])[0]
     chi2_tilt = float(tilt @ np.linalg.solve(tilt_jacobian @ P[:3, :3] @ tilt_jacobian.T, tilt))
-    length = np.linalg.norm(last.world_T_body.translation() - first.world_T_body.translation())
-    true_length = np.linalg.norm(truth.positions[end] - truth.positions[start])
-    scale = abs(length / true_length - 1.0) if true_length > SCALE_NEEDS_M else np.nan
     return Start(
         begun_s,
         max(0.0, (first.stamp_ns - observed_ns) * 1e-9),
         float(np.linalg.norm(error)),
         float(np.rad2deg(np.arccos(np.clip(up @ true_up, -1.0, 1.0)))),
-        float(scale),
+        scale,
         (chi2_velocity, chi2_tilt),
         "",
         cpu_ms,
     )
+
+
+def _scale_error(
+    estimator: Estimator, state: NavState, frames: list[Any], truth: Trajectory
+) -> float:
+    """Relative error of the scale: that of the median distance to the features in the map.
+
+    A displacement would not do: where the platform hardly moves, it is that of the velocity.
+    """
+    ids, points = estimator.landmarks()
+    rows = np.searchsorted(truth.stamps_ns, [f.stamp_ns - 1_000_000 for f in frames])
+    rotations = Rotation.from_quat(truth.quaternions[rows]).as_matrix()
+    positions = truth.positions[rows]
+    true = triangulate_frames(ids, frames, rotations, positions, estimator.rig)
+    if np.sum(true.good) < SCALE_NEEDS:
+        return float("nan")
+    here = state.world_T_body.translation()
+    distances = np.linalg.norm(points[true.good] - here, axis=1)
+    true_distances = np.linalg.norm(true.points[true.good] - positions[-1], axis=1)
+    return float(abs(np.median(distances / true_distances) - 1.0))
 
 
 def _kind(cameras: int) -> str:

@@ -11,7 +11,13 @@ from flight import NS_PER_S, Flight, features_from, packets, room
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import BackendConfig, GatingConfig, InitializationConfig
+from slam_graph.backend.backend_config import (
+    AdaptiveNoiseConfig,
+    BackendConfig,
+    GatingConfig,
+    InitializationConfig,
+    NoiseConfig,
+)
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.sensors.imu_buffer import ImuBuffer
@@ -23,6 +29,7 @@ EPSILON = 1e-3
 POINTS = 40
 SIGMAS = np.array([0.02, 0.05, 0.1, 0.1, 0.01])
 CONFIG = BackendConfig(
+    noise=NoiseConfig(adaptive=AdaptiveNoiseConfig(enabled=False)),
     gating=GatingConfig(confidence=1.0 - 1e-12, robust_loss="none"),
     initialization=InitializationConfig(mode="given", fix_gauge=False),
 )

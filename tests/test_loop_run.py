@@ -98,12 +98,22 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
         true, found = getattr(result.trajectory, name), getattr(saved.trajectory, name)
         np.testing.assert_allclose(found, true, rtol=1e-8)
     np.testing.assert_allclose(saved.sigmas, result.sigmas, rtol=1e-8)
+    if result.smoothed_sigmas is not None:
+        assert saved.smoothed_sigmas is not None
+        np.testing.assert_allclose(saved.smoothed_sigmas, result.smoothed_sigmas, rtol=1e-8)
     np.testing.assert_array_equal(saved.points, result.points)
     assert (saved.slam_map is None) == (result.slam_map is None)
     if saved.slam_map is not None and result.slam_map is not None:
         np.testing.assert_array_equal(saved.slam_map.points, result.slam_map.points)
     assert len(saved.rig.cameras) == len(result.rig.cameras)
-    tested = trajectories | {"groundtruth", "sigmas", "points", "slam_map", "rig"}
+    tested = trajectories | {
+        "groundtruth",
+        "sigmas",
+        "smoothed_sigmas",
+        "points",
+        "slam_map",
+        "rig",
+    }
     for name in ("metrics", "config", "status", "message", "coverage"):
         assert getattr(saved, name) == getattr(result, name), name
         tested.add(name)

@@ -45,7 +45,10 @@ TOLERANCE = 1e-5
 FEW, MANY = 3, 1000
 TRIANGULATION = TriangulationConfig(min_parallax_rad=0.0, max_depth_m=1e6)
 LOOSE = BackendConfig(
-    gating=CONFIG.gating, initialization=CONFIG.initialization, triangulation=TRIANGULATION
+    noise=CONFIG.noise,
+    gating=CONFIG.gating,
+    initialization=CONFIG.initialization,
+    triangulation=TRIANGULATION,
 )
 
 

@@ -53,7 +53,7 @@ MAX_NORMALIZED_COST = 3.0
 """Largest accepted mean squared residual, in σ²."""
 MAX_VELOCITY_SIGMA = 0.1
 """Largest accepted standard deviation of the velocity, m/s."""
-MAX_SCALE_SIGMA = 0.15
+MAX_SCALE_SIGMA = 0.04
 """Largest accepted standard deviation of the scale, relative to it."""
 _MAX_COST_CHANGE = 0.1
 """Largest accepted relative change of the cost by the last step: beyond it, the steps have not
