@@ -140,7 +140,7 @@ def _states(estimator: Estimator, packets: Iterator[Packet]) -> StateHistory:
             state = estimator.add_frame(packet.frame)
         except (SlamGraphError, np.linalg.LinAlgError, RuntimeError):
             break  # diverged: the error so far says it
-        if estimator.replayed:
+        if estimator.replayed is not None:
             states = list(estimator.replayed)
         elif state is not None:
             states.append(state)

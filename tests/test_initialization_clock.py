@@ -141,7 +141,7 @@ def estimate(
         assert isinstance(packet.frame, FeatureFrame)
         estimator.add_imu(packet.imu)
         state = estimator.add_frame(packet.frame)
-        if estimator.replayed:
+        if estimator.replayed is not None:
             states = list(estimator.replayed)
         elif state is not None:
             states.append(state)

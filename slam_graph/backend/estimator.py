@@ -29,7 +29,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
-from slam_graph.backend.online_calibration import CalibrationVariables
+from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
@@ -64,7 +64,8 @@ class Estimator:
         window: the variables and what is known of them; None as long as there is no state.
         rig: the sensors, as calibrated or corrected at the start.
         replayed: where the last frame led to a beginning with another calibration, the states of
-            the frames of the last seconds, which supersede all states before; else empty.
+            the frames of the last seconds, which supersede all states before; else None.
+        states: all that the last frame led to: one, none, or several where frames have waited.
     """
 
     def __init__(
@@ -101,7 +102,8 @@ class Estimator:
         self.algorithm = algorithm
         self.config = config
         self.diagnostics = diagnostics
-        self.replayed: list[NavState] = []
+        self.replayed: list[NavState] | None = None
+        self.states: list[NavState] = []
         self._begin(ImuBuffer())
 
     def _begin(self, imu: ImuBuffer) -> None:
@@ -153,14 +155,27 @@ class Estimator:
 
         Returns:
             The causal estimate with its covariance, stamped on the clock of the IMU. None as long
-            as there is no state, and for a frame that does not follow those before.
+            as there is no state, for a frame that does not follow those before, and for one that
+            waits; where one has waited, the state may be that of an earlier frame, and `states`
+            has all that were found.
         """
         with self._threads.limit(limits=1, user_api="blas"):
+            self.replayed = None
             if self._held is None:
-                return self._take(frame)
+                state = self._take(frame)
+                if self.replayed is None:
+                    self.states = [] if state is None else [state]
+                return state
             self._held.append(frame)
-            self.replayed = []
-            return self._new(self._take_held(self._held))
+            self.states = self._take_held(self._held)
+            return self._new(self.states)
+
+    def finish(self) -> list[NavState]:
+        """States at frames that still wait, when no more IMU samples come; in `states` too."""
+        with self._threads.limit(limits=1, user_api="blas"):
+            self.replayed = None
+            self.states = self._take_held(self._held or deque(), MAX_EARLY_NS)
+            return self.states
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
@@ -198,24 +213,26 @@ class Estimator:
             self.config = found.config
         given, frames = self._given, self._check.recent
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
-            given = None  # too long ago: the IMU alone would have to lead from there to here
+            # too long ago: the IMU alone would have to lead from there to here
+            given = self._given = None
             change = {"mode": "auto"}
             initialization = self.config.initialization.model_copy(update=change)
             self.config = self.config.model_copy(update={"initialization": initialization})
         if self.window is not None:
             self._output_ns = self.window.stamp_ns
-        for _ in range(_ROUNDS):
+        for rounds_left in reversed(range(_ROUNDS)):
             self._begin(self._context.imu)
             if given is not None:
                 self.start(given)
             self._held = deque(frames)
-            self.replayed = self._take_held(self._held)
+            states = self._take_held(self._held)
             better = self.calibration
-            if better is None or not self._moved_far(better.rig):
+            if not rounds_left or better is None or not self._moved_far(better.rig):
                 break
             # the first linearisation points were those of an offset some milliseconds off
             self.rig = better.rig
-        return self._new(self.replayed)
+        self.states = self.replayed = states
+        return self._new(states)
 
     def _new(self, states: list[NavState]) -> NavState | None:
         """The last of some states if it is later than those before."""
@@ -229,14 +246,14 @@ class Estimator:
         change_s = rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
         return abs(change_s) > _REPEATED_S
 
-    def _take_held(self, held: deque[FeatureFrame]) -> list[NavState]:
-        """States at the frames whose time the IMU has reached."""
+    def _take_held(self, held: deque[FeatureFrame], early_ns: int = 0) -> list[NavState]:
+        """States at the frames whose time the IMU has reached, or will within `early_ns`."""
         states: list[NavState] = []
         variables = self._context.calibration
         while held:
             rig = self.rig if self.window is None else variables.rig(self.window.state.estimate)
             offset_ns = round(rig.cameras[0].clock_offset_s * 1e9)
-            if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns():
+            if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break
             state = self._take(held.popleft())
             if state is not None:
@@ -275,6 +292,11 @@ class Estimator:
     def initialized(self) -> bool:
         """Whether there is a state."""
         return self.window is not None
+
+    @property
+    def start_is_given(self) -> bool:
+        """Whether the first state was given, by `start`."""
+        return self._given is not None
 
     @property
     def corrected_rig(self) -> Rig | None:

@@ -31,7 +31,7 @@ from slam_graph.backend.solve.state import (
 from slam_graph.geometry import NavState
 from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, Rig, RigCamera
 
-_MAX_EARLY_NS = 50_000_000
+MAX_EARLY_NS = 50_000_000
 """A frame may be taken this much too early where the IMU has no samples yet."""
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -219,7 +219,7 @@ class CalibrationVariables:
             offset_s = float(state.estimate.atVector(T(0))[0]) + self.nominal.cameras[0].middle_s
         stamp_ns = frame_ns + round(offset_s * 1e9)
         beyond_ns = stamp_ns - imu.newest_ns()
-        return stamp_ns - beyond_ns if 0 < beyond_ns <= _MAX_EARLY_NS else stamp_ns
+        return stamp_ns - beyond_ns if 0 < beyond_ns <= MAX_EARLY_NS else stamp_ns
 
     def note_motion(
         self, state: State, frame: int, stamp_ns: int, frame_ns: int, imu: ImuBuffer

@@ -153,13 +153,13 @@ class PointPredictor:
         self._mounted = mounted
         self._body_T_camera = mounted.body_T_camera
         self._offset_ns = round(mounted.clock_offset_s * 1e9)
+        self._turns_rows = mounted.readout_s != 0.0 and mounted.rotation_known
+        self._trends.clear()  # they are of the former offset
 
     def advance(self, start_ns: int, end_ns: int) -> None:
         """Integrate the rotation between two frames (times of the camera)."""
         start_R_end = self._motion.rotation(start_ns + self._offset_ns, end_ns + self._offset_ns)
-        if (
-            not self._mounted.rotation_known
-        ):  # the gyroscope says nothing of a camera that may be turned anyhow
+        if not self._mounted.rotation_known:  # the gyroscope tells nothing of the camera
             start_R_end = None
         self.rotation_known = start_R_end is not None and self._mode != "flow"
         self.camera_R = np.eye(3)
@@ -207,14 +207,14 @@ class PointPredictor:
             m: (N, 2) the same, normalised.
             stamp_ns: of one of the last two images.
         """
-        if self._mounted.readout_s == 0.0 or len(m) == 0:
+        if not self._turns_rows or len(m) == 0:
             return m
         return self._turned(m, np.asarray(pixels, np.float64)[:, 1], stamp_ns, 1.0)
 
     def _rolled(self, m: FloatArray, stamp_ns: int) -> FloatArray:
         """Pixels (N, 2) of points whose coordinates are those at the time of the middle row."""
         pixels: FloatArray = self._camera.distort(m)[0]
-        if self._mounted.readout_s == 0.0 or len(m) == 0:
+        if not self._turns_rows or len(m) == 0:
             return pixels
         for _ in range(_ROW_ITERATIONS):
             pixels = self._camera.distort(self._turned(m, pixels[:, 1], stamp_ns, -1.0))[0]

@@ -160,9 +160,17 @@ class Estimation:
         self._note(frame, tracked)
         return frame
 
+    def finish(self) -> None:
+        """Note the states of frames that waited for IMU samples which do not come."""
+        self._append(self.estimator.finish())
+
+    def _append(self, states: list[NavState]) -> None:
+        for state in states:
+            self._result.history.append(state)
+
     def _start_from_known_state(self, stamp_ns: int) -> None:
         state = self._start.at(stamp_ns)
-        if state is not None:
+        if state is not None and stamp_ns - state.stamp_ns <= _LEAD_NS:  # not after a restart
             self.estimator.start(state)
             self._result.start_was_given = True
 
@@ -191,13 +199,15 @@ class Estimation:
         if estimator.costs:
             logs.steps.append(stamp_ns, estimator.costs, estimator.columns)
         logs.innovations.append(stamp_ns, estimator.innovations)
-        if estimator.replayed:  # what was said of these frames so far is superseded
+        if estimator.replayed is not None:  # what was said of these frames so far is superseded
             result.supersede(estimator.replayed)
+            result.corrected_rig = estimator.corrected_rig
+            result.start_was_given &= estimator.start_is_given
         if frame.state is not None:
             check_sane(frame.state, result.config.limits)
             self._agreement.check(stamp_ns, estimator.innovations)
-            if not estimator.replayed:
-                result.history.append(frame.state)
+            if estimator.replayed is None:
+                self._append(estimator.states)
             result.point_map.update(frame.landmark_ids, frame.landmarks)
             if estimator.calibration is not None:
                 logs.calibration.append(estimator.calibration)

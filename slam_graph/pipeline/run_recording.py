@@ -93,6 +93,7 @@ def run(
                 for stage in stages:
                     stage.frame(frame)
                 frame_done()
+            estimation.finish()
         for stage in stages:
             stage.finish()
     result.warnings = +sequence.diagnostics.counts

@@ -22,6 +22,9 @@ from slam_graph.frontend import Feedback, Frontend
 from slam_graph.results import RunInput
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet
 
+_LEAD_MARGIN_NS = 10_000_000
+"""Packets lead by so much more than the time offset wants: it is estimated on."""
+
 
 class Stopwatch:
     """Times the stages of one frame.
@@ -93,7 +96,10 @@ class _LeadingPackets:
     def __next__(self) -> Packet:
         if self.lead_ns == 0 and not self._frames:
             return next(self._packets)
-        while not self._frames or self._newest_ns < self._frames[0].stamp_ns + self.lead_ns:
+        while not self._frames or (
+            self._newest_ns < self._frames[0].stamp_ns + self.lead_ns
+            and self._frames[-1].stamp_ns <= self._frames[0].stamp_ns + 2 * self.lead_ns
+        ):
             packet = next(self._packets, None)
             if packet is None:
                 break
@@ -154,8 +160,9 @@ class Tracking:
         if feedback is not None:
             self._frontend.receive_feedback(feedback)
             if feedback.rig is not None:
-                offset_ns = round(feedback.rig.cameras[0].time_offset_s * 1e9)
-                self._packets.lead_ns = max(0, offset_ns)
+                first = feedback.rig.cameras[0]
+                end_ns = round((first.time_offset_s + first.end_s) * 1e9)
+                self._packets.lead_ns = max(0, end_ns + _LEAD_MARGIN_NS)
         packet = next(self._packets, None)
         if packet is None:
             return None

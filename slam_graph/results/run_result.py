@@ -88,6 +88,7 @@ class RunResult:
         ending: how it ended.
         history: the causal estimate of every frame, with covariances.
         start_was_given: whether the first state came with the data, in the world of the truth.
+        corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
         logs: what was noted at every frame.
         final_ba: the smoothed trajectory and its summary, if there is one.
@@ -102,6 +103,7 @@ class RunResult:
     ending: Ending = field(default_factory=Ending)
     history: StateHistory = field(default_factory=StateHistory)
     start_was_given: bool = False
+    corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
     logs: RunLogs = field(default_factory=RunLogs)
     final_ba: FinalBa | None = None

@@ -112,9 +112,10 @@ class FrameLog:
         """(N, 2) factors on the noise of gyroscope and accelerometer at the frames."""
         return np.array(self._noise, dtype=np.float64).reshape(-1, 2)
 
-    def packets(self, first: int, stop: int) -> Iterator[Packet]:
+    def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
+        sequence.rig = rig  # how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:

@@ -229,12 +229,18 @@ class BundleAdjustment:
         """
         known = self._covariances()
         for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
+            assumed = self._factors.noise
             if known is None or not self._factors.learn_noise(
                 self._solved[0], self._values, known.pairs
             ):
                 break
             points = stacked_points(self._values, obs.ids.tolist())
-            self._minimize(obs, points, variances, self._config.tolerance)
+            try:
+                self._minimize(obs, points, variances, self._config.tolerance)
+            except (EstimationError, RuntimeError) as error:
+                logger.info("the noise of the IMU is not learned: %s", error)
+                self._factors.noise = assumed
+                break
             known = self._covariances()
         return known
 

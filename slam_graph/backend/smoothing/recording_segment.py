@@ -92,7 +92,7 @@ def read_segment(
     samples, stamps, still = [], [], []
     columns: list[tuple[IntArray, ...]] = []
     points: list[FloatArray] = []
-    for number, packet in enumerate(log.packets(first, stop)):
+    for number, packet in enumerate(log.packets(first, stop, rig)):
         frame = packet.frame
         assert isinstance(frame, FeatureFrame)
         samples.append(packet.imu)
