@@ -101,6 +101,7 @@ class Estimator:
         self.rig = rig
         self.algorithm = algorithm
         self.config = config
+        self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.diagnostics = diagnostics
         self.replayed: list[NavState] | None = None
         self.states: list[NavState] = []
@@ -109,7 +110,7 @@ class Estimator:
     def _begin(self, imu: ImuBuffer) -> None:
         """Begin without a state, with the rig and the settings as they are now."""
         rig, config, diagnostics = self.rig, self.config, self.diagnostics
-        calibration = CalibrationVariables(rig, config.calibration)
+        calibration = CalibrationVariables(rig, self._variables)
         projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
         propagation = Propagation(rig.imu, config, diagnostics)
         context = EngineContext(
@@ -117,7 +118,7 @@ class Estimator:
         )
         self._engine: Engine = self._make_engine(context)
         self._context = context
-        self._initializer = Initializer(context)
+        self._initializer = Initializer(context, self._start_mode)
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
         self.window: Window | None = None
@@ -210,14 +211,12 @@ class Estimator:
         self.diagnostics.warn("calibration_corrected", found.message)
         self.rig = found.rig
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
-            self.config = found.config
+            self._variables = found.variables
         given, frames = self._given, self._check.recent
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
             # too long ago: the IMU alone would have to lead from there to here
             given = self._given = None
-            change = {"mode": "auto"}
-            initialization = self.config.initialization.model_copy(update=change)
-            self.config = self.config.model_copy(update={"initialization": initialization})
+            self._start_mode = "auto"
         if self.window is not None:
             self._output_ns = self.window.stamp_ns
         for rounds_left in reversed(range(_ROUNDS)):

@@ -41,15 +41,17 @@ class Initializer:
         waiting_for: why there is no start yet.
     """
 
-    def __init__(self, context: EngineContext) -> None:
+    def __init__(self, context: EngineContext, mode: str) -> None:
         """Start with no frames.
 
         Args:
             context: shared with the engine; `context.imu` has the samples up to each frame.
+            mode: which starts are tried, as in `initialization.mode`.
         """
         self.waiting_for = "the first frames"
         self._context = context
         self._config = context.config.initialization
+        self._mode = mode
         self._params = context.propagation.noise.params()
         self._refinement = DynamicRefinement(context, self._params)
         self._stamps_ns: list[int] = []
@@ -74,9 +76,9 @@ class Initializer:
         """
         outcome: Window | str = "a state to start from (mode 'given')"
         self._standstill.is_still(self._context.imu, stamp_ns, frame)
-        if self._config.mode in ("auto", "static"):
+        if self._mode in ("auto", "static"):
             outcome = self._at_rest(stamp_ns)
-        if self._config.mode in ("auto", "motion") and isinstance(outcome, str):
+        if self._mode in ("auto", "motion") and isinstance(outcome, str):
             outcome = self._in_motion(stamp_ns, frame)
         if isinstance(outcome, str):
             self.waiting_for = outcome

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.initialization.gyro_alignment import (
     MAX_OFFSET_S,
     GyroAlignment,
@@ -73,12 +73,12 @@ class FoundCalibration:
 
     Attributes:
         rig: with the time offset, and the rotation of the cameras where it was unknown.
-        config: settings under which both go on as variables.
+        variables: which parameters go on as variables, and how well they are known.
         message: what was found and what the calibration said.
     """
 
     rig: Rig
-    config: BackendConfig
+    variables: CalibrationConfig
     message: str
 
 
@@ -249,6 +249,5 @@ class StartCalibration:
             }
             message = f"rotation of the camera estimated to {np.rad2deg(sigma):.1f}°; {message}"
             self.mounted = True
-        calibration = self._config.calibration.model_copy(update=changes)
-        config = self._config.model_copy(update={"calibration": calibration})
-        return FoundCalibration(Rig(tuple(cameras), self._rig.imu), config, message)
+        variables = CalibrationConfig(**{**self._config.calibration.model_dump(), **changes})
+        return FoundCalibration(Rig(tuple(cameras), self._rig.imu), variables, message)
