@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import IntArray
 from slam_graph.geometry import NavState, Trajectory, interpolate
@@ -30,6 +32,23 @@ def _state_at(trajectory: Trajectory, row: int) -> NavState:
         accel_bias=trajectory.accel_biases[row],
         gyro_bias=trajectory.gyro_biases[row],
     )
+
+
+def states_in(values: gtsam.Values, stamps_ns: Sequence[int]) -> list[NavState]:
+    """The states X(k), V(k) and B(k) among some values, with their times, without covariances."""
+    states = []
+    for k, stamp_ns in enumerate(stamps_ns):
+        bias = values.atConstantBias(B(k))
+        states.append(
+            NavState(
+                stamp_ns,
+                values.atPose3(X(k)),
+                np.asarray(values.atVector(V(k))),
+                accel_bias=np.asarray(bias.accelerometer()),
+                gyro_bias=np.asarray(bias.gyroscope()),
+            )
+        )
+    return states
 
 
 def states_at(

@@ -23,7 +23,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
-from slam_graph.backend.smoothing.keyframe_states import fill_in
+from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
     averaged,
@@ -389,16 +389,4 @@ class BundleAdjustment:
 
     def _keyframe_states(self) -> list[NavState]:
         """The states of the keyframes."""
-        keyframes = []
-        for k, stamp_ns in enumerate(self._segment.keyframe_stamps_ns.tolist()):
-            bias = self._values.atConstantBias(B(k))
-            keyframes.append(
-                NavState(
-                    stamp_ns,
-                    self._values.atPose3(X(k)),
-                    np.asarray(self._values.atVector(V(k))),
-                    accel_bias=np.asarray(bias.accelerometer()),
-                    gyro_bias=np.asarray(bias.gyroscope()),
-                )
-            )
-        return keyframes
+        return states_in(self._values, self._segment.keyframe_stamps_ns.tolist())
