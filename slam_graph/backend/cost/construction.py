@@ -116,7 +116,6 @@ class CostConstruction:
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.robust_loss)
         self._failures: dict[int, int] = {}
-        self._gated = np.zeros(0, np.int64)
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
         """The cost now.
@@ -138,10 +137,9 @@ class CostConstruction:
         in_state = np.intersect1d(window.state_features, window.tracks.ids_waiting(), True)
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
-            window, poses, len(in_state), self._dynamic, self._gated, removals
+            window, poses, len(in_state), self._dynamic, removals
         )
         gate, linear = self._apply_gate(window, cost, predicted, removals)
-        self._gated = np.intersect1d(np.union1d(self._gated, self.rejected), window.tracks.seen)
         if not self._features.relinearized:
             # a pose that no waiting observation refers to has nothing more to give
             used = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)

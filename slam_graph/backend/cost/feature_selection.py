@@ -78,7 +78,6 @@ class FeatureSelection:
         poses: PoseSelection,
         in_state: int,
         dynamic: IntArray,
-        gated: IntArray,
         removals: Removals,
     ) -> TrackFeatures | None:
         """Triangulated features that are in the cost with all of their observations.
@@ -88,14 +87,11 @@ class FeatureSelection:
             poses: which past poses stay.
             in_state: number of features of the state that the current frame sees.
             dynamic: ids (N,) of features that must not be used, ascending.
-            gated: ids (N,) of features that the gate rejected before. They may be used once, but
-                do not enter the state: one that slides passes the gate now and then, and would do
-                its damage for as long as it is tracked.
             removals: gets the observations that go without being in the cost.
         """
         bound = self.policy.max_state_features
         room = len(window.tracks.seen) if bound is None else bound - in_state
-        choice = self._candidates(window, poses, room, dynamic, gated, removals)
+        choice = self._candidates(window, poses, room, dynamic, removals)
         ids = np.union1d(choice.used, choice.lasting)
         if len(ids) == 0:
             return None
@@ -117,7 +113,6 @@ class FeatureSelection:
         poses: PoseSelection,
         room: int,
         dynamic: IntArray,
-        gated: IntArray,
         removals: Removals,
     ) -> _Candidates:
         """The features that may be in the cost, where `room` more may be held in the state."""
@@ -131,7 +126,6 @@ class FeatureSelection:
         lasting &= is_in(ids, _longest(ids[lasting], lengths[lasting], max(room, 0))) | (
             (ids + window.frame) % _RETRY_FRAMES == 0
         )
-        lasting &= ~is_in(ids, gated)
         leaving = is_in(ids, seen_by_leaving(tracks, window.past, poses))
         choice = FEATURE_POLICIES[policy.features]
         due = choice.due(WaitingTracks(ids, lengths, live, leaving))
