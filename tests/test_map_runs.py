@@ -19,7 +19,7 @@ from slam_graph.simulation.simulation_config import SimulationConfig, TrackConfi
 from slam_graph.simulation.simulator import simulate
 
 HALF_S = 48.0
-WITHIN_M, WITHIN_DEG = 0.051, 1.1
+WITHIN_M, WITHIN_DEG = 0.046, 1.1
 
 
 @pytest.fixture(scope="module")

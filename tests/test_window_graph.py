@@ -115,14 +115,14 @@ def test_it_has_the_normal_equations_of_the_engine(name: str, cameras: int) -> N
     check(estimator)
     window = estimator.factor_graph()
     points = [k for k in window.values.keys() if chr(gtsam.Symbol(k).chr()) == "l"]  # noqa: SIM118
-    assert len(points) >= 3
+    assert len(points) > 5
 
 
 @pytest.mark.parametrize("name", OWN)
 def test_so_it_has_at_every_frame_with_outliers(name: str) -> None:
     flight = steps(name, cameras=1, outliers=0.1)
     next(flight)  # the start, which has no step
-    assert sum(check(estimator) for estimator in flight) > 2, "no features outside the state"
+    assert sum(check(estimator) for estimator in flight) > 5, "no features outside the state"
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

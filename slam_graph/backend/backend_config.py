@@ -21,7 +21,7 @@ class AdaptiveNoiseConfig(Settings):
     without vibration whose noise was measured."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        name: f"is a constant now: {constant} in backend/cost/imu_factor.py"
+        name: f"is a constant now: {constant} in backend/cost/adaptive_imu_noise.py"
         for name, constant in (
             ("whiteness_s", "PERSISTENCE_TIME_S"),
             ("size_s", "SIZE_TIME_S"),

@@ -66,6 +66,7 @@ class Estimator:
         replayed: where the last frame led to a beginning with another calibration, the states of
             the frames of the last seconds, which supersede all states before; else None.
         states: all that the last frame led to: one, none, or several where frames have waited.
+        solved_ns: stamp of the frame that the last state is of, on the clock of the cameras.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class Estimator:
         self.diagnostics = diagnostics
         self.replayed: list[NavState] | None = None
         self.states: list[NavState] = []
+        self.solved_ns = np.iinfo(np.int64).min
         self._begin(ImuBuffer())
 
     def _begin(self, imu: ImuBuffer) -> None:
@@ -181,6 +183,7 @@ class Estimator:
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
         self._report = StepReport()
+        self.solved_ns = frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
         state = self.window.state if self.window is not None else None
         stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
@@ -194,6 +197,7 @@ class Estimator:
         found = self._check.add(frame, imu, self.window is not None)
         if found is not None:
             return self._begin_anew(found)
+        self._context.propagation.noise.watch_vibration(imu, stamp_ns)
         still = self._standstill.is_still(imu, stamp_ns, frame)
         frame = frame.without(self._standstill.dynamic)
         if self.window is None:
@@ -212,7 +216,7 @@ class Estimator:
         self.rig = found.rig
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
             self._variables = found.variables
-        given, frames = self._given, self._check.recent
+        given, frames = self._given, list(self._check.recent)
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
             # too long ago: the IMU alone would have to lead from there to here
             given = self._given = None

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Prediction: the motion of the body by the IMU, and where features will be in the next image.
-
-Motion of the body by the IMU, from the last state of the back end on.
-
-Prediction: where the features of a camera will be in its next image.
-"""
+"""Prediction: the motion of the body by the IMU, and where features will be in the next image."""
 
 from __future__ import annotations
 

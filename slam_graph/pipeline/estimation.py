@@ -156,6 +156,8 @@ class Estimation:
             estimator.imu_noise,
             estimator.initialized,
             estimator.corrected_rig,
+            estimator.replayed is not None,
+            estimator.solved_ns != features.stamp_ns,
         )
         self._note(frame, tracked)
         return frame

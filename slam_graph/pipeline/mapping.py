@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stages of places: keyframes and loop closure, the map of a run, localization in a saved map.
 
-Keyframes and loop closure as stages: keyframes are collected, loops closed at the end.
-
-The map as a stage: built at the end from the keyframes and their best poses.
-
-Localization as a stage: the pose of every frame in a map that was saved before.
+Keyframes are collected on the way. Loops are closed and the map is built at the end, localization
+gives every frame its pose in a map that was saved before.
 """
 
 from __future__ import annotations
@@ -44,12 +41,16 @@ class Keyframes(Stage):
 
     def __init__(self, result: RunResult) -> None:
         self.seconds = 0.0
-        self._log = KeyframeLog(result.input.rig, result.config.loop_closure.keyframes)
+        self._result = result
+        self._log = KeyframeLog(result.causal_rig, result.config.loop_closure.keyframes)
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate."""
+        if frame.restarted:
+            keyframes = self._result.config.loop_closure.keyframes
+            self._log = KeyframeLog(self._result.causal_rig, keyframes)
         state = frame.state
-        if state is None:
+        if state is None or frame.waits:
             return
         began = time.perf_counter()
         # the state's time is on the IMU's clock, also where the camera's time offset is estimated
@@ -91,7 +92,7 @@ class LoopClosing(Stage):
         with warn_on_failure(self._diagnostics, "loop_closure_failed", "no loops are closed"):
             closures = close_loops(
                 self._keyframes.at(result.best_trajectory),
-                result.input.rig,
+                result.causal_rig,
                 result.config.loop_closure,
                 result.config.seed,
                 self._diagnostics,
@@ -137,7 +138,7 @@ def _build(result: RunResult, keyframes: Keyframes) -> SlamMap:
     causal ones.
     """
     config, loops = result.config, _accepted_loops(result)
-    recording = MapRecording(result.input.info.name, "causal", result.input.rig)
+    recording = MapRecording(result.input.info.name, "causal", result.causal_rig)
     if loops and result.loops is not None:
         recording, poses = replace(recording, poses="loop_closed"), result.loops.poses
     elif result.final_ba is not None:
@@ -170,11 +171,18 @@ class Localization(Stage):
     """
 
     def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
-        rig, loops = result.input.rig, result.config.loop_closure
-        self._localizer = MapLocalizer(known, rig, loops, result.config.localization)
-        self._describer = KeyframeDescriber(rig.cameras[0].camera, loops.keyframes.further_corners)
+        loops, self._result, self._known = result.config.loop_closure, result, known
+        camera = result.input.rig.cameras[0].camera
+        self._describer = KeyframeDescriber(camera, loops.keyframes.further_corners)
+        self._localizer = self._new_localizer()
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.localization = LocalizationLog(known)
+
+    def _new_localizer(self) -> MapLocalizer:
+        config = self._result.config
+        return MapLocalizer(
+            self._known, self._result.causal_rig, config.loop_closure, config.localization
+        )
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate.
@@ -182,8 +190,10 @@ class Localization(Stage):
         Raises:
             DataError: if the run has descriptors of another kind than the map.
         """
+        if frame.restarted:
+            self._localizer = self._new_localizer()
         state = frame.state
-        if state is None:
+        if state is None or frame.waits:
             return
         began = time.perf_counter()
         localizer = self._localizer

@@ -77,7 +77,7 @@ class Smoothing(Stage):
         result.final_ba = adjust_recording(
             log,
             result.trajectory,
-            (result.corrected_rig or result.input.rig) if calibrated is None else calibrated.rig,
+            result.causal_rig if calibrated is None else calibrated.rig,
             result.config.backend,
             result.config.final_ba,
             self._progress.adjusting,

@@ -47,6 +47,8 @@ class EstimatedFrame:
         imu_noise: factors on the white noise of gyroscope and accelerometer that are assumed now.
         initialized: whether the estimator has started.
         corrected_rig: the calibration, where the estimator has corrected it; None otherwise.
+        restarted: whether the estimator began anew at this frame, in another world.
+        waits: whether this frame waits for IMU samples, and the state is that of an earlier one.
     """
 
     packet: Packet
@@ -58,6 +60,8 @@ class EstimatedFrame:
     imu_noise: tuple[float, float]
     initialized: bool
     corrected_rig: Rig | None = None
+    restarted: bool = False
+    waits: bool = False
 
     @property
     def image(self) -> np.ndarray | None:

@@ -234,6 +234,11 @@ class RunLogs:
     features: Counter[str] = field(default_factory=Counter)
     last_frame_ns: int | None = None
 
+    def supersede(self) -> None:
+        """Begin anew with what is said of states; times and counts of frames stay."""
+        self.steps, self.innovations = StepLog(), InnovationLog()
+        self.calibration = CalibrationLog()
+
     def count_frame(
         self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]
     ) -> None:

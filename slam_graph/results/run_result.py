@@ -120,8 +120,9 @@ class RunResult:
         )
 
     def supersede(self, states: Sequence[NavState]) -> None:
-        """Put other states in the place of all so far; the map begins anew."""
+        """Put other states in the place of all so far; the map and what was logged begin anew."""
         self.history, self.point_map = StateHistory(), PointMap()
+        self.logs.supersede()
         for state in states:
             self.history.append(state)
 
@@ -134,6 +135,11 @@ class RunResult:
     def rig(self) -> Rig:
         """The sensors that were used, with the calibration from before the run."""
         return self.input.rig
+
+    @property
+    def causal_rig(self) -> Rig:
+        """The calibration that the causal estimate was made with, before any online estimate."""
+        return self.corrected_rig or self.input.rig
 
     @property
     def status(self) -> Status:

@@ -45,6 +45,11 @@ class SmootherEngine:
         Raises:
             ConfigError: if parameters of the calibration are to be estimated.
         """
+        if not all(mounted.rotation_known for mounted in context.rig.cameras):
+            raise ConfigError(
+                f"the mounting of a camera is not known, and '{context.algorithm.name}' cannot "
+                "estimate it; use msckf, swf, okvis, ekf or iekf"
+            )
         if context.config.calibration.anything:
             raise ConfigError(
                 f"backend.calibration is not for '{context.algorithm.name}': GTSAM's smoothers "

@@ -69,16 +69,14 @@ class DynamicRefinement:
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
     """
 
-    def __init__(self, context: EngineContext, params: gtsam.PreintegrationCombinedParams) -> None:
+    def __init__(self, context: EngineContext) -> None:
         """Prepare for attempts.
 
         Args:
             context: shared with the engine.
-            params: noise of the IMU.
         """
         self.outliers = np.zeros(0, np.int64)
         self._context = context
-        self._params = params
 
     def refine(self, frames: StartFrames, guess: StartGuess) -> Window | str:
         """The window that begins with the last frame, or what is missing for it.
@@ -131,8 +129,9 @@ class DynamicRefinement:
             state.insert_imu_state(k, nav)
         start = guess.states[0]
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
+        params = context.propagation.noise.params()
         for k, samples in enumerate(frames.imu_between(context.imu)):
-            factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, self._params)))
+            factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
         first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
         first = fix_gauge(first, MOTION_PRIOR)
         factors += _prior_factors(first)

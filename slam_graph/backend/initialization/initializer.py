@@ -52,8 +52,7 @@ class Initializer:
         self._context = context
         self._config = context.config.initialization
         self._mode = mode
-        self._params = context.propagation.noise.params()
-        self._refinement = DynamicRefinement(context, self._params)
+        self._refinement = DynamicRefinement(context)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
@@ -114,7 +113,7 @@ class Initializer:
             frames,
             context.imu,
             context.projection.moving(turning),
-            self._params,
+            context.propagation.noise.params(),
             context.config.noise,
             self._rng,
         )

@@ -116,6 +116,9 @@ class StartCalibration:
             A calibration that the old one contradicts; None as long as there is none.
         """
         if self.done:
+            self._frames.clear()
+            self._turns.clear()
+            self.recent.clear()
             return None
         self.recent.append(frame)
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:

@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.cost.imu_factor import MAX_FACTOR
+from slam_graph.backend.cost.adaptive_imu_noise import MAX_FACTOR
 from slam_graph.sensors import ImuNoise
 
 _ROWS = (slice(0, 3), slice(6, 9), slice(9, 12), slice(12, 15))

@@ -160,7 +160,8 @@ def write_kalibr(rig: Rig, path: str | Path) -> None:
 def kalibr_text(rig: Rig) -> str:
     """The content of a Kalibr file with cameras and IMU, which loses no digit."""
     content: dict[str, Any] = {
-        f"cam{index}": _camera_entry(mounted) for index, mounted in enumerate(rig.cameras)
+        f"cam{index}": _camera_entry(mounted) | _mounting(rig, index)
+        for index, mounted in enumerate(rig.cameras)
     }
     content[_IMU_KEY] = {
         "gyroscope_noise_density": float(rig.imu.gyro_noise_density),
@@ -174,6 +175,17 @@ def kalibr_text(rig: Rig) -> str:
     return f"# Kalibr camera chain: {comment}\n{table}"
 
 
+def _mounting(rig: Rig, index: int) -> dict[str, Any]:
+    """Where a camera is: on the body, or beside the one before if the body does not know."""
+    mounted = rig.cameras[index]
+    if mounted.rotation_known:
+        return {"T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist()}
+    if index == 0:
+        return {"T_cam_imu": _UNKNOWN}
+    before = rig.cameras[index - 1].body_T_camera
+    return {"T_cn_cnm1": mounted.body_T_camera.between(before).matrix().tolist()}
+
+
 def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
     camera, entry = mounted.camera, camera_entry(mounted.camera)
     return shutter_entry(mounted) | {
@@ -183,8 +195,5 @@ def _camera_entry(mounted: RigCamera) -> dict[str, Any]:
         "distortion_model": entry.kalibr_distortion,
         "distortion_coeffs": entry.coefficients,
         "resolution": [int(camera.width), int(camera.height)],
-        "T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist()
-        if mounted.rotation_known
-        else _UNKNOWN,
         "timeshift_cam_imu": float(mounted.time_offset_s),
     }
