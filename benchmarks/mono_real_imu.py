@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.experiments import compared, configs_of, folder_of, note_failures, results_of
+from benchmarks.flights import FLIGHTS
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED, is_held_out
-from benchmarks.starts import FLIGHTS
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.arrays import FloatArray
 from slam_graph.experiment.comparison_plan import Comparison

@@ -16,12 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.flights import KIND, flight_is_held_out, flown_by_camera
 from benchmarks.metric import Metric, info
-from benchmarks.recordings import is_held_out
 from benchmarks.running import Errors, Run
 from benchmarks.suite import RECURSIVE, Benchmark, Outcome
 from slam_graph.sensors import Rig
-from slam_graph.simulation import simulate
 
 FLIGHTS = ("euroc_inertial/V1_02_medium", "tumvi_inertial/room1", "tumvi_inertial/room3")
 READOUTS_S = (0.02, 0.03)
@@ -67,9 +66,8 @@ def measure(data: Path, duration_s: float = DURATION_S) -> Outcome:
     with ProcessPoolExecutor() as pool:
         found = list(pool.map(figures_of, *zip(*tasks, strict=True)))
     for (path, cameras, algorithm, _), figures in zip(tasks, found, strict=True):
-        held_out = is_held_out("/".join(path.parts[-2:]))
-        word = "mono" if cameras == 1 else "stereo"
-        outcome.add(f"{path.name}.{word}.{algorithm}", figures, held_out=held_out)
+        held_out = flight_is_held_out(path)
+        outcome.add(f"{path.name}.{KIND[cameras]}.{algorithm}", figures, held_out=held_out)
     return outcome
 
 
@@ -123,16 +121,7 @@ def _run(
     known: bool,
     seed: int,
 ) -> Flown:
-    sequence = simulate(
-        trajectory=str(path),
-        real_imu=True,
-        cameras=cameras,
-        rate_hz=20.0,
-        duration_s=duration_s,
-        tracks={"features": 150, "pixel_sigma": 1.0},
-        shutter_readout_s=readout_s,
-        seed=seed,
-    )
+    sequence = flown_by_camera(path, cameras, seed, duration_s=duration_s, readout_s=readout_s)
     sequence.rig = sequence.rig if known else ignored(sequence.rig)
     run = Run(sequence, algorithm, final_ba=algorithm == WITH_FINAL_BA)
     smoothed = Errors.unknown()

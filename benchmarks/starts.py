@@ -20,25 +20,17 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera
 from benchmarks.metric import EXACT, Metric, info
-from benchmarks.recordings import is_held_out
+from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.arrays import skew
 from slam_graph.backend import Estimator, triangulate_frames
 from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, ImuData, Packet
-from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
-FLIGHTS = (
-    "euroc_inertial/V1_02_medium",
-    "euroc_inertial/V2_01_easy",
-    "euroc_inertial/V2_02_medium",
-    "euroc_inertial/MH_04_difficult",
-    "tumvi_inertial/room1",
-    "tumvi_inertial/room3",
-)
 SPACING_S, PATIENCE_S, JUDGED_AFTER_S = 2.0, 8.0, 1.0
 """Time between starts; how long one may take; and when after it the state is judged."""
 
@@ -117,12 +109,12 @@ def measure(data: Path, spacing_s: float = SPACING_S) -> Outcome:
         found = list(pool.map(starts_of, *zip(*tasks, strict=True)))
     together: dict[tuple[int, bool], list[Start]] = {}
     for (path, cameras, sigma, _), starts in zip(tasks, found, strict=True):
-        held_out = is_held_out("/".join(path.parts[-2:]))
-        name = f"{path.name}.{_kind(cameras)}_{sigma:g}px"
+        held_out = flight_is_held_out(path)
+        name = f"{path.name}.{KIND[cameras]}_{sigma:g}px"
         outcome.add(name, figures_of(starts, cameras), judged=False, held_out=held_out)
         together.setdefault((cameras, held_out), []).extend(starts)
     for (cameras, held_out), starts in sorted(together.items()):
-        name = f"{'held_out' if held_out else 'chosen_on'}.{_kind(cameras)}"
+        name = f"{'held_out' if held_out else 'chosen_on'}.{KIND[cameras]}"
         outcome.add(name, figures_of(starts, cameras), held_out=held_out)
         reasons = Counter(start.reason for start in starts if not start.started)
         for reason, count in reasons.most_common(5):
@@ -132,14 +124,7 @@ def measure(data: Path, spacing_s: float = SPACING_S) -> Outcome:
 
 def starts_of(path: Path, cameras: int, pixel_sigma: float, spacing_s: float) -> list[Start]:
     """Every start of one flight; frames are simulated once."""
-    sequence = simulate(
-        trajectory=str(path),
-        real_imu=True,
-        cameras=cameras,
-        rate_hz=20.0,
-        tracks={"features": 150, "pixel_sigma": pixel_sigma},
-        seed=100,
-    )
+    sequence = flown_by_camera(path, cameras, FIRST_HELD_OUT_SEED, pixel_sigma)
     config = load_config(
         algorithm="msckf",
         overrides=[f"backend.noise.pixel_sigma={pixel_sigma:g}"],
@@ -297,10 +282,6 @@ def _scale_error(
     distances = np.linalg.norm(points[true.good] - here, axis=1)
     true_distances = np.linalg.norm(true.points[true.good] - positions[-1], axis=1)
     return float(abs(np.median(distances / true_distances) - 1.0))
-
-
-def _kind(cameras: int) -> str:
-    return "mono" if cameras == 1 else "stereo"
 
 
 BENCHMARKS = {

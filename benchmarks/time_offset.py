@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera
 from benchmarks.metric import EXACT, Metric, info
-from benchmarks.recordings import is_held_out
+from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.backend import Estimator
 from slam_graph.config import load_config
@@ -25,16 +26,7 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.evaluation import ape
 from slam_graph.geometry import NavState, StateHistory
 from slam_graph.sensors import FeatureFrame, ImuData, Packet
-from slam_graph.simulation import simulate
 
-FLIGHTS = (
-    "euroc_inertial/V1_02_medium",
-    "euroc_inertial/V2_01_easy",
-    "euroc_inertial/V2_02_medium",
-    "euroc_inertial/MH_04_difficult",
-    "tumvi_inertial/room1",
-    "tumvi_inertial/room3",
-)
 OFFSETS_S = (0.0, 0.01, -0.01, 0.03, -0.03, 0.055, -0.055, 0.1, -0.1)
 SECONDS = 25.0
 """Length of each run, from the beginning of the flight."""
@@ -72,8 +64,8 @@ def measure(data: Path) -> Outcome:
     with ProcessPoolExecutor() as pool:
         found = list(pool.map(runs_of, *zip(*tasks, strict=True)))
     for (path, cameras), runs in zip(tasks, found, strict=True):
-        held_out = is_held_out("/".join(path.parts[-2:]))
-        name = f"{path.name}.{'mono' if cameras == 1 else 'stereo'}"
+        held_out = flight_is_held_out(path)
+        name = f"{path.name}.{KIND[cameras]}"
         outcome.add(name, figures_of(runs), held_out=held_out)
     return outcome
 
@@ -94,16 +86,11 @@ def figures_of(runs: list[_Run]) -> Iterator[Metric]:
     yield info("end_error_ms", 1e3 * max(abs(run.estimate_s - run.offset_s) for run in late), "ms")
 
 
-def runs_of(path: Path, cameras: int, seed: int = 100, seconds: float = SECONDS) -> list[_Run]:
+def runs_of(
+    path: Path, cameras: int, seed: int = FIRST_HELD_OUT_SEED, seconds: float = SECONDS
+) -> list[_Run]:
     """A flight under every offset; its frames are simulated once."""
-    sequence = simulate(
-        trajectory=str(path),
-        real_imu=True,
-        cameras=cameras,
-        rate_hz=20.0,
-        tracks={"features": 150, "pixel_sigma": 1.0},
-        seed=seed,
-    )
+    sequence = flown_by_camera(path, cameras, seed)
     config = load_config(algorithm="msckf")
     first_ns, packets = sequence.info().start_ns, []
     for packet in sequence.packets():

@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded flights with their real IMU, and a simulated camera along them: 20 Hz, 150 features."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.recordings import is_held_out
+from slam_graph.simulation import simulate
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+
+FLIGHTS = (
+    "euroc_inertial/V1_02_medium",
+    "euroc_inertial/V2_01_easy",
+    "euroc_inertial/V2_02_medium",
+    "euroc_inertial/MH_04_difficult",
+    "tumvi_inertial/room1",
+    "tumvi_inertial/room3",
+)
+KIND = {1: "mono", 2: "stereo"}
+"""What figures call a number of cameras."""
+
+
+def flown_by_camera(
+    path: Path,
+    cameras: int,
+    seed: int,
+    pixel_sigma: float = 1.0,
+    duration_s: float | None = None,
+    readout_s: float = 0.0,
+) -> SimulatedSequence:
+    """Tracks of a simulated camera along a recorded flight, with the IMU of the recording.
+
+    Args:
+        path: folder of the flight.
+        cameras: one or two.
+        seed: of the noise of the tracks.
+        pixel_sigma: their noise in px.
+        duration_s: how much of the flight to take; all of it if not said.
+        readout_s: readout time of a rolling shutter.
+    """
+    return simulate(
+        trajectory=str(path),
+        real_imu=True,
+        cameras=cameras,
+        rate_hz=20.0,
+        duration_s=duration_s,
+        tracks={"features": 150, "pixel_sigma": pixel_sigma},
+        shutter_readout_s=readout_s,
+        seed=seed,
+    )
+
+
+def flight_is_held_out(path: Path) -> bool:
+    """Whether the flight in a folder is kept out of choices."""
+    return is_held_out("/".join(path.parts[-2:]))
