@@ -5,6 +5,10 @@
 All states of the window and all features they see are estimated together by Levenberg-Marquardt,
 once more after outliers are removed; all but the last state is then marginalised. The result is
 refused if it does not fit, or does not determine velocity and scale well enough.
+
+Features are triangulated again after every step (variable projection, Golub & Pereyra 1973): over
+so short a window their depths are far from linear, and steps that move states and points together
+hardly get on along the direction of scale and tilt, which the data determine least.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import PriorConfig
-from slam_graph.backend.cost.cost import Cost, TrackFeatures
+from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
 from slam_graph.backend.cost.imu_factor import imu_factor
@@ -33,7 +37,7 @@ from slam_graph.backend.initialization.dynamic_start import (
 from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance
 from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
 from slam_graph.backend.policies import GaussNewtonPolicy
-from slam_graph.backend.solve.gauss_newton import minimize
+from slam_graph.backend.solve.gauss_newton import linearized, minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
@@ -41,8 +45,6 @@ from slam_graph.geometry import NavState
 
 _BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the batch problem is solved."""
-_FINAL = GaussNewtonPolicy(max_steps=1)
-"""The last step, whose linear system becomes the prior."""
 MAX_FEATURES = 150
 """How many features the batch problem has at most, those with the longest tracks."""
 MOTION_PRIOR = PriorConfig(attitude_rad=0.3, velocity=10.0, gyro_bias=0.05)
@@ -55,11 +57,37 @@ MAX_VELOCITY_SIGMA = 0.1
 """Largest accepted standard deviation of the velocity, m/s."""
 MAX_SCALE_SIGMA = 0.04
 """Largest accepted standard deviation of the scale, relative to it."""
-_MAX_COST_CHANGE = 0.1
-"""Largest accepted relative change of the cost by the last step: beyond it, the steps have not
-converged."""
+_MAX_STEP_LEFT = 0.3
+"""Longest accepted step that is left at the end, in σ: with more the steps have not converged."""
 _BEST_FEATURES = 0.1
 """Quantile of the features' relative distance errors that is taken for the error of the scale."""
+
+
+class _BatchCost(Cost):
+    """The cost of a window whose features outside the state follow the poses."""
+
+    def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
+        """Move the states by an increment (n,), and triangulate the features from there."""
+        super().apply(delta, linear, layout)
+        assert self.tracks is not None
+        tracks = self.tracks
+        found = self.triangulated(tracks.obs)
+        better = found.good & (self._errors(found.points) < self._errors(tracks.points))
+        points = np.where(better[:, None], found.points, tracks.points)
+        self.tracks = replace(tracks, points=points)
+
+    def _errors(self, points: FloatArray) -> FloatArray:
+        """Summed squared residuals (J,) of the features at some positions (J, 3), in σ²."""
+        assert self.tracks is not None
+        obs = self.tracks.obs
+        squares = self.squared_errors(obs, points)
+        return np.asarray(np.bincount(obs.feature, squares, len(obs.ids)))
+
+    def triangulated(self, obs: Observations) -> Triangulation:
+        """Features from the current estimates of the poses."""
+        rig = self.rig.at(self.state)
+        poses = rig.poses(self.state.estimate, obs.frames)
+        return triangulate(rig.renormalized(obs), rig, *poses, self.config.triangulation)
 
 
 class DynamicRefinement:
@@ -94,21 +122,17 @@ class DynamicRefinement:
             minimize(cost, _BATCH)
             self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
-            final = minimize(cost, _FINAL)
-            before, after = final.costs
-            normalized_cost = _normalized_cost(cost)
-            scale_sigma = _scale_sigma(cost, final.posterior)
+            posterior, linear = linearized(cost), cost.linearize()
+            scale_sigma = _scale_sigma(cost, linear, posterior)
         except np.linalg.LinAlgError:
             return "motion that determines gravity and scale"
-        if not abs(after - before) < _MAX_COST_CHANGE * max(before, 1.0):
-            return "steps that converge"
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
         keep = [L(j) for j in features.tolist()]
         keep += [*calibration, *imu_state_keys(last)]
         points: LinearizationPoints = "current"
         if self._context.algorithm.marginalization.first_estimates:
             points = "first"
-        prior = marginalize(final.posterior, cost.state, keep, points)
+        prior = marginalize(posterior, cost.state, keep, points)
         start = Window(
             last,
             frames.stamps_ns[-1],
@@ -117,10 +141,10 @@ class DynamicRefinement:
             state_features=features,
             calibration=calibration,
         )
-        covariance = prior.covariance_of(imu_state_keys(last))
-        return _doubt(normalized_cost, scale_sigma, covariance) or start
+        found = prior.marginal(imu_state_keys(last))
+        return _doubt(_normalized_cost(linear), scale_sigma, found) or start
 
-    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> Cost:
+    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> _BatchCost:
         """All states of the window, a prior on the first, and the static features they see."""
         context = self._context
         state = State()
@@ -139,9 +163,9 @@ class DynamicRefinement:
         for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
             context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
         loss = RobustLoss(context.config.gating.robust_loss)
-        cost = Cost(state, context.projection, context.config, known, factors, loss=loss)
+        cost = _BatchCost(state, context.projection, context.config, known, factors, loss=loss)
         obs = _lasting(frames)
-        result = self._triangulated(cost, obs)
+        result = cost.triangulated(obs)
         _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
         return cost
 
@@ -150,20 +174,14 @@ class DynamicRefinement:
         for k, stamp_ns in enumerate(frames.stamps_ns):
             self._context.calibration.refine_motion(cost.state, k, stamp_ns, self._context.imu)
 
-    def _triangulated(self, cost: Cost, obs: Observations) -> Triangulation:
-        """Features from the current estimates of the poses."""
-        rig = cost.rig.at(cost.state)
-        poses = rig.poses(cost.state.estimate, obs.frames)
-        return triangulate(rig.renormalized(obs), rig, *poses, self._context.config.triangulation)
-
-    def _remove_outliers(self, cost: Cost, frames: StartFrames) -> bool:
+    def _remove_outliers(self, cost: _BatchCost, frames: StartFrames) -> bool:
         """Triangulate all features again and keep those that fit; whether these are enough.
 
         Features that the guess took for dynamic count too: a motion that only few features support
         is wrong.
         """
         obs = _lasting(frames)
-        result = self._triangulated(cost, obs)
+        result = cost.triangulated(obs)
         fits = result.reprojection_px < OUTLIER_SIGMAS * self._context.config.noise.pixel_sigma
         good = result.good & fits
         self.outliers = obs.ids[~fits]
@@ -196,15 +214,17 @@ def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: Bo
     cost.tracks = TrackFeatures(obs, result.points, nothing).subset(chosen)
 
 
-def _doubt(normalized_cost: float, scale_sigma: float, covariance: FloatArray) -> str | None:
+def _doubt(normalized_cost: float, scale_sigma: float, last: SquareRootInformation) -> str | None:
     """What is missing if the solution cannot be trusted; None if it can.
 
     Args:
         normalized_cost: mean squared residual, σ².
         scale_sigma: relative standard deviation of the scale.
-        covariance: (15, 15) of the last state.
+        last: what is known of the last state, over an increment of its estimate.
     """
-    velocity_sigma = float(np.sqrt(np.max(np.diag(covariance)[6:9])))
+    velocity_sigma = float(np.sqrt(np.max(np.diag(last.covariance())[6:9])))
+    if not np.linalg.norm(last.d) < _MAX_STEP_LEFT:
+        return "steps that converge"
     if normalized_cost > MAX_NORMALIZED_COST:
         return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
     if velocity_sigma > MAX_VELOCITY_SIGMA:
@@ -237,21 +257,21 @@ def _lasting(frames: StartFrames) -> Observations:
     return tracks.observations(ids[lengths >= 3])
 
 
-def _normalized_cost(cost: Cost) -> float:
+def _normalized_cost(linear: Linearization) -> float:
     """Mean squared residual of the features after their positions are eliminated, σ²."""
-    tracks = cost.linearize().tracks
+    tracks = linear.tracks
     if not isinstance(tracks, ReducedFeatures):
         return float("inf")
     return float(np.sum(tracks.r_2**2)) / max(int(np.sum(tracks.dof)), 1)
 
 
-def _scale_sigma(cost: Cost, posterior: SquareRootInformation) -> float:
+def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInformation) -> float:
     """Relative standard deviation of the scale: that of the best determined distances.
 
     A distance to a feature is scale times shape, so no distance has a smaller relative error than
     the scale. Absolute errors are no measure: if the scale is estimated too small, so are they.
     """
-    tracks, features = cost.linearize().tracks, cost.tracks
+    tracks, features = linear.tracks, cost.tracks
     if not isinstance(tracks, ReducedFeatures) or features is None or not len(features.points):
         return float("inf")
     keys = cost.rig.keys_of(features.obs)
