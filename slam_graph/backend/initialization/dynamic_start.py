@@ -2,14 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start in motion: a first guess of a short window, from static features and the IMU.
 
-Static features of a start in motion: RANSAC over whole tracks with one inertial motion as model.
-The equations of the alignment, with the position of each feature eliminated, hold for static
-features only: no velocity and gravity explain the tracks of an object that accelerates or turns
-together with the measured specific force. So RANSAC (Fischler & Bolles 1981, with the score of Torr
-& Zisserman 2000) with the closed-form alignment as model finds the static features even where most
-features are dynamic. An object in uniform motion is an inertial frame like any other: against it
-the larger group wins.
-
 Gyroscope bias from epipolar geometry, static features by consensus, then velocity, gravity and
 scale in closed form. The engine refines the guess (see dynamic_refinement.py).
 """
@@ -20,133 +12,21 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.backend.cost.feature_factors import eliminate_points
-from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
+from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.first_state import level_rotation
+from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.visual_inertial_alignment import (
-    MIN_DEPTH_M,
     Alignment,
     Motion,
     align,
-    alignment_equations,
-    constrained_solution,
     estimate_gyro_bias,
 )
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
-
-_SAMPLES = 100
-"""If half of the features are static, one sample of four has only such with a probability of
-0.998."""
-_SAMPLE_FEATURES = 4
-"""Features in a sample."""
-_REFINED = 5
-"""How many of the best samples are refined by their inliers."""
-_REFINEMENTS = 3
-"""How often a sample is refined by its inliers."""
-
-
-class _Model:
-    """The equations of J features with their positions eliminated, for the motion alone."""
-
-    def __init__(
-        self, obs: Observations, motion: Motion, rig: RigProjection, gravity: float
-    ) -> None:
-        by_point, by_motion, b = alignment_equations(obs, motion, rig, np.ones(len(obs)))
-        others = np.concatenate([by_motion, b[:, :, None]], axis=2)
-        self._R, rest = eliminate_points(obs, by_point, others)
-        self._R = self._R + 1e-9 * np.eye(3)
-        self._top, self._rows = rest[:, :3], rest[:, 3:]
-        self._squares = self._rows.transpose(0, 2, 1) @ self._rows
-        self._gravity = gravity
-        self._dof = np.maximum(2 * obs.counts - 3, 1)
-        self._counts = obs.counts
-        t = motion.times_s[obs.frame]
-        self._t, self._tt = self._mean(obs, t), self._mean(obs, t**2)
-        self._shift = np.column_stack(
-            [self._mean(obs, column) for column in motion.displacements[obs.frame].T]
-        )
-
-    def _mean(self, obs: Observations, values: FloatArray) -> FloatArray:
-        """Mean (J,) over the observations of each feature."""
-        return np.asarray(np.bincount(obs.feature, values, len(obs.ids)) / self._counts)
-
-    def solve(self, features: NDArray[np.int64], weights: FloatArray | None) -> FloatArray | None:
-        """Velocity and gravity (6,) from some features, None if they do not determine them."""
-        rows = self._rows[features]
-        if weights is not None:
-            rows = rows * weights[features, None, None]
-        A = rows.reshape(-1, 7)
-        try:
-            found: Alignment = constrained_solution(A[:, :6], A[:, 6], self._gravity)
-        except (np.linalg.LinAlgError, ValueError):
-            return None
-        x = np.concatenate([found.velocity, found.gravity])
-        return x if np.isfinite(x).all() else None
-
-    def distances(self, x: FloatArray) -> FloatArray:
-        """Mean distances (J,) of the features from the body under a motion x (6,), m."""
-        right = self._top[:, :, 6] - self._top[:, :, :6] @ x
-        points = np.linalg.solve(self._R, right[:, :, None])[:, :, 0]
-        eyes = self._t[:, None] * x[:3] + 0.5 * self._tt[:, None] * x[3:] + self._shift
-        return np.asarray(np.maximum(np.linalg.norm(points - eyes, axis=1), MIN_DEPTH_M))
-
-    def errors(self, x: FloatArray) -> FloatArray:
-        """Mean squared residual (J,) of the features on the plane z = 1 under a motion x (6,)."""
-        y = np.append(x, -1.0)
-        squares = np.einsum("i,jik,k->j", y, self._squares, y)
-        return np.asarray(np.maximum(squares, 0.0) / self._dof / self.distances(x) ** 2)
-
-
-def static_features(
-    obs: Observations,
-    motion: Motion,
-    rig: RigProjection,
-    gravity: float,
-    tolerance: float,
-    rng: np.random.Generator,
-) -> BoolArray:
-    """Which features (J,) are static: those that agree on one motion of the body.
-
-    Args:
-        obs: features seen from at least three of the frames.
-        motion: inertial motion between the frames.
-        rig: mounting of the cameras.
-        gravity: its magnitude, m/s².
-        tolerance: largest root mean square residual on the plane z = 1.
-        rng: draws the samples.
-    """
-    model, count, limit = _Model(obs, motion, rig, gravity), len(obs.ids), tolerance**2
-
-    def score(x: FloatArray) -> float:
-        return float(np.sum(np.minimum(model.errors(x), limit)))
-
-    motions = [model.solve(np.arange(count), None)]
-    for _ in range(_SAMPLES):
-        sample = rng.choice(count, min(_SAMPLE_FEATURES, count), replace=False)
-        motions.append(model.solve(sample, None))
-    best = sorted((x for x in motions if x is not None), key=score)[:_REFINED]
-    if not best:
-        return np.ones(count, np.bool_)
-    x = min((_refined(model, x, limit) for x in best), key=score)
-    return np.asarray(model.errors(x) < limit)
-
-
-def _refined(model: _Model, x: FloatArray, limit: float) -> FloatArray:
-    """A motion that is computed from its inliers again and again."""
-    for _ in range(_REFINEMENTS):
-        agree = np.flatnonzero(model.errors(x) < limit)
-        better = model.solve(agree, 1.0 / model.distances(x)) if len(agree) else None
-        if better is None:
-            break
-        x = better
-    return x
-
 
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error are outliers, in units of σ."""
@@ -234,19 +114,21 @@ def guess_states(
     obs = tracks.observations(ids)
     tolerance = OUTLIER_SIGMAS * config.pixel_sigma / rig.cameras[0].fx
 
-    def consensus(seen: StartFrames) -> tuple[FloatArray, Motion, BoolArray] | None:
+    def consensus(
+        seen: StartFrames, near: FloatArray
+    ) -> tuple[FloatArray, Motion, BoolArray] | None:
         """Gyroscope bias by some features, the motion that it gives, and the static features."""
-        gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params)
+        gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params, near)
         if gyro_bias is None:
             return None
         motion = _integrate(frames, samples, gyro_bias, params)
         static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
         return gyro_bias, motion, static
 
-    found = consensus(frames)
+    found = consensus(frames, np.zeros(3))
     if found is not None and not found[2].all():
         # dynamic features have biased the gyroscope bias, and with it the consensus
-        found = consensus(frames.only(ids[found[2]]))
+        found = consensus(frames.only(ids[found[2]]), found[0])
     if found is None:
         return "features in common between frames"
     gyro_bias, motion, static = found

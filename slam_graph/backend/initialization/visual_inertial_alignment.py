@@ -24,7 +24,7 @@ are solved for under the constraint that gravity has its known length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -45,6 +45,10 @@ _STEP_RAD_S = 1e-4
 """Step of the numerical derivative by the bias."""
 _ROBUST_WIDTH = 0.02
 """Width of the robust loss on the whitened residual of a pair."""
+_ROUNDS, _LINEAR_RAD_S = 2, 1e-3
+"""How often the bias is estimated at most; a change below this needs no other linearisation."""
+_CONVERGED = 1e-4
+"""Relative change of the bias at which the steps end; noise is a hundred times that."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +58,7 @@ class _Pairs:
     Attributes:
         pair: (N,) which pair each feature belongs to, ascending.
         starts: (P,) first feature of each pair.
+        interval: (P,) which two frames each pair is of.
         first, second: (N, 3) bearings in the orientation of the body.
         R: (P, 3, 3) rotation from the second body to the first.
         by_bias: (P, 3, 3) its derivative by the bias.
@@ -62,6 +67,7 @@ class _Pairs:
 
     pair: NDArray[np.intp]
     starts: NDArray[np.intp]
+    interval: NDArray[np.intp]
     first: FloatArray
     second: FloatArray
     R: FloatArray
@@ -74,6 +80,7 @@ def estimate_gyro_bias(
     imu: list[ImuData],
     rig: RigProjection,
     params: gtsam.PreintegrationCombinedParams,
+    near: FloatArray | None = None,
 ) -> FloatArray | None:
     """The constant gyroscope bias (3,) rad/s over some frames, None without enough features.
 
@@ -82,26 +89,78 @@ def estimate_gyro_bias(
         imu: samples between each frame and the next.
         rig: mounting of the cameras.
         params: of the preintegration.
+        near: (3,) a bias to begin with; zero if not given.
     """
-    bias = np.zeros(3)
-    for _ in range(2):  # the rotation is linearised in the bias: once more at the solution
-        pairs = _pairs(frames, imu, rig, params, bias)
-        if pairs is None:
-            return None
+    bias = np.zeros(3) if near is None else near
+    pairs = _pairs(frames, imu, rig, params, bias)
+    if pairs is None:
+        return None
+    for _ in range(_ROUNDS):  # the rotation is linearised in the bias: once more at the solution
         result = least_squares(
-            _residuals, np.zeros(3), args=(pairs,), loss="huber", f_scale=_ROBUST_WIDTH
+            _residuals,
+            np.zeros(3),
+            _jacobian,
+            args=(pairs,),
+            loss="huber",
+            f_scale=_ROBUST_WIDTH,
+            xtol=_CONVERGED,
+            ftol=_CONVERGED**2,
         )
         bias = bias + result.x
+        if np.linalg.norm(result.x) < _LINEAR_RAD_S:
+            break
+        rotations = np.array([_rotation(samples, bias, params) for samples in imu])
+        pairs = replace(pairs, R=rotations[pairs.interval])
     return bias
 
 
 def _residuals(change: FloatArray, pairs: _Pairs) -> FloatArray:
     """Distance (P,) of each pair's normals from the plane that fits them best."""
-    R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
-    normals = np.cross(pairs.first, np.einsum("nij,nj->ni", R[pairs.pair], pairs.second))
-    scatter = np.add.reduceat(normals[:, :, None] * normals[:, None, :], pairs.starts)
-    white = pairs.whitening @ scatter @ pairs.whitening.transpose(0, 2, 1)
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(white)[:, 0], 0.0)))
+    return _Planes(change, pairs).distances
+
+
+def _jacobian(change: FloatArray, pairs: _Pairs) -> FloatArray:
+    """Derivative (P, 3) of the distances; exact at zero, where their rotations are linearised.
+
+    The plane is the best one, so that its own change does not count. For a normal a of it in the
+    original space, the change of a · (f₁ × R f₂) by a turn θ of the second body is
+    θ · (R f₂ × (a × f₁)).
+    """
+    planes = _Planes(change, pairs)
+    a, first, turned = planes.normals[pairs.pair], pairs.first, planes.turned
+    along = np.sum(first * turned, axis=1)[:, None] * a
+    along -= np.sum(turned * a, axis=1)[:, None] * first
+    offsets = np.sum(a * planes.crossed, axis=1)[:, None]
+    by_turn = np.add.reduceat(offsets * along, pairs.starts)
+    by_change = planes.R @ pairs.by_bias
+    slopes = np.einsum("pi,pij->pj", by_turn, by_change)
+    return np.asarray(slopes / np.maximum(planes.distances, 1e-12)[:, None])
+
+
+class _Planes:
+    """The plane of best fit to the normals of each pair.
+
+    Attributes:
+        R: (P, 3, 3) rotations from the second body to the first.
+        turned: (N, 3) second bearings in the orientation of the first body.
+        crossed: (N, 3) normals of the epipolar planes.
+        distances: (P,) root of the sum of their squared distances from the plane.
+        normals: (P, 3) what a normal is multiplied by for its distance.
+    """
+
+    def __init__(self, change: FloatArray, pairs: _Pairs) -> None:
+        self.R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
+        f = pairs.first
+        self.turned = g = np.einsum("nij,nj->ni", self.R[pairs.pair], pairs.second)
+        self.crossed = np.empty_like(f)
+        for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+            self.crossed[:, axis] = f[:, i] * g[:, j] - f[:, j] * g[:, i]
+        outer = self.crossed[:, :, None] * self.crossed[:, None, :]
+        scatter = np.add.reduceat(outer, pairs.starts)
+        white = pairs.whitening @ scatter @ pairs.whitening.transpose(0, 2, 1)
+        values, vectors = np.linalg.eigh(white)
+        self.distances = np.sqrt(np.maximum(values[:, 0], 0.0))
+        self.normals = np.einsum("pij,pi->pj", pairs.whitening, vectors[:, :, 0])
 
 
 def _pairs(
@@ -111,7 +170,7 @@ def _pairs(
     params: gtsam.PreintegrationCombinedParams,
     bias: FloatArray,
 ) -> _Pairs | None:
-    first, second, rotations, derivatives = [], [], [], []
+    first, second, rotations, derivatives, intervals = [], [], [], [], []
     turns = [rig.row_turns(k, frame) for k, frame in enumerate(frames)]
     for k, samples in enumerate(imu):
         before, after = frames[k], frames[k + 1]
@@ -124,12 +183,14 @@ def _pairs(
                 second.append(_bearings(two, j, mounting, turns[k + 1][camera]))
                 rotations.append(R)
                 derivatives.append(by_bias)
+                intervals.append(k)
     if not first:
         return None
     counts = np.array([len(bearings) for bearings in first])
     return _Pairs(
         np.repeat(np.arange(len(counts)), counts),
         np.cumsum(counts) - counts,
+        np.array(intervals),
         np.concatenate(first),
         np.concatenate(second),
         np.array(rotations),

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Static features of a start in motion: RANSAC over whole tracks with one inertial motion as model.
+
+The equations of the alignment, with the position of each feature eliminated, hold for static
+features only: no velocity and gravity explain the tracks of an object that accelerates or turns
+together with the measured specific force. So RANSAC (Fischler & Bolles 1981, with the score of Torr
+& Zisserman 2000) with the closed-form alignment as model finds the static features even where most
+features are dynamic. An object in uniform motion is an inertial frame like any other: against it
+the larger group wins.
+
+All samples are solved together, by the normal equations of each feature, which are computed once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.cost.feature_factors import eliminate_points
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.initialization.visual_inertial_alignment import (
+    MIN_DEPTH_M,
+    Motion,
+    alignment_equations,
+)
+
+_SAMPLES = 100
+"""If half of the features are static, one sample of four has only such with a probability of
+0.998."""
+_SAMPLE_FEATURES = 4
+"""Features in a sample."""
+_REFINED = 5
+"""How many of the best samples are refined by their inliers."""
+_REFINEMENTS = 3
+"""How often a sample is refined by its inliers."""
+_NEWTON_STEPS = 12
+"""Steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
+_RIDGE = 1e-13
+"""Keeps the equations of a sample solvable that does not determine the velocity."""
+
+
+class _Model:
+    """The equations of J features with their positions eliminated, for the motion alone.
+
+    Motions (S, 6) are velocity and gravity in the frame of the first body.
+    """
+
+    def __init__(
+        self, obs: Observations, motion: Motion, rig: RigProjection, gravity: float
+    ) -> None:
+        by_point, by_motion, b = alignment_equations(obs, motion, rig, np.ones(len(obs)))
+        others = np.concatenate([by_motion, b[:, :, None]], axis=2)
+        R, rest = eliminate_points(obs, by_point, others)
+        rows, count = rest[:, 3:], len(obs.ids)
+        self._squares = (rows.transpose(0, 2, 1) @ rows).reshape(count, 49)
+        self._gravity = gravity
+        self._dof = np.maximum(2 * obs.counts - 3, 1)
+        t = motion.times_s[obs.frame]
+
+        def mean(values: FloatArray) -> FloatArray:
+            """Mean (J,) over the observations of each feature."""
+            return np.asarray(np.bincount(obs.feature, values, count) / obs.counts)
+
+        # from the mean position of the body to the feature, by (velocity, gravity, -1)
+        away = -np.linalg.solve(R + 1e-9 * np.eye(3), rest[:, :3])
+        away[:, :, :3] -= mean(t)[:, None, None] * np.eye(3)
+        away[:, :, 3:6] -= 0.5 * mean(t**2)[:, None, None] * np.eye(3)
+        for axis, column in enumerate(motion.displacements[obs.frame].T):
+            away[:, axis, 6] += mean(column)
+        self._away = away
+
+    def solve(self, weights: FloatArray) -> FloatArray:
+        """Motions (S, 6) from features weighted by (S, J); not finite where undetermined."""
+        M = (weights**2 @ self._squares).reshape(-1, 7, 7)
+        return constrained_solutions(M, self._gravity)
+
+    def distances(self, x: FloatArray) -> FloatArray:
+        """Mean distances (S, J) of the features from the body under motions x (S, 6), m."""
+        away = np.einsum("jki,si->sjk", self._away, _extended(x))
+        return np.asarray(np.maximum(np.linalg.norm(away, axis=2), MIN_DEPTH_M))
+
+    def errors(self, x: FloatArray) -> FloatArray:
+        """Mean squared residual (S, J) of the features on the plane z = 1 under motions (S, 6)."""
+        y = _extended(x)
+        squares = (y[:, :, None] * y[:, None, :]).reshape(-1, 49) @ self._squares.T
+        return np.asarray(np.maximum(squares, 0.0) / self._dof / self.distances(x) ** 2)
+
+
+def _extended(x: FloatArray) -> FloatArray:
+    """Motions (S, 7) with the factor of the right-hand side."""
+    return np.column_stack([x, -np.ones(len(x))])
+
+
+def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
+    """Velocity and gravity (S, 6) of least squares under |g| = gravity, for many problems at once.
+
+    The velocity is eliminated; for gravity it is a secular equation in the Lagrange multiplier. Its
+    solution is found by Newton's method on the inverse length of g, which is nearly linear in the
+    multiplier, from the left without safeguards (Moré & Sorensen 1983).
+
+    Args:
+        M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.
+        gravity: its magnitude, m/s².
+    """
+    of_v = M[:, :3, :3] + _RIDGE * np.trace(M[:, :6, :6], axis1=1, axis2=2)[:, None, None] * np.eye(
+        3
+    )
+    with np.errstate(all="ignore"):
+        by_g = np.linalg.solve(of_v + 1e-300 * np.eye(3), M[:, :3, 3:])
+        rest = M[:, 3:, 3:] - M[:, 3:, :3] @ by_g
+        values, vectors = np.linalg.eigh(np.nan_to_num(rest[:, :3, :3]))
+        projected = np.einsum("sji,sj->si", vectors, rest[:, :3, 3])
+        multiplier = -values[:, :1] + 1e-12 * np.maximum(values[:, 2:], 1e-12)
+        for _ in range(_NEWTON_STEPS):
+            g = projected / (values + multiplier)
+            square = np.sum(g**2, axis=1, keepdims=True)
+            slope = np.sum(g**2 / (values + multiplier), axis=1, keepdims=True)
+            step = (np.sqrt(square) / gravity - 1.0) * square / slope
+            multiplier = multiplier + np.where(step > 0.0, step, 0.0)
+        g = projected / (values + multiplier)
+        g *= gravity / np.linalg.norm(g, axis=1, keepdims=True)
+        g = np.einsum("sij,sj->si", vectors, g)
+        v = by_g[:, :, 3] - np.einsum("sij,sj->si", by_g[:, :, :3], g)
+    return np.concatenate([v, g], axis=1)
+
+
+def static_features(
+    obs: Observations,
+    motion: Motion,
+    rig: RigProjection,
+    gravity: float,
+    tolerance: float,
+    rng: np.random.Generator,
+) -> BoolArray:
+    """Which features (J,) are static: those that agree on one motion of the body.
+
+    Args:
+        obs: features seen from at least three of the frames.
+        motion: inertial motion between the frames.
+        rig: mounting of the cameras.
+        gravity: its magnitude, m/s².
+        tolerance: largest root mean square residual on the plane z = 1.
+        rng: draws the samples.
+    """
+    model, count, limit = _Model(obs, motion, rig, gravity), len(obs.ids), tolerance**2
+
+    def scores(x: FloatArray) -> FloatArray:
+        return np.asarray(np.sum(np.minimum(model.errors(x), limit), axis=1))
+
+    chosen = np.zeros((1 + _SAMPLES, count))
+    chosen[0] = 1.0
+    for sample in range(1, len(chosen)):
+        features = rng.choice(count, min(_SAMPLE_FEATURES, count), replace=False)
+        chosen[sample, features] = 1.0
+    motions = model.solve(chosen)
+    motions = motions[np.isfinite(motions).all(axis=1)]
+    if not len(motions):
+        return np.ones(count, np.bool_)
+    best = motions[np.argsort(scores(motions), kind="stable")[:_REFINED]]
+    for _ in range(_REFINEMENTS):
+        agree = model.errors(best) < limit
+        better = model.solve(agree / model.distances(best))
+        known = np.isfinite(better).all(axis=1) & agree.any(axis=1)
+        best = np.where(known[:, None], better, best)
+    x = best[[int(np.argmin(scores(best)))]]
+    return np.asarray(model.errors(x)[0] < limit)
