@@ -18,13 +18,14 @@ from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
     StartGuess,
     guess_states,
-    static_features,
 )
+from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
+from slam_graph.backend.initialization.start_consensus import static_features
+from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     Motion,
     align,
-    estimate_gyro_bias,
 )
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -175,8 +176,8 @@ def test_a_guess_says_what_it_lacks() -> None:
     mounted = RigProjection(rig())
     few, imu = window_of(Flight(), room(6, rng), 1, rng)
     reason = guess_states(few, imu, mounted, PARAMS, NoiseConfig(), rng)
-    assert isinstance(reason, str)
-    assert "features" in reason
+    assert isinstance(reason, Refusal)
+    assert "features" in reason.needs
 
 
 def test_a_window_is_thinned_from_its_end() -> None:

@@ -308,8 +308,10 @@ class Estimator:
 
     @property
     def waiting_for(self) -> str:
-        """What a start still needs."""
-        return self._initializer.waiting_for if self._check.mounted else self._check.waiting_for
+        """What a start still needs, and the likeliest cause of the lack."""
+        if not self._check.mounted:
+            return self._check.waiting_for
+        return self._initializer.waiting_for(self._check.contradiction(self._context.imu))
 
     @property
     def timings(self) -> dict[str, float]:

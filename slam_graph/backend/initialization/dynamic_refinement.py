@@ -29,12 +29,12 @@ from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.dynamic_start import (
-    MIN_FEATURES,
     OUTLIER_SIGMAS,
     StartFrames,
     StartGuess,
 )
 from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance
+from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.gauss_newton import linearized, minimize
@@ -106,7 +106,7 @@ class DynamicRefinement:
         self.outliers = np.zeros(0, np.int64)
         self._context = context
 
-    def refine(self, frames: StartFrames, guess: StartGuess) -> Window | str:
+    def refine(self, frames: StartFrames, guess: StartGuess) -> Window | Refusal:
         """The window that begins with the last frame, or what is missing for it.
 
         Args:
@@ -117,15 +117,16 @@ class DynamicRefinement:
         try:
             minimize(cost, _BATCH)
             self._refine_motions(cost, frames)
-            if not self._remove_outliers(cost, frames):
-                return "features that fit the motion"
+            fit, seen = self._remove_outliers(cost, frames)
+            if fit < max(MIN_FEATURES, _MIN_INLIERS * seen):
+                return Refusal("fit", f"features that fit the motion ({fit} of {seen} do)")
             minimize(cost, _BATCH)
             self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
             posterior, linear = linearized(cost), cost.linearize()
             scale_sigma = _scale_sigma(cost, linear, posterior)
         except np.linalg.LinAlgError:
-            return "motion that determines gravity and scale"
+            return Refusal("motion", "motion that determines gravity and scale")
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
         keep = [L(j) for j in features.tolist()]
         keep += [*calibration, *imu_state_keys(last)]
@@ -174,8 +175,8 @@ class DynamicRefinement:
         for k, stamp_ns in enumerate(frames.stamps_ns):
             self._context.calibration.refine_motion(cost.state, k, stamp_ns, self._context.imu)
 
-    def _remove_outliers(self, cost: _BatchCost, frames: StartFrames) -> bool:
-        """Triangulate all features again and keep those that fit; whether these are enough.
+    def _remove_outliers(self, cost: _BatchCost, frames: StartFrames) -> tuple[int, int]:
+        """Triangulate all features again and keep those that fit; their number, and that of all.
 
         Features that the guess took for dynamic count too: a motion that only few features support
         is wrong.
@@ -186,7 +187,7 @@ class DynamicRefinement:
         good = result.good & fits
         self.outliers = obs.ids[~fits]
         _set_features(cost, obs, result, good)
-        return bool(np.sum(good) >= max(MIN_FEATURES, _MIN_INLIERS * len(good)))
+        return int(np.sum(good)), len(good)
 
     def _keep_features(self, cost: Cost, frames: StartFrames) -> IntArray:
         """Make variables of the features that the last frame still sees."""
@@ -214,7 +215,9 @@ def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: Bo
     cost.tracks = TrackFeatures(obs, result.points, nothing).subset(chosen)
 
 
-def _doubt(normalized_cost: float, scale_sigma: float, last: SquareRootInformation) -> str | None:
+def _doubt(
+    normalized_cost: float, scale_sigma: float, last: SquareRootInformation
+) -> Refusal | None:
     """What is missing if the solution cannot be trusted; None if it can.
 
     Args:
@@ -224,13 +227,15 @@ def _doubt(normalized_cost: float, scale_sigma: float, last: SquareRootInformati
     """
     velocity_sigma = float(np.sqrt(np.max(np.diag(last.covariance())[6:9])))
     if not np.linalg.norm(last.d) < _MAX_STEP_LEFT:
-        return "steps that converge"
+        return Refusal("fit", "steps that converge")
     if normalized_cost > MAX_NORMALIZED_COST:
-        return f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
+        return Refusal("fit", f"images and IMU to agree (normalised cost {normalized_cost:.1f})")
     if velocity_sigma > MAX_VELOCITY_SIGMA:
-        return f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+        return Refusal(
+            "motion", f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+        )
     if scale_sigma > MAX_SCALE_SIGMA:
-        return f"more motion (scale is known to {scale_sigma:.0%} only)"
+        return Refusal("motion", f"more motion (scale is known to {scale_sigma:.0%} only)")
     return None
 
 

@@ -18,21 +18,19 @@ from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.first_state import level_rotation
+from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.start_consensus import static_features
+from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     Alignment,
     Motion,
     align,
-    estimate_gyro_bias,
 )
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
 
 OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error are outliers, in units of σ."""
-
-MIN_FEATURES = 10
-"""Smallest number of features that a start in motion is computed from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +92,7 @@ def guess_states(
     params: gtsam.PreintegrationCombinedParams,
     config: NoiseConfig,
     rng: np.random.Generator,
-) -> StartGuess | str:
+) -> StartGuess | Refusal:
     """States of all frames of a window, or what is missing for them.
 
     Args:
@@ -110,7 +108,7 @@ def guess_states(
     ids, lengths = tracks.lengths()
     ids = ids[lengths >= max(3, len(frames.frames) // 3)]
     if len(ids) < MIN_FEATURES:
-        return f"more features with long tracks ({len(ids)} so far)"
+        return Refusal("tracks", f"more features with long tracks ({len(ids)} so far)")
     obs = tracks.observations(ids)
     tolerance = OUTLIER_SIGMAS * config.pixel_sigma / rig.cameras[0].fx
 
@@ -130,13 +128,14 @@ def guess_states(
         # dynamic features have biased the gyroscope bias, and with it the consensus
         found = consensus(frames.only(ids[found[2]]), found[0])
     if found is None:
-        return "features in common between frames"
+        return Refusal("tracks", "features in common between frames")
     gyro_bias, motion, static = found
     if np.sum(static) < MIN_FEATURES:
-        return "features that agree on a motion"
+        agree = f"{np.sum(static)} of {len(ids)} do"
+        return Refusal("fit", f"features that agree on a motion ({agree})")
     alignment = align(obs.subset(static), motion, rig, config.gravity)
     if alignment is None:
-        return "motion that determines gravity and scale"
+        return Refusal("motion", "motion that determines gravity and scale")
     return StartGuess(_states(frames, motion, alignment, gyro_bias), ids[static])
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray, skew
@@ -40,6 +41,12 @@ _CORRELATION = 2.0
 independent ones by this factor (measured on simulated flights with real and simulated IMUs)."""
 _APART_S = 0.02
 """A second minimum is one that is farther from the first than this."""
+_SHOWN_RAD = 0.03
+"""Changes of the rotation below this in the median show nothing of units and mounting."""
+_SAME_RATE = (0.67, 1.5)
+"""Camera and gyroscope turn equally fast if the ratio of their rates is within these."""
+_FITS, _CONTRADICTS = 0.3, 0.6
+"""Median difference of rotations relative to their size, of what fits and what does not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,3 +242,58 @@ def align_gyroscope(
         rotation_sigma,
         scale,
     )
+
+
+def turns_contradict(
+    turns: Turns, imu: ImuData, body_R_camera: FloatArray, offset_s: float
+) -> str | None:
+    """What is likely to be wrong if camera and gyroscope do not turn alike; None if they do.
+
+    Coarser than the alignment and without its wrap at half a turn: the integral of the angular rate
+    is compared with the rotation vector of the camera, with the means subtracted for the bias.
+
+    Args:
+        turns: rotations of the camera.
+        imu: samples that cover them.
+        body_R_camera: (3, 3) mounting by calibration.
+        offset_s: time offset by calibration.
+    """
+    camera = Rotation.from_matrix(turns.R).as_rotvec()
+    stamps_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    integral = cumulative_trapezoid(imu.gyro, stamps_s, axis=0, initial=0.0)
+    one, two = (
+        (stamps - imu.stamps_ns[0]) * 1e-9 + offset_s
+        for stamps in (turns.first_ns, turns.second_ns)
+    )
+    body = np.stack([np.interp(two, stamps_s, c) - np.interp(one, stamps_s, c) for c in integral.T])
+    seconds = ((two - one) / np.mean(two - one))[:, None]
+    camera = camera - seconds * np.median(camera, axis=0)
+    moved = body.T - seconds * np.median(body, axis=1)
+    size = float(np.median(np.linalg.norm(camera, axis=1)))
+    if size < _SHOWN_RAD:
+        return None
+    ratio = float(np.median(np.linalg.norm(moved, axis=1))) / size
+    best = Rotation.align_vectors(moved, camera)[0]
+    scaled = moved / max(ratio, 1e-6)
+
+    def misfit(R: FloatArray) -> float:
+        return float(np.median(np.linalg.norm(scaled - camera @ R.T, axis=1))) / size
+
+    if misfit(best.as_matrix()) < _FITS:
+        if not _SAME_RATE[0] < ratio < _SAME_RATE[1]:
+            return (
+                f"the gyroscope turns {ratio:.3g} times as fast as the camera; check its unit "
+                "(rad/s) and the focal length"
+            )
+        if misfit(body_R_camera) > _CONTRADICTS:
+            away = np.rad2deg((best * Rotation.from_matrix(body_R_camera).inv()).magnitude())
+            return (
+                f"the camera is turned by some {away:.0f}° against its calibrated mounting; check "
+                "T_cam_imu and the axes of the IMU"
+            )
+    elif misfit(body_R_camera) > _CONTRADICTS:
+        return (
+            "camera and gyroscope do not turn alike under any mounting; clocks that differ by more "
+            "than 0.1 s, most features on moving objects, or wrong matches"
+        )
+    return None

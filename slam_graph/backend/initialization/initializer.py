@@ -15,11 +15,11 @@ from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
 from slam_graph.backend.initialization.dynamic_start import (
-    MIN_FEATURES,
     StartFrames,
     guess_states,
 )
 from slam_graph.backend.initialization.first_state import start_from, state_at_rest
+from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal, likeliest_cause
 from slam_graph.backend.window import Window
 from slam_graph.sensors import FeatureFrame
 
@@ -31,15 +31,14 @@ RETRY_S = 0.2
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
-"""How much longer than the window frames are kept."""
+"""How much longer than the window frames are kept; and as much longer as it takes where there is no
+frame of that time, as with few frames a second, or in a gap."""
+_LONGEST = 2.0
+"""Frames older than so many windows are not kept whatever is missing after them."""
 
 
 class Initializer:
-    """Collects frames and tries to start from them.
-
-    Attributes:
-        waiting_for: why there is no start yet.
-    """
+    """Collects frames and tries to start from them."""
 
     def __init__(self, context: EngineContext, mode: str) -> None:
         """Start with no frames.
@@ -48,7 +47,8 @@ class Initializer:
             context: shared with the engine; `context.imu` has the samples up to each frame.
             mode: which starts are tried, as in `initialization.mode`.
         """
-        self.waiting_for = "the first frames"
+        self._refusal = Refusal("frames", "the first frames")
+        self._latest: tuple[int, FeatureFrame] | None = None
         self._context = context
         self._config = context.config.initialization
         self._mode = mode
@@ -73,39 +73,55 @@ class Initializer:
             stamp_ns: time of the frame on the clock of the IMU.
             frame: its features.
         """
-        outcome: Window | str = "a state to start from (mode 'given')"
+        outcome: Window | Refusal = Refusal("frames", "a state to start from (mode 'given')")
+        self._latest = stamp_ns, frame
         self._standstill.is_still(self._context.imu, stamp_ns, frame)
         if self._mode in ("auto", "static"):
             outcome = self._at_rest(stamp_ns)
-        if self._mode in ("auto", "motion") and isinstance(outcome, str):
+        if self._mode in ("auto", "motion") and isinstance(outcome, Refusal):
             outcome = self._in_motion(stamp_ns, frame)
-        if isinstance(outcome, str):
-            self.waiting_for = outcome
+        if isinstance(outcome, Refusal):
+            self._refusal = outcome
             return None
         return outcome
 
-    def _at_rest(self, stamp_ns: int) -> Window | str:
+    def waiting_for(self, calibration: str | None) -> str:
+        """What a start still needs, and the likeliest cause of the lack.
+
+        Args:
+            calibration: what contradicts the calibration, if something does.
+        """
+        needs = self._refusal.needs
+        if self._latest is None:
+            return needs
+        stamp_ns, frame = self._latest
+        imu, noise = self._context.imu, self._context.config.noise
+        cause = likeliest_cause(
+            self._refusal, self._frames, frame, imu, stamp_ns, noise, calibration
+        )
+        return f"{needs}; likeliest cause: {cause}" if cause else needs
+
+    def _at_rest(self, stamp_ns: int) -> Window | Refusal:
         """A start from standstill, or what it waits for."""
         since_ns, needed_s = self._standstill.since_ns, self._config.static_window_s
         if since_ns is None or stamp_ns - since_ns < round(needed_s * 1e9):
-            return f"a still period of {needed_s:g} s"
+            return Refusal("rest", f"a still period of {needed_s:g} s")
         samples = self._context.imu.between(since_ns, stamp_ns)
         state = state_at_rest(samples, stamp_ns, self._config.prior)
         return start_from(state, self._context.config, self._context.calibration)
 
-    def _in_motion(self, stamp_ns: int, frame: FeatureFrame) -> Window | str:
+    def _in_motion(self, stamp_ns: int, frame: FeatureFrame) -> Window | Refusal:
         """A start in motion, or what it waits for."""
         context, length_s = self._context, self._config.motion_window_s
         length_ns = round(length_s * 1e9)
         if context.imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
             self._stamps_ns.append(stamp_ns)
             self._frames.append(frame)
-        while self._stamps_ns and self._stamps_ns[0] < stamp_ns - length_ns - _SLACK_NS:
-            del self._stamps_ns[0], self._frames[0]
+        self._forget(stamp_ns, length_ns)
         if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
-            return f"{length_s:g} s of frames with IMU samples"
+            return Refusal("frames", f"{length_s:g} s of frames with IMU samples")
         if stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
-            return self.waiting_for
+            return self._refusal
         self._tried_ns = stamp_ns
         frames = StartFrames.thinned(self._stamps_ns, self._frames, FRAME_SPACING_S)
         turning = context.calibration.turning(frames.stamps_ns, frames.frames, context.imu)
@@ -117,4 +133,13 @@ class Initializer:
             context.config.noise,
             self._rng,
         )
-        return guess if isinstance(guess, str) else self._refinement.refine(frames, guess)
+        return guess if isinstance(guess, Refusal) else self._refinement.refine(frames, guess)
+
+    def _forget(self, stamp_ns: int, length_ns: int) -> None:
+        """Forget frames before the window, but the last of them if none is at its beginning."""
+        stamps_ns = self._stamps_ns
+        while stamps_ns and stamps_ns[0] < stamp_ns - length_ns - _SLACK_NS:
+            spanned = len(stamps_ns) > 1 and stamps_ns[1] <= stamp_ns - length_ns
+            if not spanned and stamps_ns[0] >= stamp_ns - _LONGEST * length_ns:
+                break
+            del stamps_ns[0], self._frames[0]

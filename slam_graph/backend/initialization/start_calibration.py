@@ -23,9 +23,10 @@ from slam_graph.backend.initialization.gyro_alignment import (
     GyroAlignment,
     Turns,
     align_gyroscope,
+    turns_contradict,
 )
 from slam_graph.backend.initialization.visual_rotation import MIN_COMMON, visual_rotation
-from slam_graph.sensors import FeatureFrame, ImuBuffer, Rig
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
 
 _BASELINE_NS = 400_000_000
 """Time between the two frames of a rotation; the longer, the larger the change of the rate."""
@@ -129,7 +130,7 @@ class StartCalibration:
             return None
         found = self._estimate(imu)
         self._tried_ns = frame.stamp_ns
-        self.done = self._seen > _GIVE_UP_TURNS and self.mounted
+        self.done = self._seen > _GIVE_UP_TURNS and self.mounted and started
         clear = _CLEAR if started else _CLEAR_WAITING
         if found is None or found.margin < clear or found.misfit > _MAX_MISFIT:
             return None
@@ -182,8 +183,24 @@ class StartCalibration:
         vector = Rotation.from_matrix(R).as_rotvec() * ratio
         return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
+    def contradiction(self, imu: ImuBuffer) -> str | None:
+        """What of mounting or units the rotations of the last seconds contradict, if anything."""
+        covered = None if self.done else self._covered(imu)
+        if covered is None or not self.mounted:
+            return None
+        R = self._camera.body_T_camera.rotation().matrix()
+        return turns_contradict(*covered, R, self._camera.clock_offset_s)
+
     def _estimate(self, imu: ImuBuffer) -> GyroAlignment | None:
         """The alignment of the turns that the gyroscope covers; None if they are too few."""
+        covered = self._covered(imu)
+        if covered is None:
+            return None
+        R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
+        return align_gyroscope(*covered, R, self._camera.clock_offset_s)
+
+    def _covered(self, imu: ImuBuffer) -> tuple[Turns, ImuData] | None:
+        """The turns that the gyroscope covers, and its samples; None if they are too few."""
         nominal_ns = round(self._camera.clock_offset_s * 1e9)
         around_ns = round(MAX_OFFSET_S * 1e9) + 10_000_000
         newest_ns = imu.newest_ns() - nominal_ns - around_ns
@@ -198,9 +215,7 @@ class StartCalibration:
             np.array([t[3] for t in rows]),
         )
         first_ns, last_ns = rows[0][0] + nominal_ns, int(turns.second_ns.max()) + nominal_ns
-        samples = imu.between(first_ns - around_ns, last_ns + around_ns)
-        R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
-        return align_gyroscope(turns, samples, R, self._camera.clock_offset_s)
+        return turns, imu.between(first_ns - around_ns, last_ns + around_ns)
 
     def _judged(self, found: GyroAlignment, largest_sigma_s: float) -> FoundCalibration | None:
         """The new calibration, if what was found is known and contradicts the old one."""

@@ -104,11 +104,10 @@ def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
         M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.
         gravity: its magnitude, m/s².
     """
-    of_v = M[:, :3, :3] + _RIDGE * np.trace(M[:, :6, :6], axis1=1, axis2=2)[:, None, None] * np.eye(
-        3
-    )
+    size = np.trace(M[:, :6, :6], axis1=1, axis2=2)[:, None, None] + 1e-300
+    of_v = M[:, :3, :3] + _RIDGE * size * np.eye(3)
     with np.errstate(all="ignore"):
-        by_g = np.linalg.solve(of_v + 1e-300 * np.eye(3), M[:, :3, 3:])
+        by_g = np.linalg.solve(of_v, M[:, :3, 3:])
         rest = M[:, 3:, 3:] - M[:, 3:, :3] @ by_g
         values, vectors = np.linalg.eigh(np.nan_to_num(rest[:, :3, :3]))
         projected = np.einsum("sji,sj->si", vectors, rest[:, :3, 3])
@@ -160,9 +159,9 @@ def static_features(
         return np.ones(count, np.bool_)
     best = motions[np.argsort(scores(motions), kind="stable")[:_REFINED]]
     for _ in range(_REFINEMENTS):
-        agree = model.errors(best) < limit
+        agree = np.asarray(model.errors(best) < limit)
         better = model.solve(agree / model.distances(best))
         known = np.isfinite(better).all(axis=1) & agree.any(axis=1)
         best = np.where(known[:, None], better, best)
     x = best[[int(np.argmin(scores(best)))]]
-    return np.asarray(model.errors(x)[0] < limit)
+    return np.asarray(np.ravel(model.errors(x)) < limit)

@@ -28,6 +28,8 @@ _SEARCH_COST, _MAX_COST = 0.3, 1.0
 rotation is refused. Noise gives 0.13, and 1 % of wrong matches 0.06."""
 _RANSAC_SIGMAS = 2.0
 """Tolerance of the search for another start, in units of the noise."""
+_RANSAC_SAMPLES = 300
+"""Most samples of five of that search: enough where half of the matches are right."""
 _STEPS = 10
 """Most Gauss-Newton steps."""
 _CONVERGED_RAD = 1e-5
@@ -102,7 +104,8 @@ def _cost(candidate: tuple[float, VisualRotation]) -> float:
 
 def _by_five_points(one: FloatArray, two: FloatArray, noise: float) -> list[FloatArray]:
     """The first_R_second of an essential matrix by RANSAC (Nistér 2004)."""
-    E, _ = cv2.findEssentialMat(one, two, np.eye(3), cv2.RANSAC, 0.999, _RANSAC_SIGMAS * noise)
+    tolerance = _RANSAC_SIGMAS * noise
+    E, _ = cv2.findEssentialMat(one, two, np.eye(3), cv2.RANSAC, 0.999, tolerance, _RANSAC_SAMPLES)
     if E is None or E.shape != (3, 3):
         return []
     R_1, R_2, _ = cv2.decomposeEssentialMat(E)
