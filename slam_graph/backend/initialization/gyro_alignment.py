@@ -283,7 +283,7 @@ def turns_contradict(
         if not _SAME_RATE[0] < ratio < _SAME_RATE[1]:
             return (
                 f"the gyroscope turns {ratio:.3g} times as fast as the camera; check its unit "
-                "(rad/s) and the focal length"
+                "(rad/s; 57 times is degrees) and the focal length"
             )
         if misfit(body_R_camera) > _CONTRADICTS:
             away = np.rad2deg((best * Rotation.from_matrix(body_R_camera).inv()).magnitude())

@@ -159,9 +159,9 @@ def static_features(
         return np.ones(count, np.bool_)
     best = motions[np.argsort(scores(motions), kind="stable")[:_REFINED]]
     for _ in range(_REFINEMENTS):
-        agree = np.asarray(model.errors(best) < limit)
+        agree = model.errors(best) < limit
         better = model.solve(agree / model.distances(best))
-        known = np.isfinite(better).all(axis=1) & agree.any(axis=1)
-        best = np.where(known[:, None], better, best)
+        known = np.asarray(np.isfinite(better).all(axis=1, keepdims=True))
+        best = np.where(known & agree.any(axis=1, keepdims=True), better, best)
     x = best[[int(np.argmin(scores(best)))]]
     return np.asarray(np.ravel(model.errors(x)) < limit)
