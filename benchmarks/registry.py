@@ -28,6 +28,7 @@ from benchmarks import (
     rolling_shutter,
     speed,
     starts,
+    stream_rates,
     time_offset,
     wheel,
 )
@@ -44,6 +45,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **real_imu.BENCHMARKS,
     **mono_real_imu.BENCHMARKS,
     **starts.BENCHMARKS,
+    **stream_rates.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,
     **time_offset.BENCHMARKS,
     **final_ba.BENCHMARKS,
