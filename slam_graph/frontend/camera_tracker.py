@@ -183,7 +183,7 @@ class CameraTracker:
         if self._config.map_check_px is None:
             return fits
         world_T_body = self._predictor.body_pose(stamp_ns)
-        # PnP weighs all of the plane z = 1 alike, and its noise grows towards the edge of a wide lens
+        # PnP weighs all of the plane z = 1 alike; its noise grows towards the edge of a wide lens
         near = np.all(np.abs(tracks.normalized) < MAX_TANGENT, axis=1)
         known = np.flatnonzero(np.isin(tracks.ids, feedback.ids) & near)
         if world_T_body is None or len(known) == 0:
