@@ -44,13 +44,26 @@ def fitted_motion(camera: Camera, before: FloatArray, after: FloatArray) -> Floa
 
 
 def distances_px(
-    camera: Camera, F: FloatArray, before: FloatArray, after: FloatArray
+    camera: Camera,
+    F: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    other: Camera | None = None,
 ) -> FloatArray:
-    """Sampson's distances (N,) in pixels of matches (N, 2) from a motion F (3, 3)."""
-    if not camera.model.sees_sideways:
-        distances: FloatArray = epipolar_distance(F, before, after) * camera.fx
-        return distances
-    return _Matches.of(before, after, camera).distances_px(F[None])[0]
+    """Sampson's distances (N,) in pixels of matches (N, 2) from a motion F (3, 3).
+
+    Args:
+        camera: which took the first image.
+        F: with m_afterᵀ F m_before = 0 for a match that fits.
+        before: (N, 2) normalised coordinates in the first image.
+        after: (N, 2) the same points in the second one.
+        other: which took the second image, if not the same.
+    """
+    other = other or camera
+    if not (camera.model.sees_sideways or other.model.sees_sideways):
+        return epipolar_distance(F, before, after) * camera.fx
+    distances: FloatArray = _Matches.of(before, after, camera, other).distances_px(F[None])[0]
+    return distances
 
 
 class EpipolarTest:
@@ -138,9 +151,11 @@ class _Matches:
     by_b: FloatArray
 
     @staticmethod
-    def of(before: FloatArray, after: FloatArray, camera: Camera) -> _Matches:
-        """Those of normalised points (N, 2)."""
-        (a, by_a), (b, by_b) = _on_sphere(before, camera), _on_sphere(after, camera)
+    def of(
+        before: FloatArray, after: FloatArray, camera: Camera, other: Camera | None = None
+    ) -> _Matches:
+        """Those of normalised points (N, 2), the later ones in another camera if it is given."""
+        (a, by_a), (b, by_b) = _on_sphere(before, camera), _on_sphere(after, other or camera)
         return _Matches(a, b, by_a, by_b)
 
     def select(self, rows: BoolArray) -> _Matches:
