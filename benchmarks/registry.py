@@ -30,6 +30,7 @@ from benchmarks import (
     starts,
     time_offset,
     wheel,
+    wide_lenses,
 )
 from benchmarks.suite import Benchmark
 
@@ -46,6 +47,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **starts.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,
     **time_offset.BENCHMARKS,
+    **wide_lenses.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,
