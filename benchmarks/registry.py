@@ -31,6 +31,7 @@ from benchmarks import (
     stream_rates,
     time_offset,
     wheel,
+    wide_lenses,
 )
 from benchmarks.suite import Benchmark
 
@@ -48,6 +49,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **stream_rates.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,
     **time_offset.BENCHMARKS,
+    **wide_lenses.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **memory.BENCHMARKS,

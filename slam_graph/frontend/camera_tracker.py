@@ -8,20 +8,13 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import Associator
+from slam_graph.frontend.epipolar_test import EpipolarTest, distances_px, fitted_motion
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
-from slam_graph.frontend.outliers import (
-    MIN_POINTS,
-    coherent_groups,
-    direction_inliers,
-    eight_point,
-    epipolar_distance,
-    fundamental_inliers,
-    map_inliers,
-)
-from slam_graph.frontend.prediction import PointPredictor
+from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
+from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
 from slam_graph.sensors import RigCamera
 
 _MERGE_DISTANCE_PX = 3.0
@@ -58,7 +51,7 @@ class CameraTracker:
         self._predictor = predictor
         self._config = config
         self._stats = stats
-        self._rng = rng
+        self._epipolar = EpipolarTest(mounted.camera, config, rng)
         self._motion_ids: list[IntArray] = []  # of the features of each rigid motion
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
@@ -156,22 +149,16 @@ class CameraTracker:
 
     def _inliers(self, before: FloatArray, after: FloatArray, scale: float = 1.0) -> BoolArray:
         """Which matches (N, 2) fit the motion of most of them, with the tolerance scaled."""
-        config, focal_px = self._config, self._camera.fx
-        if config.outliers == "gyroscope" and self._predictor.rotation_known:
-            R = self._predictor.camera_R
-            return direction_inliers(before, after, R, focal_px, config, self._rng, scale)
-        order = self._rng.permutation(len(before))
-        inlier = np.empty(len(before), np.bool_)
-        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, config, scale)
-        return inlier
+        R = self._predictor.camera_R if self._predictor.rotation_known else None
+        return self._epipolar.inliers(before, after, R, scale)
 
     def _fits_motion(
         self, origins: FloatArray, points: FloatArray, scale: float, motions: list[FloatArray]
     ) -> BoolArray:
         """Which candidates (M, 2) for new features fit a motion of the features, or a new one."""
         limit_px = scale * self._config.epipolar_px
-        distances = [epipolar_distance(F, origins, points) for F in motions]
-        good: BoolArray = np.min(distances, axis=0) * self._camera.fx < limit_px
+        distances = [distances_px(self._camera, F, origins, points) for F in motions]
+        good: BoolArray = np.min(distances, axis=0) < limit_px
 
         def inliers(rows: IntArray) -> BoolArray:
             return self._inliers(origins[rows], points[rows], scale)
@@ -186,8 +173,9 @@ class CameraTracker:
         groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
         start, end = self._unrolled(before), self._unrolled(after)
         matches = ((start[rows], end[rows]) for rows in groups)
-        motions = [eight_point(one, other) for one, other in matches if len(one) >= MIN_POINTS]
-        return motions or [eight_point(start, end)]
+        camera = self._camera
+        enough = [(one, other) for one, other in matches if len(one) >= MIN_POINTS]
+        return [fitted_motion(camera, *pair) for pair in enough or [(start, end)]]
 
     def _fits_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> BoolArray:
         """Which features (N,) fit the map of the back end, or are not in it."""
@@ -195,7 +183,9 @@ class CameraTracker:
         if self._config.map_check_px is None:
             return fits
         world_T_body = self._predictor.body_pose(stamp_ns)
-        known = np.flatnonzero(np.isin(tracks.ids, feedback.ids))
+        # PnP weighs all of the plane z = 1 alike; its noise grows towards the edge of a wide lens
+        near = np.all(np.abs(tracks.normalized) < MAX_TANGENT, axis=1)
+        known = np.flatnonzero(np.isin(tracks.ids, feedback.ids) & near)
         if world_T_body is None or len(known) == 0:
             return fits
         points = feedback.points[np.searchsorted(feedback.ids, tracks.ids[known])]

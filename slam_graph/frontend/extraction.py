@@ -24,11 +24,6 @@ windows of detectors and descriptors are cut."""
 _REST_FRAMES = 3
 """Frames for which a cell is skipped that could not be filled: it hardly could be in the next."""
 
-_REACH = 2.75
-"""Largest normalised coordinate of features of wide lenses: 70° off the axis. On the plane z = 1,
-where matches are tested and points triangulated, the noise of a pixel grows with 1 / cos²: by 9 at
-70°, by 33 at 80°."""
-
 _MARGIN_PX = 4
 """Cells are cut out with this margin, so that scores at their edge see the pixels beyond."""
 
@@ -272,7 +267,7 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
     mask = None if path is None else _read_mask(path, camera.width, camera.height)
     if not camera.model.sees_sideways:
         return mask
-    visible = np.where(camera.visible_mask(_REACH), np.uint8(255), np.uint8(0))
+    visible = np.where(camera.visible_mask(), np.uint8(255), np.uint8(0))
     inside = np.asarray(cv2.erode(visible, np.ones((window_px, window_px), np.uint8)), np.uint8)
     return inside if mask is None else np.minimum(mask, inside)
 

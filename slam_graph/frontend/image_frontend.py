@@ -98,6 +98,7 @@ class ImageFrontend:
                 pose = rig.cameras[reference].body_T_camera
                 self._matchers[i] = StereoMatcher(
                     camera,
+                    rig.cameras[reference].camera,
                     mounted.body_T_camera.between(pose),
                     LucasKanade(config),
                     extractor,

@@ -13,10 +13,11 @@ from scipy.spatial.distance import cdist
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import Association, Candidates, inside
 from slam_graph.frontend.descriptors import Descriptor, Vectors
+from slam_graph.frontend.epipolar_test import distances_px, fitted_motion
 from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks
-from slam_graph.frontend.outliers import MIN_POINTS, eight_point, epipolar_distance
+from slam_graph.frontend.outliers import MIN_POINTS
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
 from slam_graph.sensors import Camera
 
@@ -309,7 +310,6 @@ class DescriptorMatching:
     def _fits(self, lost: _Lost, found: IntArray, after: Tracks) -> BoolArray:
         """Which of the features (N,) that were found again fit the motion since they were seen."""
         fits = np.zeros(len(found), np.bool_)
-        limit = self._epipolar_px / self._camera.fx
         for number in np.unique(lost.seen[found >= 0]).tolist():
             back = self._images - number
             if back > len(self._history):
@@ -318,9 +318,10 @@ class DescriptorMatching:
             here, there = after.common(then)
             if len(here) < MIN_POINTS:
                 continue
-            F = eight_point(then.normalized[there], after.normalized[here])
+            F = fitted_motion(self._camera, then.normalized[there], after.normalized[here])
             rows = np.flatnonzero((found >= 0) & (lost.seen == number))
             pixels = self._current.keypoints.pixels[found[rows]].astype(np.float64)
             m = self._camera.undistort(pixels)
-            fits[rows] = epipolar_distance(F, lost.normalized[rows], m) < limit
+            off_px = distances_px(self._camera, F, lost.normalized[rows], m)
+            fits[rows] = off_px < self._epipolar_px
         return fits

@@ -95,7 +95,8 @@ _NEAREST_DEPTH_M = 0.1
 """Points of the map nearer than this, or behind the camera, are not used for prediction."""
 
 MAX_TANGENT = 2.75
-"""Largest normalised coordinate for which a camera model is evaluated: 70° off the axis."""
+"""Largest normalised coordinate for which the model of a narrow lens is evaluated: 70° off the
+axis. A wide lens has its own limit."""
 
 _ROW_ITERATIONS = 3
 """Iterations for the row at which a rolling shutter will see a point."""
@@ -136,6 +137,8 @@ class PointPredictor:
 
     def __init__(self, mounted: RigCamera, motion: ImuMotion, config: FrontendConfig) -> None:
         self._camera = mounted.camera
+        wide = mounted.camera.model.sees_sideways
+        self._reach = mounted.camera.max_tangent if wide else MAX_TANGENT
         self._trends: dict[int, tuple[FloatArray, FloatArray]] = {}  # at the last two images
         self.mount(mounted)
         self._motion = motion
@@ -179,7 +182,7 @@ class PointPredictor:
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True
-        sane = np.all(np.abs(m) < MAX_TANGENT, axis=1)
+        sane = np.all(np.abs(m) < self._reach, axis=1)
         pixels = before.pixels.copy()
         pixels[sane] = self._rolled(m[sane], stamp_ns)
         size = np.array([self._camera.width - 1, self._camera.height - 1])

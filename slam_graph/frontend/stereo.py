@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.frontend.epipolar_test import distances_px
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
-from slam_graph.frontend.outliers import epipolar_error, triangulated_depths
+from slam_graph.frontend.outliers import epipolar_error, essential_matrix, triangulated_depths
 from slam_graph.sensors import Camera, Rig, RigCamera
 
 _OVERLAP_GRID = 8
@@ -37,7 +38,7 @@ _MIN_OVERLAP = 0.25
 """A camera that sees less than this share of another one's view has features of its own."""
 
 MAX_TANGENT = 3.0
-"""Points with larger normalised coordinates, 72° off the axis, are outside of any camera."""
+"""Points with larger normalised coordinates, 72° off the axis, are outside of any narrow lens."""
 
 _HALVINGS = 2
 """The epipolar search runs on images of a quarter of the size."""
@@ -96,7 +97,8 @@ def _sees(mounted: RigCamera, points: FloatArray) -> BoolArray:
     camera = mounted.camera
     ahead = points[:, 2] > 0
     m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
-    ahead &= np.all(np.abs(m) < MAX_TANGENT, axis=1)
+    reach = camera.max_tangent if camera.model.sees_sideways else MAX_TANGENT
+    ahead &= np.all(np.abs(m) < reach, axis=1)
     pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
     sees: BoolArray = (
         ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
@@ -107,8 +109,9 @@ def _sees(mounted: RigCamera, points: FloatArray) -> BoolArray:
 class _EpipolarSearch:
     """Searches points of one camera along their epipolar lines in the image of another.
 
-    The candidates are projections at depths that are evenly spaced in 1 / z; the best one is that
-    with the largest normalised cross-correlation of a small patch of the reduced images.
+    The candidates are projections at depths that are evenly spaced in 1 / z (with a wide lens, at
+    distances evenly spaced in 1 / distance); the best one is that with the largest normalised
+    cross-correlation of a small patch of the reduced images.
 
     Args:
         camera: the one that is searched in.
@@ -131,12 +134,15 @@ class _EpipolarSearch:
 
         Args:
             normalized: (..., 2) in the reference camera.
-            inverse_depth_per_m: (...) 1 / z in the reference camera; 0 for points at infinity.
+            inverse_depth_per_m: (...) 1 / z in the reference camera, 1 / distance if this camera's
+                lens is wide; 0 for points at infinity.
 
         Returns:
             (..., 2); far off the image for points that are not in front of the other camera.
         """
         rays = np.concatenate([normalized, np.ones((*normalized.shape[:-1], 1))], axis=-1)
+        if self._camera.model.sees_sideways:
+            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         points = rays @ self._R.T + self._t * inverse_depth_per_m[..., None]
         m = points[..., :2] / np.maximum(points[..., 2:], 1e-3)
         return self._camera.distort(m.reshape(-1, 2))[0].reshape(m.shape)
@@ -210,6 +216,7 @@ class StereoMatcher:
 
     Args:
         camera: the other camera.
+        reference: the reference camera.
         other_T_reference: pose of the reference camera in the other one's frame.
         lucas_kanade: refines the matches.
         extractor: of the other camera, for its mask.
@@ -222,12 +229,15 @@ class StereoMatcher:
     def __init__(
         self,
         camera: Camera,
+        reference: Camera,
         other_T_reference: gtsam.Pose3,
         lucas_kanade: LucasKanade,
         extractor: FeatureExtractor,
         config: FrontendConfig,
     ) -> None:
         self._camera = camera
+        self._reference = reference
+        self._wide = camera.model.sees_sideways or reference.model.sees_sideways
         self._other_T_reference = other_T_reference
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
         self._lucas_kanade = lucas_kanade
@@ -290,8 +300,13 @@ class StereoMatcher:
         """Which matches (N, 2) fit the calibration of the rig, (N,)."""
         focal_px = self._camera.fx
         pose = self._other_T_reference
-        distance_px = epipolar_error(pose, m_reference, m_other) * focal_px
         depth_m = triangulated_depths(pose, m_reference, m_other)[:, 0]
+        if self._wide:
+            E = essential_matrix(pose)
+            distance_px = distances_px(self._reference, E, m_reference, m_other, self._camera)
+            depth_m = depth_m * np.sqrt(1.0 + np.sum(m_reference**2, axis=1))  # along the ray
+        else:
+            distance_px = epipolar_error(pose, m_reference, m_other) * focal_px
         # In terms of disparity, because far points may come out a little beyond infinity
         disparity_px = focal_px * self._baseline_m / depth_m
         nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m

@@ -30,11 +30,11 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.plugins import Registry
 
-MAX_TANGENT = 6.0
-"""Longest normalised point that is used: 80.5° off the axis. What a lens sees beyond has no place
+MAX_TANGENT = 11.45
+"""Longest normalised point that is used: 85° off the axis. What a lens sees beyond has no place
 on the plane z = 1, or one too far out to calculate with."""
 
-_FOLD_SAMPLES = 240
+_FOLD_SAMPLES = 458
 """Radii at which a model is tested for being one-to-one; a step is 0.025."""
 
 _NEWTON_STEPS = 20

@@ -10,7 +10,7 @@ image plane, the inverse is NaN.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import gtsam
@@ -55,6 +55,8 @@ class Pinhole(CameraModel):
 class _SolvedByOpenCv(CameraModel):
     """A model that OpenCV inverts roughly; Newton's method does the rest."""
 
+    _steps: ClassVar[int] = _STEPS_FROM_OPENCV
+
     def undistort(
         self, q: FloatArray, coefficients: Coefficients, near: FloatArray | None = None
     ) -> FloatArray:
@@ -62,7 +64,7 @@ class _SolvedByOpenCv(CameraModel):
         if near is None:
             start = self._opencv(np.ascontiguousarray(q[:, None, :]), np.array(coefficients))
             near = np.asarray(start, dtype=np.float64)[:, 0, :]
-        return self._newton(q, coefficients, near, _STEPS_FROM_OPENCV)
+        return self._newton(q, coefficients, near, self._steps)
 
     @abstractmethod
     def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
@@ -135,6 +137,9 @@ class Equidistant(_SolvedByOpenCv):
 
     name = "equidistant"
     coefficient_names = ("k1", "k2", "k3", "k4")
+    _steps = (
+        10  # OpenCV's solution is far off where the polynomial is nearly flat, 80° off the axis
+    )
     sees_sideways = True
     ros_names = ("equidistant", "fisheye")
 

@@ -60,6 +60,8 @@ class RigProjection:
         body_p_camera: (C, 3).
         rolling: whether a shutter rolls; observations are then projected from where their rows were
             exposed, by the motions of their frames.
+        wide: whether a lens sees so much to the side that errors on the plane z = 1 must be
+            weighted (`pixel_slopes`).
         calibration_keys: of the parameters of the rig that are variables.
     """
 
@@ -85,6 +87,7 @@ class RigProjection:
         self.body_R_camera = matrices[:, :3, :3]
         self.body_p_camera = matrices[:, :3, 3]
         self.rolling = rig.rolling
+        self.wide = any(camera.model.sees_sideways for camera in self.cameras)
         self._rig = rig
         self._motions = motions or {}
         self._mounts: tuple[Observations, tuple[FloatArray, FloatArray]] | None = None  # the last
@@ -225,9 +228,29 @@ class RigProjection:
         return pixels, slope
 
     def residuals(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
-        """Residuals z - π(f) (N, 2) in pixels, and depths (N,) in metres."""
+        """Residuals z - π(f) (N, 2) in pixels, and depths (N,) in metres.
+
+        With a wide lens near points have small depths at the edge of the image. There a depth is
+        the distance from the camera, negative behind it.
+        """
         in_camera = self.in_camera(obs, self.in_body(obs, at))
-        return obs.pixels - self.pixels(obs, in_camera)[0], in_camera[:, 2]
+        depths = in_camera[:, 2]
+        if self.wide:
+            depths = np.copysign(np.linalg.norm(in_camera, axis=1), depths)
+        return obs.pixels - self.pixels(obs, in_camera)[0], depths
+
+    def pixel_slopes(self, obs: Observations) -> FloatArray:
+        """Derivatives (N, 2, 2) of the observed pixels by their normalised coordinates.
+
+        In units of the first camera's focal length. They weigh errors on the plane z = 1 as the
+        pixels do, whose noise is the same everywhere: on that plane it grows with 1 / cos² of the
+        angle to the axis.
+        """
+        slopes = np.empty((len(obs), 2, 2))
+        for number, camera in enumerate(self.cameras):
+            rows = obs.camera == number
+            slopes[rows] = camera.distort(obs.normalized[rows])[1]
+        return slopes / self.cameras[0].fx
 
     def jacobians(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
         """Derivatives of π, not of the residual.

@@ -4,7 +4,9 @@
 
 The linear solution is the point nearest to all rays. It is refined in the inverse-depth
 parametrisation (α, β, ρ) of the feature's first camera (Montiel, Civera & Davison 2006), in which
-the reprojection error is nearly linear also for far points.
+the reprojection error is nearly linear also for far points. Errors are those on the plane z = 1;
+with wide lenses they are weighted by the derivative of the camera model, since the noise of a pixel
+is not the same everywhere on that plane.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class Triangulation:
             near nor too far, and with enough parallax.
         reprojection_px: (J,) root mean square reprojection error.
         depth_error: (J,) relative standard deviation of the inverse depth, for known poses and a
-            standard deviation of 1 of the observations in normalised coordinates.
+            standard deviation of 1 of the observations in normalised coordinates, or of the first
+            camera's focal length in pixels if a lens is wide.
     """
 
     points: FloatArray
@@ -54,6 +57,7 @@ class _Rays:
     world_p_camera: FloatArray  # (N, 3)
     R: FloatArray  # (N, 3, 3) camera_R_anchor
     t: FloatArray  # (N, 3) position of the anchor in the camera
+    weights: FloatArray | None  # (N, 2, 2) of errors on the plane z = 1; None for narrow lenses
 
 
 def triangulate(
@@ -151,6 +155,7 @@ def _rays(
         world_p,
         camera_R_world @ world_R[home],
         np.einsum("nij,nj->ni", camera_R_world, world_p[home] - world_p),
+        rig.pixel_slopes(obs) if rig.wide else None,
     )
 
 
@@ -217,6 +222,8 @@ def _normal_equations(
     r = obs.normalized - m
     by_x = np.concatenate([rays.R[:, :, :2], rays.t[:, :, None]], axis=2)
     J = (by_x[:, :2, :] - m[:, :, None] * by_x[:, 2:, :]) / z[:, :, None]
+    if rays.weights is not None:
+        J, r = rays.weights @ J, np.einsum("nij,nj->ni", rays.weights, r)
     lhs = np.add.reduceat(J.transpose(0, 2, 1) @ J, starts)
     rhs = np.add.reduceat(np.einsum("nij,ni->nj", J, r), starts)
     return np.add.reduceat(np.sum(r * r, axis=1), starts), lhs, rhs

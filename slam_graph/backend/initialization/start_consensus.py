@@ -50,7 +50,10 @@ class _Model:
     def __init__(
         self, obs: Observations, motion: Motion, rig: RigProjection, gravity: float
     ) -> None:
-        by_point, by_motion, b = alignment_equations(obs, motion, rig, np.ones(len(obs)))
+        weights = np.ones(len(obs))
+        if rig.wide:  # errors are divided by distances, which are not depths towards the edge
+            weights = np.sqrt(1.0 + np.sum(obs.normalized**2, axis=1))
+        by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
         others = np.concatenate([by_motion, b[:, :, None]], axis=2)
         R, rest = eliminate_points(obs, by_point, others)
         rows, count = rest[:, 3:], len(obs.ids)

@@ -105,6 +105,8 @@ def alignment_equations(
     rows = np.zeros((len(obs), 2, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1.0
     rows[:, :, 2] = -obs.normalized
+    if rig.wide:
+        rows = rig.pixel_slopes(obs) @ rows
     in_body = rows @ camera_R_body * weights[:, None, None]
     by_point = in_body @ motion.rotations[obs.frame].transpose(0, 2, 1)
     late_s = rig.row_times_s(obs)  # of the rows of a rolling shutter

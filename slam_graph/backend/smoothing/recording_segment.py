@@ -23,6 +23,9 @@ from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
 
 _MAX_INITIAL_ERROR = 30.0
 """Features with a larger root-mean-square reprojection error are left out, in units of σ."""
+_PINHOLE_TANGENT = 2.75
+"""Longest normalised points that a pinhole in place of a wide lens sees: 70° off the axis. In its
+pixels the noise grows with 1 / cos², by 9 there. Those further out are left out."""
 _RECENT_NS = 10_000_000_000
 """Length of the IMU buffer in which a standstill is detected."""
 
@@ -157,6 +160,8 @@ def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig
             points[rows, 2:] = mounted.camera.undistort(points[rows, :2])
         if supported is not mounted:
             points[rows, :2] = supported.camera.distort(points[rows, 2:])[0]
+            if mounted.camera.model.sees_sideways:
+                points[rows & (np.linalg.norm(points[:, 2:], axis=1) > _PINHOLE_TANGENT)] = np.nan
     return points
 
 
