@@ -55,7 +55,7 @@ MAX_NORMALIZED_COST = 3.0
 """Largest accepted mean squared residual, in σ²."""
 MAX_VELOCITY_SIGMA = 0.1
 """Largest accepted standard deviation of the velocity, m/s."""
-MAX_SCALE_SIGMA = 0.04
+MAX_SCALE_SIGMA = 0.05
 """Largest accepted standard deviation of the scale, relative to it."""
 _MAX_STEP_LEFT = 0.3
 """Longest accepted step that is left at the end, in σ: with more the steps have not converged."""
