@@ -9,8 +9,13 @@ from gtsam.symbol_shorthand import X
 from slam_graph.backend.marginalization.marginalize import relative_to, unobservable_directions
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of
+from slam_graph.config import load_config
+from slam_graph.evaluation.consistency import mean_bounds
+from slam_graph.pipeline.run_recording import run
+from slam_graph.simulation.simulator import simulate
 
 TIMES = np.array([0.0, 0.4, 0.9])
+FLIGHTS = range(3)
 
 
 def test_a_start_defines_its_world_by_its_last_pose() -> None:
@@ -39,3 +44,29 @@ def test_a_start_defines_its_world_by_its_last_pose() -> None:
     np.testing.assert_allclose(
         W.T @ moved.solution(), W.T @ state.offset(layout), rtol=1e-6, atol=1e-9
     )
+
+
+def test_after_a_start_in_motion_errors_are_relative_to_the_first_state() -> None:
+    """One camera, with the noise that is assumed: the start is least certain of the scale."""
+    config = load_config(
+        algorithm="msckf",
+        overrides=[
+            "cameras=1",
+            "final_ba.enabled=false",
+            "backend.initialization.mode=motion",
+        ],
+    )
+    means = []
+    for seed in FLIGHTS:
+        sequence = simulate(
+            trajectory="figure8",
+            cameras=1,
+            duration_s=6.0,
+            flight={"hover_s": 0.0},
+            seed=seed,
+        )
+        metrics = run(sequence, config).metrics
+        assert metrics["nees"]["alignment"] == "first_pose"
+        means.append([metrics["nees"][part]["mean"] for part in ("orientation", "position")])
+    low, high = mean_bounds(3, len(FLIGHTS), 0.999)
+    assert np.all((np.mean(means, axis=0) > low) & (np.mean(means, axis=0) < high)), means
