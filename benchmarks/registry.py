@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from benchmarks import (
     bal,
+    consistency_real,
     cost_over_time,
     elimination,
     final_ba,
@@ -45,6 +46,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **moving_object.BENCHMARKS,
     **real_imu.BENCHMARKS,
     **mono_real_imu.BENCHMARKS,
+    **consistency_real.BENCHMARKS,
     **starts.BENCHMARKS,
     **stream_rates.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,

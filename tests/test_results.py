@@ -197,7 +197,7 @@ def test_files_of_a_real_trajectory(tmp_path: Path, data_dir: Path) -> None:
     errors = [table["translation_m"]["rmse"] for table in freer]
     assert errors == sorted(errors, reverse=True)
     assert metrics["accuracy"]["none"]["rpe"]["translation_m"]["rmse"] < 0.0117
-    assert metrics["nees"]["alignment"] == "yaw"
+    assert metrics["nees"]["alignment"] == "first_pose"
     assert metrics["features_per_frame"] == {"tracked": 10.0}
     assert metrics["timing"]["real_time_factor"] == pytest.approx(result.input.recorded_s / 2.0)
     assert (tmp_path / "out" / "trajectory.png").read_bytes()[:4] == b"\x89PNG"

@@ -56,7 +56,7 @@ class SquareRootEngine:
         context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
-        return state
+        return context.propagation.reported(state)
 
     def _minimize(
         self, window: Window, constructed: ConstructedCost

@@ -5,16 +5,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
+from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
 from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
@@ -24,6 +25,9 @@ from slam_graph.geometry import (
     StateHistory,
     Trajectory,
 )
+
+if TYPE_CHECKING:
+    from slam_graph.backend import FinalBa
 
 _REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
@@ -51,7 +55,7 @@ def consistency_report(
     truth: Trajectory,
     history: StateHistory,
     aligned: bool,
-    after_alignment: FloatArray | None = None,
+    smoothed: FinalBa | None = None,
 ) -> Table | None:
     """NEES of orientation, position and pose, or None without covariances.
 
@@ -60,9 +64,9 @@ def consistency_report(
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
             given); otherwise it is aligned as `nees_of_run` says.
-        after_alignment: see `nees_of_run`.
+        smoothed: see `nees_of_run`.
     """
-    result, alignment = nees_of_run(truth, history, aligned, after_alignment)
+    result, alignment = nees_of_run(truth, history, aligned, smoothed)
     if len(result.stamps_ns) == 0:
         return None
     table: Table = {"alignment": alignment, "states": len(result.pose)}
@@ -121,44 +125,35 @@ def nees_of_run(
     truth: Trajectory,
     history: StateHistory,
     aligned: bool,
-    after_alignment: FloatArray | None = None,
+    smoothed: FinalBa | None = None,
 ) -> tuple[Nees, AlignmentMode | Literal["first_pose"]]:
     """NEES of the states of a run, and the alignment under which it was taken.
 
     An estimate that does not live in the world of the truth is aligned in yaw and position, which
-    nothing tells it, over the whole run: the truth's own orientation at one time may be off by far
-    more than the estimate's uncertainty there. What never moves is aligned by its first pose.
+    nothing tells it, and a covariance has to be that of what the alignment leaves:
+
+    - `yaw`: over the whole run, by the smoothed trajectory (`alignment_covariance.py`);
+    - `first_pose`, without one: at the first state, relative to which covariances are. A truth
+      whose orientation is wrong there turns all positions.
 
     Args:
         truth: the true trajectory.
-        history: estimated states.
+        history: estimated states, or those of the smoothed trajectory.
         aligned: whether the estimate lives in the world of the truth already.
-        after_alignment: (N, 6, 6) pose covariances of what is left after an alignment in yaw and
-            position over the whole run, in the body frame. Those of the states are relative to the
-            first one, where they vanish, while an error after alignment does not.
+        smoothed: the smoothed trajectory of the run, if there is one.
 
     Raises:
-        DataError: if the two share no time.
+        DataError: if truth and estimate share no time.
     """
-    estimate = history.trajectory()
-    similarity, alignment = _truth_from_estimate(truth, estimate, aligned)
-    covariances = history.pose_covariances()
-    if alignment == "yaw" and after_alignment is not None:
-        covariances = after_alignment
-    return nees(estimate, covariances, truth, similarity), alignment
-
-
-def _truth_from_estimate(
-    truth: Trajectory, estimate: Trajectory, aligned: bool
-) -> tuple[Similarity, AlignmentMode | Literal["first_pose"]]:
-    """The map from the world of an estimate to that of the truth, and its name."""
+    estimate, covariances = history.trajectory(), history.pose_covariances()
     if aligned:
-        return Similarity.identity(), "none"
+        return nees(estimate, covariances, truth), "none"
     true, own = synchronize(truth, estimate)
-    try:
-        return Similarity.of_positions(true.positions, own.positions, "yaw"), "yaw"
-    except DataError:
-        return Similarity.of_first_pose(true, own), "first_pose"
+    with suppress(DataError):  # what never moves determines no yaw
+        found = None if smoothed is None else aligned_by_smoothed(truth, history, smoothed)
+        if found is not None:
+            return nees(estimate, found[1], truth, found[0]), "yaw"
+    return nees(estimate, covariances, truth, Similarity.of_first_pose(true, own)), "first_pose"
 
 
 def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:

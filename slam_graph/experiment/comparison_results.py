@@ -121,7 +121,7 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
 
 def _nees_series(truth: Trajectory, result: RunResult) -> Series:
     try:
-        values, _ = nees_of_run(truth, result.history, result.start_was_given)
+        values, _ = nees_of_run(truth, result.history, result.start_was_given, result.final_ba)
     except DataError:
         return {}
     return {

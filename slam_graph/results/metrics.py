@@ -17,7 +17,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from slam_graph.arrays import FloatArray
 from slam_graph.backend import FinalBa
 from slam_graph.errors import DataError
 from slam_graph.evaluation import accuracy_report, consistency_report
@@ -86,7 +85,7 @@ def consistency_table(
     truth: Trajectory | None,
     history: StateHistory,
     given: bool,
-    after_alignment: FloatArray | None = None,
+    smoothed: FinalBa | None = None,
 ) -> Table | None:
     """NEES against ground truth, or None where there is nothing to compare.
 
@@ -94,12 +93,12 @@ def consistency_table(
         truth: the true trajectory.
         history: the estimate with its covariances.
         given: whether the start was given in the world of the truth.
-        after_alignment: pose covariances after an alignment, as `nees_of_run` takes them.
+        smoothed: the smoothed trajectory of the run, by which `nees_of_run` aligns.
     """
     if truth is None or len(history) == 0:
         return None
     try:
-        return consistency_report(truth, history, given, after_alignment)
+        return consistency_report(truth, history, given, smoothed)
     except DataError as error:
         return {"unavailable": str(error)}
 
@@ -142,7 +141,7 @@ def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table 
     if final_ba is None:
         return None
     accuracy = None if truth is None else accuracy_report(truth, final_ba.trajectory)
-    nees = consistency_table(truth, final_ba.history, given=False, after_alignment=final_ba.aligned)
+    nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
     return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees}
 
 

@@ -232,7 +232,9 @@ class RunResult:
                     if located is None
                     else located.table(asked.start_ns, logs.frames, asked.truth)
                 ),
-                "nees": tables.consistency_table(truth, self.history, self.start_was_given),
+                "nees": tables.consistency_table(
+                    truth, self.history, self.start_was_given, self.final_ba
+                ),
                 "nis": innovation_report(logs.innovations.columns()),
                 "calibration": logs.calibration.table(),
                 "timing": tables.timing_table(logs, asked.start_ns, self.ending.wall_s),

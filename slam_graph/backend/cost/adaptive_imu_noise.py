@@ -106,7 +106,11 @@ class DensityScale:
 
 
 class DynamicsNoise:
-    """Noise parameters of the preintegration that adapt during the run."""
+    """Noise parameters of the preintegration that adapt during the run.
+
+    Attributes:
+        vibrates: whether the accelerometer does.
+    """
 
     def __init__(self, imu: ImuNoise, config: NoiseConfig) -> None:
         self._imu = imu
@@ -115,7 +119,7 @@ class DynamicsNoise:
         self._accel = DensityScale()
         self._gyro_walk = DensityScale(_SLOW_FALL_TIME_S)
         self._accel_walk = DensityScale(_SLOW_FALL_TIME_S)
-        self._vibrates = False
+        self.vibrates = False
 
     def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
         """Current parameters, with all densities multiplied by `scale`."""
@@ -141,9 +145,9 @@ class DynamicsNoise:
         """
         if not self._config.adaptive.enabled:
             return
-        vibrated, self._vibrates = self._vibrates, self._is_vibrating(imu, stamp_ns)
-        self._accel.fall_time_s = _SLOW_FALL_TIME_S if self._vibrates else RESPONSE_TIME_S
-        if self._vibrates and not vibrated:
+        vibrated, self.vibrates = self.vibrates, self._is_vibrating(imu, stamp_ns)
+        self._accel.fall_time_s = _SLOW_FALL_TIME_S if self.vibrates else RESPONSE_TIME_S
+        if self.vibrates and not vibrated:
             self._accel.factor = max(self._accel.factor, _VIBRATING_ACCEL)
 
     def _is_vibrating(self, imu: ImuBuffer, stamp_ns: int) -> bool:
@@ -154,7 +158,7 @@ class DynamicsNoise:
         since_ns = stamp_ns - round(_VIBRATION_TIME_S * 1e9)
         recent = imu.data[int(np.searchsorted(imu.data.stamps_ns, since_ns)) :]
         if len(recent) < _FEWEST_SAMPLES:
-            return self._vibrates
+            return self.vibrates
         spacing_s = float(np.median(np.diff(recent.stamps_ns))) * 1e-9
         median = float(np.median(np.abs(np.diff(recent.accel, n=3, axis=0))))
         sigma = median / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)

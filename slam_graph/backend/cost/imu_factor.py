@@ -18,6 +18,7 @@ from gtsam.symbol_shorthand import B, V, X
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise
+from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
@@ -40,10 +41,17 @@ def _predicted_covariance(
         values: of both states.
         covariance: (15, 15) of the earlier one: pose, velocity, bias.
     """
-    A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
-    before, after = np.hstack([A[:, :9], A[:, 18:24]]), np.hstack([A[:, 9:18], A[:, 24:]])
+    before, after = _jacobians(factor, values)
     root = np.linalg.solve(after, np.hstack([before @ np.linalg.cholesky(covariance), np.eye(15)]))
     return np.asarray(root @ root.T, dtype=np.float64)
+
+
+def _jacobians(
+    factor: gtsam.NonlinearFactor, values: gtsam.Values
+) -> tuple[FloatArray, FloatArray]:
+    """The whitened Jacobians (15, 15) of a dynamics factor by the earlier and the later state."""
+    A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
+    return np.hstack([A[:, :9], A[:, 18:24]]), np.hstack([A[:, 9:18], A[:, 24:]])
 
 
 def imu_factor(
@@ -64,6 +72,7 @@ class Propagation:
         self.config = config
         self.diagnostics = diagnostics
         self.noise = DynamicsNoise(imu, config.noise)
+        self._vibration = VibrationCovariance(config.noise.imu_scale * imu.accel_noise_density)
         self._last: NavState | None = None
         self._predicted: NavState | None = None
 
@@ -90,6 +99,7 @@ class Propagation:
         factor = imu_factor(i, j, pim)
         window.factors.append(factor)
         self._predicted = None if still else self._with_covariance(predicted, factor, window)
+        self._predict_vibration(factor, window)
         if still:
             window.factors += zero_velocity_factors(i, j)
 
@@ -103,11 +113,29 @@ class Propagation:
         covariance = _predicted_covariance(factor, window.state.estimate, last.covariance)
         return replace(predicted, covariance=covariance)
 
+    def _predict_vibration(self, factor: gtsam.CombinedImuFactor, window: Window) -> None:
+        """Carry what vibration adds to the covariance on to the new frame."""
+        if self._predicted is None or self._last is None:
+            self._vibration.stay()
+        elif self.noise.vibrates or not self._vibration.vanishes:
+            before, after = _jacobians(factor, window.state.estimate)
+            dt_s = (window.stamp_ns - self._last.stamp_ns) * 1e-9
+            transition = np.asarray(-np.linalg.solve(after, before), dtype=np.float64)
+            self._vibration.predict(transition, dt_s, self.noise.vibrates)
+
+    def reported(self, state: NavState) -> NavState:
+        """The state of the last frame with the covariance that vibration gives it."""
+        return self._vibration.added_to(state)
+
     def learn(self, state: NavState) -> None:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction."""
         if self._last is not None and self._predicted is not None:
             dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
             self.noise.learn(self._predicted, state, dt_s)
+            if self.noise.vibrates or not self._vibration.vanishes:
+                assert self._predicted.covariance is not None
+                assert state.covariance is not None
+                self._vibration.correct(self._predicted.covariance, state.covariance)
         self._last = state
 
     def _params(

@@ -95,7 +95,7 @@ class SmootherEngine:
             propagation.append_frame(ahead, self._context.imu, stamp_ns, still)
             predicted = self._predicted(ahead)
         if stamp_ns - window.stamp_ns < self._policy.spacing_s * 1e9:
-            return predicted
+            return propagation.reported(predicted)
         with report.timed("cost"):
             if still:
                 new = self._pause(window.tracks, ahead, frame)
@@ -108,7 +108,7 @@ class SmootherEngine:
         with report.timed("covariance"):
             state = self._advance(window, ahead, predicted)
         propagation.learn(state)
-        return state
+        return propagation.reported(state)
 
     def _predicted(self, ahead: Window) -> NavState:
         """The new state and its covariance before any image is used."""

@@ -35,7 +35,11 @@ from slam_graph.backend.initialization.dynamic_start import (
 )
 from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance
 from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
-from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
+from slam_graph.backend.marginalization.marginalize import (
+    LinearizationPoints,
+    marginalize,
+    relative_to,
+)
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.gauss_newton import linearized, minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
@@ -134,15 +138,17 @@ class DynamicRefinement:
         if self._context.algorithm.marginalization.first_estimates:
             points = "first"
         prior = marginalize(posterior, cost.state, keep, points)
+        # the first state that is reported defines the world, not that where the window began
+        sigmas = MOTION_PRIOR.position_m, MOTION_PRIOR.yaw_rad
         start = Window(
             last,
             frames.stamps_ns[-1],
             cost.state,
-            prior,
+            relative_to(prior, cost.state, X(last), sigmas),
             state_features=features,
             calibration=calibration,
         )
-        found = prior.marginal(imu_state_keys(last))
+        found = start.prior.marginal(imu_state_keys(last))
         return _doubt(_normalized_cost(linear), scale_sigma, found) or start
 
     def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> _BatchCost:

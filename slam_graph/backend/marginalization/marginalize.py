@@ -75,6 +75,32 @@ def relinearized(prior: SquareRootInformation, state: State) -> SquareRootInform
     return SquareRootInformation(prior.layout, triangularize(Rd))
 
 
+def relative_to(
+    prior: SquareRootInformation, state: State, pose: int, sigmas: tuple[float, float]
+) -> SquareRootInformation:
+    """The same prior, but with position and yaw of a pose as what defines the world.
+
+    Position and yaw of the world are set free, which leaves what is known of everything else, and
+    then fixed anew (an S-transformation: Baarda 1973).
+
+    Args:
+        prior: over offsets from the linearisation points.
+        state: the variables.
+        pose: key of the pose.
+        sigmas: of position (m) and yaw (rad) of the pose from now on.
+    """
+    count, layout = prior.layout.size, prior.layout
+    free = np.zeros((count + 1, 4))
+    free[:-1] = prior.R @ unobservable_directions(state.first, layout)
+    rest = triangularize(np.hstack([free, prior.Rd]))[4:, 4:]
+    fixed, columns = np.zeros((4, count + 1)), layout.indices([pose])
+    fixed[:3, columns[3:]] = np.eye(3) / sigmas[0]
+    body_R_world = state.first.atPose3(pose).rotation().matrix().T
+    fixed[3, columns[:3]] = body_R_world @ UP / sigmas[1]
+    fixed[:, -1] = fixed[:, :-1] @ state.offset(layout)
+    return SquareRootInformation(layout, triangularize(np.vstack([rest, fixed])))
+
+
 LinearizationPoints = Literal["first", "current", "corrected"]
 """Where variables of the prior are linearised (see `marginalize`)."""
 

@@ -136,7 +136,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     keyframes = log.keyframes
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
         raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
-    longest = task.config.max_keyframes
+    longest, began_ns = task.config.max_keyframes, causal.stamps_ns[0]
     causal = _extended_backward(log, causal, task, report)
     history = StateHistory()
     states: list[NavState] = []  # of the last segment, from its anchor on
@@ -147,7 +147,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         if not _overlaps(causal, stamps_ns):
             continue
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
-        anchor = int(np.searchsorted(stamps_ns[:-1], causal.stamps_ns[0]))
+        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns))
         begin, link = 0, None
         if states:
             anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
