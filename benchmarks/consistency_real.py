@@ -17,17 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.flights import FLIGHTS
+from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera, without_start
 from benchmarks.metric import EXACT, Metric, info
-from benchmarks.recordings import FIRST_HELD_OUT_SEED, is_held_out
+from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.running import Run
 from benchmarks.suite import PEERS, RECURSIVE, Benchmark, Outcome
-from slam_graph.datasets import dataset_from_arrays
-from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation import ape, nees_of_run
-from slam_graph.sensors import FeatureFrame, ImuData
-from slam_graph.simulation import simulate
-from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
 SECONDS = 30.0
 SMOOTHED_WITH = "msckf"
@@ -81,8 +76,8 @@ def measure(
     with ProcessPoolExecutor() as pool:
         found = list(pool.map(flown, *zip(*tasks, strict=True)))
     for (path, cameras, name, _), runs in zip(tasks, found, strict=True):
-        held_out = is_held_out("/".join(path.parts[-2:]))
-        flight = f"{path.name}.{'mono' if cameras == 1 else 'stereo'}"
+        held_out = flight_is_held_out(path)
+        flight = f"{path.name}.{KIND[cameras]}"
         for what, run in zip((name, f"smoothed_{name}"), runs, strict=False):
             judged = name not in PEERS
             outcome.add(f"{flight}.{what}", figures_of(run), judged, held_out)
@@ -93,18 +88,10 @@ def measure(
 
 def flown(path: Path, cameras: int, algorithm: str, seconds: float) -> list[Consistency]:
     """A causal run, and the smoothed trajectory if it is judged."""
-    held_out = is_held_out("/".join(path.parts[-2:]))
-    sequence = simulate(
-        trajectory=str(path),
-        real_imu=True,
-        cameras=cameras,
-        rate_hz=20.0,
-        duration_s=seconds,
-        tracks={"features": 150, "pixel_sigma": 1.0},
-        seed=FIRST_HELD_OUT_SEED if held_out else 0,
-    )
+    seed = FIRST_HELD_OUT_SEED if flight_is_held_out(path) else 0
+    sequence = flown_by_camera(path, cameras, seed, duration_s=seconds)
     smoothed = algorithm == SMOOTHED_WITH
-    run = Run(_without_start(sequence), algorithm, cameras, final_ba=smoothed)
+    run = Run(without_start(sequence), algorithm, cameras, final_ba=smoothed)
     if not run.ok:
         return [Consistency(np.nan, _UNKNOWN, _UNKNOWN, run.result.message)]
     found = [_judged(run, smoothed=False)]
@@ -118,20 +105,6 @@ def figures_of(run: Consistency) -> Iterator[Metric]:
     for part, mean, late in zip(PARTS, run.nees, run.late, strict=True):
         yield Metric(f"nees_{part}", mean, "", "lower", NEES_BAR)
         yield info(f"nees_{part}_late", late, "")
-
-
-def _without_start(sequence: SimulatedSequence) -> Sequence:
-    """The recording without the state that comes with it."""
-    packets = list(sequence.packets())
-    imu = ImuData.concatenate([packet.imu for packet in packets])
-    return dataset_from_arrays(
-        sequence.rig,
-        imu_stamps_ns=imu.stamps_ns,
-        gyro=imu.gyro,
-        accel=imu.accel,
-        features=[p.frame for p in packets if isinstance(p.frame, FeatureFrame)],
-        groundtruth=sequence.groundtruth(),
-    )
 
 
 def _judged(run: Run, smoothed: bool) -> Consistency:

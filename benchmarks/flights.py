@@ -7,6 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.recordings import is_held_out
+from slam_graph.datasets import dataset_from_arrays
+from slam_graph.datasets.sequence import Sequence
+from slam_graph.sensors import FeatureFrame, ImuData
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
@@ -49,6 +52,20 @@ def flown_by_camera(
         tracks={"features": 150, "pixel_sigma": pixel_sigma},
         shutter_readout_s=readout_s,
         seed=seed,
+    )
+
+
+def without_start(sequence: SimulatedSequence) -> Sequence:
+    """The recording without the state that comes with it."""
+    packets = list(sequence.packets())
+    imu = ImuData.concatenate([packet.imu for packet in packets])
+    return dataset_from_arrays(
+        sequence.rig,
+        imu_stamps_ns=imu.stamps_ns,
+        gyro=imu.gyro,
+        accel=imu.accel,
+        features=[p.frame for p in packets if isinstance(p.frame, FeatureFrame)],
+        groundtruth=sequence.groundtruth(),
     )
 
 
