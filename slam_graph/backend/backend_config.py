@@ -130,6 +130,10 @@ class PriorConfig(Settings):
     """Accelerometer bias, m/s²."""
 
 
+UnknownScale = Literal["wait", "go_on"]
+"""What a start with one camera does as long as the scale is not known."""
+
+
 class InitializationConfig(Settings):
     """How the first state is found."""
 
@@ -143,6 +147,10 @@ class InitializationConfig(Settings):
     but is more accurate."""
     static_window_s: float = expert(1.0, gt=0)
     """How long the platform must stand still for a static start."""
+    unknown_scale: UnknownScale = expert("wait")
+    """With one camera, as long as motion does not show the scale to 5 %. wait: no state. go_on:
+    begin as soon as it is known to 50 %, which the covariances say; when later motion shows it to
+    5 % and contradicts the estimate, begin again in another world."""
     prior: PriorConfig = PriorConfig()
     """Uncertainty of the first state of a static start."""
     fix_gauge: bool = expert(True)
@@ -161,7 +169,7 @@ class InitializationConfig(Settings):
             ("frame_spacing_s", "FRAME_SPACING_S", "initializer"),
             ("retry_s", "RETRY_S", "initializer"),
             ("features", "MAX_FEATURES", "dynamic_refinement"),
-            ("min_features", "MIN_FEATURES", "dynamic_start"),
+            ("min_features", "MIN_FEATURES", "start_diagnosis"),
             ("max_normalized_cost", "MAX_NORMALIZED_COST", "dynamic_refinement"),
             ("max_velocity_sigma", "MAX_VELOCITY_SIGMA", "dynamic_refinement"),
             ("max_scale_sigma", "MAX_SCALE_SIGMA", "dynamic_refinement"),

@@ -29,6 +29,7 @@ from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
+from slam_graph.backend.initialization.start_review import StartReview
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
@@ -39,7 +40,6 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import (
     CalibrationEstimate,
     FeatureFrame,
-    FeatureObservations,
     ImuBuffer,
     ImuData,
     Rig,
@@ -63,8 +63,8 @@ class Estimator:
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
         rig: the sensors, as calibrated or corrected at the start.
-        replayed: where the last frame led to a beginning with another calibration, the states of
-            the frames of the last seconds, which supersede all states before; else None.
+        replayed: where the last frame led to a new beginning, with another calibration or from a
+            better solution of the start, the states that supersede all states before; else None.
         states: all that the last frame led to: one, none, or several where frames have waited.
         solved_ns: stamp of the frame that the last state is of, on the clock of the cameras.
     """
@@ -123,6 +123,7 @@ class Estimator:
         self._initializer = Initializer(context, self._start_mode)
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
+        self._review: StartReview | None = None
         self.window: Window | None = None
 
     # --- input -----------------------------------------------------------------------------------
@@ -138,7 +139,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        self._given = state
+        self._given, self._review = state, None
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
 
@@ -193,7 +194,11 @@ class Estimator:
             return None
         self._latest_ns = stamp_ns
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
-        frame = self._usable(frame)
+        frame, bad = frame.usable(len(self.rig.cameras))
+        if bad:
+            self.diagnostics.warn(
+                "feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns"
+            )
         found = self._check.add(frame, imu, self.window is not None)
         if found is not None:
             return self._begin_anew(found)
@@ -203,7 +208,8 @@ class Estimator:
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
-            return self._engine.step(self.window, stamp_ns, frame, still, self._report)
+            stepped = self._engine.step(self.window, stamp_ns, frame, still, self._report)
+            return self._reviewed(stamp_ns, frame, stepped)
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
@@ -271,23 +277,23 @@ class Estimator:
             window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
+            if self._initializer.scale_sigma is not None and self._held is None:
+                scale_sigma = self._initializer.scale_sigma
+                self._review = StartReview(self._context, stamp_ns, scale_sigma)
         return window
 
-    def _usable(self, frame: FeatureFrame) -> FeatureFrame:
-        """The frame with all cameras of the rig, without observations that are not finite."""
-        missing = len(self.rig.cameras) - len(frame.cameras)
-        if missing > 0:
-            empty = (FeatureObservations.empty(),) * missing
-            frame = FeatureFrame(frame.stamp_ns, frame.cameras + empty)
-        good = [
-            np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in frame.cameras
-        ]
-        bad = sum(int(np.sum(~rows)) for rows in good)
-        if not bad:
-            return frame
-        self.diagnostics.warn("feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns")
-        cameras = (c.select(rows) for c, rows in zip(frame.cameras, good, strict=True))
-        return FeatureFrame(frame.stamp_ns, tuple(cameras))
+    def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
+        """The state, or that of a new beginning if what followed the start contradicts it."""
+        if self._review is None:
+            return state
+        with self._report.timed("start"):
+            window = self._review.better(stamp_ns, frame, state)
+        self._review = None if self._review.done else self._review
+        if window is None:
+            return state
+        self.window, self._engine = window, self._make_engine(self._context)
+        self.replayed = self.states = [window.current(window.prior)]
+        return self.replayed[0]
 
     # --- output ----------------------------------------------------------------------------------
 

@@ -159,6 +159,24 @@ class FeatureFrame:
         cameras = (c.select(np.isin(c.ids, ids)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
+    def usable(self, cameras: int) -> tuple[FeatureFrame, int]:
+        """The frame with as many cameras, without observations that are not finite.
+
+        Args:
+            cameras: of the rig; those that are missing have no observations.
+
+        Returns:
+            The frame, and how many observations were left out.
+        """
+        missing = (FeatureObservations.empty(),) * (cameras - len(self.cameras))
+        seen = self.cameras + missing
+        good = [np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in seen]
+        bad = sum(int(np.sum(~rows)) for rows in good)
+        if not bad:
+            return (FeatureFrame(self.stamp_ns, seen) if missing else self), 0
+        finite = (c.select(rows) for c, rows in zip(seen, good, strict=True))
+        return FeatureFrame(self.stamp_ns, tuple(finite)), bad
+
     def without(self, ids: IntArray) -> FeatureFrame:
         """The frame without these features."""
         if len(ids) == 0:

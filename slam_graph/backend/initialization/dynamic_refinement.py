@@ -17,10 +17,10 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.backend_config import PriorConfig
+from slam_graph.backend.backend_config import PriorConfig, UnknownScale
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
@@ -61,6 +61,8 @@ MAX_VELOCITY_SIGMA = 0.1
 """Largest accepted standard deviation of the velocity, m/s."""
 MAX_SCALE_SIGMA = 0.05
 """Largest accepted standard deviation of the scale, relative to it."""
+ROUGH_SCALE_SIGMA = 0.5
+"""The same for a start without a metre scale (`initialization.unknown_scale: go_on`)."""
 _MAX_STEP_LEFT = 0.3
 """Longest accepted step that is left at the end, in σ: with more the steps have not converged."""
 _BEST_FEATURES = 0.1
@@ -99,16 +101,20 @@ class DynamicRefinement:
 
     Attributes:
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
+        scale_sigma: relative standard deviation of the scale of the last solution.
     """
 
-    def __init__(self, context: EngineContext) -> None:
+    def __init__(self, context: EngineContext, unknown_scale: UnknownScale) -> None:
         """Prepare for attempts.
 
         Args:
             context: shared with the engine.
+            unknown_scale: as in `initialization.unknown_scale`.
         """
         self.outliers = np.zeros(0, np.int64)
+        self.scale_sigma = float("inf")
         self._context = context
+        self._max_scale_sigma = MAX_SCALE_SIGMA if unknown_scale == "wait" else ROUGH_SCALE_SIGMA
 
     def refine(self, frames: StartFrames, guess: StartGuess) -> Window | Refusal:
         """The window that begins with the last frame, or what is missing for it.
@@ -128,7 +134,7 @@ class DynamicRefinement:
             self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
             posterior, linear = linearized(cost), cost.linearize()
-            scale_sigma = _scale_sigma(cost, linear, posterior)
+            self.scale_sigma = _scale_sigma(cost, linear, posterior)
         except np.linalg.LinAlgError:
             return Refusal("motion", "motion that determines gravity and scale")
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
@@ -148,8 +154,30 @@ class DynamicRefinement:
             state_features=features,
             calibration=calibration,
         )
-        found = start.prior.marginal(imu_state_keys(last))
-        return _doubt(_normalized_cost(linear), scale_sigma, found) or start
+        return self._doubt(_normalized_cost(linear), start) or start
+
+    def _doubt(self, normalized_cost: float, start: Window) -> Refusal | None:
+        """What is missing if a solution cannot be trusted; None if it can.
+
+        Args:
+            normalized_cost: mean squared residual, σ².
+            start: the window that would begin.
+        """
+        last = start.prior.marginal(imu_state_keys(start.frame))
+        if not np.linalg.norm(last.d) < _MAX_STEP_LEFT:
+            return Refusal("fit", "steps that converge")
+        if normalized_cost > MAX_NORMALIZED_COST:
+            needs = f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
+            return Refusal("fit", needs)
+        velocity_sigma = float(np.sqrt(np.max(np.diag(last.covariance())[6:9])))
+        speed = float(np.linalg.norm(start.state.estimate.atVector(V(start.frame))))
+        if velocity_sigma > max(MAX_VELOCITY_SIGMA, self._max_scale_sigma * speed):
+            needs = f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
+            return Refusal("motion", needs)
+        if self.scale_sigma > self._max_scale_sigma:
+            needs = f"more motion (scale is known to {self.scale_sigma:.0%} only)"
+            return Refusal("motion", needs)
+        return None
 
     def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> _BatchCost:
         """All states of the window, a prior on the first, and the static features they see."""
@@ -219,30 +247,6 @@ def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: Bo
     chosen[order] = good[order]
     nothing = np.zeros(len(good), np.bool_)
     cost.tracks = TrackFeatures(obs, result.points, nothing).subset(chosen)
-
-
-def _doubt(
-    normalized_cost: float, scale_sigma: float, last: SquareRootInformation
-) -> Refusal | None:
-    """What is missing if the solution cannot be trusted; None if it can.
-
-    Args:
-        normalized_cost: mean squared residual, σ².
-        scale_sigma: relative standard deviation of the scale.
-        last: what is known of the last state, over an increment of its estimate.
-    """
-    velocity_sigma = float(np.sqrt(np.max(np.diag(last.covariance())[6:9])))
-    if not np.linalg.norm(last.d) < _MAX_STEP_LEFT:
-        return Refusal("fit", "steps that converge")
-    if normalized_cost > MAX_NORMALIZED_COST:
-        return Refusal("fit", f"images and IMU to agree (normalised cost {normalized_cost:.1f})")
-    if velocity_sigma > MAX_VELOCITY_SIGMA:
-        return Refusal(
-            "motion", f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
-        )
-    if scale_sigma > MAX_SCALE_SIGMA:
-        return Refusal("motion", f"more motion (scale is known to {scale_sigma:.0%} only)")
-    return None
 
 
 def _prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import IntArray
+from slam_graph.backend.backend_config import UnknownScale
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
@@ -38,21 +39,30 @@ _LONGEST = 2.0
 
 
 class Initializer:
-    """Collects frames and tries to start from them."""
+    """Collects frames and tries to start from them.
 
-    def __init__(self, context: EngineContext, mode: str) -> None:
+    Attributes:
+        scale_sigma: relative standard deviation of the scale of a start in motion; None before it,
+            and for a start from standstill.
+    """
+
+    def __init__(
+        self, context: EngineContext, mode: str, unknown_scale: UnknownScale | None = None
+    ) -> None:
         """Start with no frames.
 
         Args:
             context: shared with the engine; `context.imu` has the samples up to each frame.
             mode: which starts are tried, as in `initialization.mode`.
+            unknown_scale: takes the place of `initialization.unknown_scale`.
         """
+        self.scale_sigma: float | None = None
         self._refusal = Refusal("frames", "the first frames")
         self._latest: tuple[int, FeatureFrame] | None = None
         self._context = context
         self._config = context.config.initialization
         self._mode = mode
-        self._refinement = DynamicRefinement(context)
+        self._refinement = DynamicRefinement(context, unknown_scale or self._config.unknown_scale)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns = 0
@@ -133,7 +143,11 @@ class Initializer:
             context.config.noise,
             self._rng,
         )
-        return guess if isinstance(guess, Refusal) else self._refinement.refine(frames, guess)
+        if isinstance(guess, Refusal):
+            return guess
+        found = self._refinement.refine(frames, guess)
+        self.scale_sigma = None if isinstance(found, Refusal) else self._refinement.scale_sigma
+        return found
 
     def _forget(self, stamp_ns: int, length_ns: int) -> None:
         """Forget frames before the window, but the last of them if none is at its beginning."""

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Review of a start in motion: the first seconds are solved again from the frames that follow it.
+
+The batch problem of a start over frames after it gives velocity and direction of gravity a second
+time. If these contradict the estimate, the start was wrong, and the estimator goes on from the new
+solution. After a start without a metre scale this waits until the scale is known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import null_space
+
+from slam_graph.arrays import FloatArray, skew
+from slam_graph.backend.cost.gating import threshold
+from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.dynamic_refinement import MAX_SCALE_SIGMA
+from slam_graph.backend.initialization.initializer import Initializer
+from slam_graph.backend.marginalization.marginalize import UP
+from slam_graph.backend.window import Window
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
+
+_CONFIDENCE = 0.9999
+"""Of the χ² tests: velocities and tilts of two solutions differ by more with 1e-4."""
+_LEAST = np.array([0.1, np.deg2rad(2.0)])
+"""Velocities (m/s) and tilts (rad) that differ by less are left to the filter: what images have in
+common over some frames, as in a dark second, contradicts a velocity that is known to 1 mm/s.
+"""
+_GIVE_UP_NS = 5_000_000_000
+"""A start whose scale is known is compared within this time or not at all."""
+
+
+class StartReview:
+    """Compares a start in motion with a solution of what follows.
+
+    Attributes:
+        done: whether there is nothing left to compare.
+    """
+
+    def __init__(self, context: EngineContext, stamp_ns: int, scale_sigma: float) -> None:
+        """Begin after a start.
+
+        Args:
+            context: shared with the engine.
+            stamp_ns: time of the start, on the clock of the IMU.
+            scale_sigma: relative standard deviation of its scale.
+        """
+        self.done = False
+        self._begun_ns = stamp_ns
+        self._without_scale = scale_sigma > MAX_SCALE_SIGMA
+        self._initializer = Initializer(context, "motion", "wait")
+        self._diagnostics = context.diagnostics
+        if self._without_scale:
+            message = f"start with a scale that is known to {scale_sigma:.0%} only"
+            self._diagnostics.warn("scale_unknown", message)
+
+    def better(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> Window | None:
+        """A window to go on from, if the start was wrong.
+
+        Args:
+            stamp_ns: time of the frame on the clock of the IMU.
+            frame: its features.
+            state: the estimate at the frame, with its covariance.
+        """
+        self.done = not self._without_scale and stamp_ns - self._begun_ns > _GIVE_UP_NS
+        window = None if self.done else self._initializer.try_to_start(stamp_ns, frame)
+        if window is None:
+            return None
+        self.done = True
+        if not contradict(state, window.current(window.prior)):
+            return None
+        seconds = (stamp_ns - self._begun_ns) * 1e-9
+        self._diagnostics.warn(
+            "start_corrected",
+            f"what follows the start contradicts it; solved again {seconds:.1f} s later",
+        )
+        return window
+
+
+def contradict(one: NavState, other: NavState) -> bool:
+    """Whether velocity or direction of gravity of two estimates differ clearly and by much.
+
+    Both are compared in the body frame, as worlds may differ in yaw and position.
+
+    Args:
+        one: with its covariance.
+        other: the same, of the same time.
+    """
+    (x, P), (y, Q) = _in_body(one), _in_body(other)
+    difference, S = x - y, P + Q
+    across = null_space(x[None, 3:]).T  # the two directions of a tilt
+    tilt, tilt_S = across @ difference[3:], across @ S[3:, 3:] @ across.T
+    squares = [
+        difference[:3] @ np.linalg.solve(S[:3, :3], difference[:3]),
+        tilt @ np.linalg.solve(tilt_S, tilt),
+    ]
+    far = np.array([np.linalg.norm(difference[:3]), np.linalg.norm(tilt)]) > _LEAST
+    return bool(np.any(far & (squares > threshold(np.array([3, 2]), _CONFIDENCE))))
+
+
+def _in_body(state: NavState) -> tuple[FloatArray, FloatArray]:
+    """Velocity (m/s) and upward direction (6,) in the body frame, and their covariance (6, 6)."""
+    assert state.covariance is not None
+    body_R_world = state.world_T_body.rotation().matrix().T
+    seen = np.array([state.velocity, UP]) @ body_R_world.T
+    J = np.zeros((6, 15))
+    J[:3, :3], J[3:, :3] = skew(seen)
+    J[:3, 6:9] = body_R_world
+    return np.ravel(seen), J @ state.covariance @ J.T
