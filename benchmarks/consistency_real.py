@@ -11,13 +11,19 @@ hardly depend on the algorithm of the run, so that only those of one are judged.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera, without_start
+from benchmarks.flights import (
+    FLIGHTS,
+    KIND,
+    flight_is_held_out,
+    flown_by_camera,
+    in_parallel,
+    without_start,
+)
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.running import Run
@@ -73,8 +79,7 @@ def measure(
         for cameras in (1, 2)
         for name in algorithms
     ]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(flown, *zip(*tasks, strict=True)))
+    found = in_parallel(flown, tasks)
     for (path, cameras, name, _), runs in zip(tasks, found, strict=True):
         held_out = flight_is_held_out(path)
         flight = f"{path.name}.{KIND[cameras]}"

@@ -4,7 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from collections.abc import Sequence as Tasks
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 from benchmarks.recordings import is_held_out
 from slam_graph.datasets import dataset_from_arrays
@@ -72,3 +76,12 @@ def without_start(sequence: SimulatedSequence) -> Sequence:
 def flight_is_held_out(path: Path) -> bool:
     """Whether the flight in a folder is kept out of choices."""
     return is_held_out("/".join(path.parts[-2:]))
+
+
+_Found = TypeVar("_Found")
+
+
+def in_parallel(measure: Callable[..., _Found], tasks: Tasks[tuple[Any, ...]]) -> list[_Found]:
+    """What a function finds for each of some arguments, in as many processes as there are cores."""
+    with ProcessPoolExecutor() as pool:
+        return list(pool.map(measure, *zip(*tasks, strict=True)))

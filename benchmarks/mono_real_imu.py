@@ -9,14 +9,19 @@ is given. Flights that are held out get seeds that are, too.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.flights import FLIGHTS, flight_is_held_out, flown_by_camera, without_start
+from benchmarks.flights import (
+    FLIGHTS,
+    flight_is_held_out,
+    flown_by_camera,
+    in_parallel,
+    without_start,
+)
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.running import Run
@@ -68,8 +73,7 @@ def measure(data: Path, seeds: int = SEEDS, duration_s: float | None = None) -> 
         for row, begin in zip(rows, first, strict=True)
         for k in range(seeds)
     ]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(fly, *zip(*tasks, strict=True)))
+    found = in_parallel(fly, tasks)
     for k, (path, name) in enumerate(rows):
         runs, label = found[k * seeds : (k + 1) * seeds], f"{path.name}.{name}"
         outcome.add(label, figures_of(runs), name == WITH_FINAL_BA, flight_is_held_out(path))

@@ -10,13 +10,12 @@ that knows nothing of rows would say.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.flights import KIND, flight_is_held_out, flown_by_camera
+from benchmarks.flights import KIND, flight_is_held_out, flown_by_camera, in_parallel
 from benchmarks.metric import Metric, info
 from benchmarks.running import Errors, Run
 from benchmarks.suite import RECURSIVE, Benchmark, Outcome
@@ -63,8 +62,7 @@ def measure(data: Path, duration_s: float = DURATION_S) -> Outcome:
         for cameras in (1, 2)
         for algorithm in RECURSIVE
     ]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(figures_of, *zip(*tasks, strict=True)))
+    found = in_parallel(figures_of, tasks)
     for (path, cameras, algorithm, _), figures in zip(tasks, found, strict=True):
         held_out = flight_is_held_out(path)
         outcome.add(f"{path.name}.{KIND[cameras]}.{algorithm}", figures, held_out=held_out)

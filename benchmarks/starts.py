@@ -12,7 +12,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera
+from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera, in_parallel
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
@@ -105,8 +104,7 @@ def measure(data: Path, spacing_s: float = SPACING_S) -> Outcome:
         for cameras in (1, 2)
         for sigma in (1.0, 0.5)
     ]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(starts_of, *zip(*tasks, strict=True)))
+    found = in_parallel(starts_of, tasks)
     together: dict[tuple[int, bool], list[Start]] = {}
     for (path, cameras, sigma, _), starts in zip(tasks, found, strict=True):
         held_out = flight_is_held_out(path)

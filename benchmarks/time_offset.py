@@ -10,13 +10,12 @@ with the right stamps are the reference.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera
+from benchmarks.flights import FLIGHTS, KIND, flight_is_held_out, flown_by_camera, in_parallel
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
@@ -61,8 +60,7 @@ def measure(data: Path) -> Outcome:
     """
     outcome = Outcome()
     tasks = [(data / flight, cameras) for flight in FLIGHTS for cameras in (1, 2)]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(runs_of, *zip(*tasks, strict=True)))
+    found = in_parallel(runs_of, tasks)
     for (path, cameras), runs in zip(tasks, found, strict=True):
         held_out = flight_is_held_out(path)
         name = f"{path.name}.{KIND[cameras]}"
