@@ -63,10 +63,9 @@ class Estimator:
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
         rig: the sensors, as calibrated or corrected at the start.
-        replayed: where the last frame led to a new beginning, with another calibration or from a
-            better solution of the start, the states that supersede all states before; else None.
+        replayed: the states that supersede all before, if the last frame led to a new beginning.
         states: all that the last frame led to: one, none, or several where frames have waited.
-        solved_ns: stamp of the frame that the last state is of, on the clock of the cameras.
+        solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
     """
 
     def __init__(
@@ -140,6 +139,7 @@ class Estimator:
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
         self._given, self._review = state, None
+        self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
 
@@ -196,20 +196,18 @@ class Estimator:
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
-            self.diagnostics.warn(
-                "feature_not_finite", f"{bad} observations at {frame.stamp_ns} ns"
-            )
+            self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
         found = self._check.add(frame, imu, self.window is not None)
         if found is not None:
             return self._begin_anew(found)
         self._context.propagation.noise.watch_vibration(imu, stamp_ns)
-        still = self._standstill.is_still(imu, stamp_ns, frame)
+        still, whole = self._standstill.is_still(imu, stamp_ns, frame), frame
         frame = frame.without(self._standstill.dynamic)
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still, self._report)
-            return self._reviewed(stamp_ns, frame, stepped)
+            return self._reviewed(stamp_ns, whole, stepped)
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
@@ -224,9 +222,8 @@ class Estimator:
             self._variables = found.variables
         given, frames = self._given, list(self._check.recent)
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
-            # too long ago: the IMU alone would have to lead from there to here
-            given = self._given = None
-            self._start_mode = "auto"
+            # the IMU alone would have to lead from there to here
+            given, self._given, self._start_mode = None, None, "auto"
         if self.window is not None:
             self._output_ns = self.window.stamp_ns
         for rounds_left in reversed(range(_ROUNDS)):
@@ -236,7 +233,10 @@ class Estimator:
             self._held = deque(frames)
             states = self._take_held(self._held)
             better = self.calibration
-            if not rounds_left or better is None or not self._moved_far(better.rig):
+            if not rounds_left or better is None:
+                break
+            change_s = better.rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
+            if abs(change_s) <= _REPEATED_S:
                 break
             # the first linearisation points were those of an offset some milliseconds off
             self.rig = better.rig
@@ -250,11 +250,6 @@ class Estimator:
         self._output_ns = states[-1].stamp_ns
         return states[-1]
 
-    def _moved_far(self, rig: Rig) -> bool:
-        """Whether the time offset of a rig is far from that which the start was made with."""
-        change_s = rig.cameras[0].time_offset_s - self.rig.cameras[0].time_offset_s
-        return abs(change_s) > _REPEATED_S
-
     def _take_held(self, held: deque[FeatureFrame], early_ns: int = 0) -> list[NavState]:
         """States at the frames whose time the IMU has reached, or will within `early_ns`."""
         states: list[NavState] = []
@@ -264,9 +259,14 @@ class Estimator:
             offset_ns = round(rig.cameras[0].clock_offset_s * 1e9)
             if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break
+            corrected = self.replayed
             state = self._take(held.popleft())
+            if self.replayed is not corrected:  # what came before is superseded
+                states.clear()
             if state is not None:
                 states.append(state)
+        if self.replayed is not None:
+            self.replayed = states
         return states
 
     def _try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
@@ -277,21 +277,24 @@ class Estimator:
             window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
-            if self._initializer.scale_sigma is not None and self._held is None:
-                scale_sigma = self._initializer.scale_sigma
+            scale_sigma = self._initializer.scale_sigma
+            if scale_sigma is not None:
                 self._review = StartReview(self._context, stamp_ns, scale_sigma)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
         """The state, or that of a new beginning if what followed the start contradicts it."""
-        if self._review is None:
+        review = self._review
+        if review is None:
             return state
         with self._report.timed("start"):
-            window = self._review.better(stamp_ns, frame, state)
-        self._review = None if self._review.done else self._review
+            window = review.better(stamp_ns, frame, state)
+        self._review = None if review.done else review
         if window is None:
             return state
+        self._standstill.dynamic = review.outliers
         self.window, self._engine = window, self._make_engine(self._context)
+        self._context.propagation.restart()
         self.replayed = self.states = [window.current(window.prior)]
         return self.replayed[0]
 

@@ -9,7 +9,7 @@ with the random walk of the biases (GTSAM's `CombinedImuFactor`); the integratio
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -30,28 +30,35 @@ IMU_GAP_SCALE = 1000.0
 counts."""
 
 
-def _predicted_covariance(
-    factor: gtsam.NonlinearFactor, values: gtsam.Values, covariance: FloatArray
-) -> FloatArray:
-    """The covariance (15, 15) of the state that a dynamics factor predicts.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Transition:
+    """A dynamics factor, linearised: before e + after e' is white noise of 1.
 
-    Args:
-        factor: between the six variables of two IMU states, in the order of
-            `gtsam.CombinedImuFactor`.
-        values: of both states.
-        covariance: (15, 15) of the earlier one: pose, velocity, bias.
+    The errors e and e' of the two states have the tangents of `NavState.covariance`.
+
+    Attributes:
+        before, after: (15, 15).
     """
-    before, after = _jacobians(factor, values)
-    root = np.linalg.solve(after, np.hstack([before @ np.linalg.cholesky(covariance), np.eye(15)]))
-    return np.asarray(root @ root.T, dtype=np.float64)
 
+    before: FloatArray
+    after: FloatArray
 
-def _jacobians(
-    factor: gtsam.NonlinearFactor, values: gtsam.Values
-) -> tuple[FloatArray, FloatArray]:
-    """The whitened Jacobians (15, 15) of a dynamics factor by the earlier and the later state."""
-    A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
-    return np.hstack([A[:, :9], A[:, 18:24]]), np.hstack([A[:, 9:18], A[:, 24:]])
+    @staticmethod
+    def of(factor: gtsam.CombinedImuFactor, values: gtsam.Values) -> _Transition:
+        """That of a factor at the values of its states."""
+        A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
+        before = np.hstack([A[:, :9], A[:, 18:24]])
+        return _Transition(before, np.hstack([A[:, 9:18], A[:, 24:]]))
+
+    def matrix(self) -> FloatArray:
+        """The (15, 15) matrix F of e' = F e + noise."""
+        return np.asarray(-np.linalg.solve(self.after, self.before), dtype=np.float64)
+
+    def predicted(self, covariance: FloatArray) -> FloatArray:
+        """The covariance (15, 15) of the later state from that of the earlier one."""
+        known = self.before @ np.linalg.cholesky(covariance)
+        root = np.linalg.solve(self.after, np.hstack([known, np.eye(15)]))
+        return np.asarray(root @ root.T, dtype=np.float64)
 
 
 def imu_factor(
@@ -72,9 +79,15 @@ class Propagation:
         self.config = config
         self.diagnostics = diagnostics
         self.noise = DynamicsNoise(imu, config.noise)
-        self._vibration = VibrationCovariance(config.noise.imu_scale * imu.accel_noise_density)
+        self._density = config.noise.imu_scale * imu.accel_noise_density
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the last state: the next one is not its successor. What was learned stays."""
+        self._vibration = VibrationCovariance(self._density)
         self._last: NavState | None = None
         self._predicted: NavState | None = None
+        self._still = False
 
     def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
         """Make a new frame the current one.
@@ -98,41 +111,41 @@ class Propagation:
         window.frame, window.stamp_ns = j, stamp_ns
         factor = imu_factor(i, j, pim)
         window.factors.append(factor)
-        self._predicted = None if still else self._with_covariance(predicted, factor, window)
-        self._predict_vibration(factor, window)
+        self._predict_covariance(predicted, factor, window)
+        self._still = still
         if still:
             window.factors += zero_velocity_factors(i, j)
 
-    def _with_covariance(
+    def _predict_covariance(
         self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window
-    ) -> NavState | None:
-        """A prediction from the last state, with its covariance where that is known."""
-        last = self._last
+    ) -> None:
+        """Note the prediction with its covariance, where that of the last state is known."""
+        self._predicted, last = None, self._last
         if last is None or last.covariance is None:
-            return None
-        covariance = _predicted_covariance(factor, window.state.estimate, last.covariance)
-        return replace(predicted, covariance=covariance)
+            return
+        transition = _Transition.of(factor, window.state.estimate)
+        self._predicted = replace(predicted, covariance=transition.predicted(last.covariance))
+        if self._counts_vibration():
+            dt_s = (window.stamp_ns - last.stamp_ns) * 1e-9
+            self._vibration.predict(transition.matrix(), dt_s, self.noise.vibrates)
 
-    def _predict_vibration(self, factor: gtsam.CombinedImuFactor, window: Window) -> None:
-        """Carry what vibration adds to the covariance on to the new frame."""
-        if self._predicted is None or self._last is None:
-            self._vibration.stay()
-        elif self.noise.vibrates or not self._vibration.vanishes:
-            before, after = _jacobians(factor, window.state.estimate)
-            dt_s = (window.stamp_ns - self._last.stamp_ns) * 1e-9
-            transition = np.asarray(-np.linalg.solve(after, before), dtype=np.float64)
-            self._vibration.predict(transition, dt_s, self.noise.vibrates)
+    def _counts_vibration(self) -> bool:
+        return self.noise.vibrates or not self._vibration.vanishes
 
     def reported(self, state: NavState) -> NavState:
         """The state of the last frame with the covariance that vibration gives it."""
         return self._vibration.added_to(state)
 
     def learn(self, state: NavState) -> None:
-        """Adapt the noise of the IMU to the difference of an estimate from its prediction."""
+        """Adapt the noise of the IMU to the difference of an estimate from its prediction.
+
+        Not at a standstill, whose zero velocity is no measurement of images.
+        """
         if self._last is not None and self._predicted is not None:
-            dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
-            self.noise.learn(self._predicted, state, dt_s)
-            if self.noise.vibrates or not self._vibration.vanishes:
+            if not self._still:
+                dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
+                self.noise.learn(self._predicted, state, dt_s)
+            if self._counts_vibration():
                 assert self._predicted.covariance is not None
                 assert state.covariance is not None
                 self._vibration.correct(self._predicted.covariance, state.covariance)

@@ -10,14 +10,15 @@ times). White noise that is as large over seconds would be far too large from fr
 the estimate would follow its images too much.
 
 So the estimate is left as it is, and the error is considered (Schmidt 1966; Maybeck 1979, sec.
-6.8): a first-order Gauss-Markov process c beside the bias of the accelerometer, which the gain does
-not know. With the error e of a state, the transition F of a step and its effect G of the bias on
-pose and velocity, what c adds to the covariance of e follows from
+6.8): a first-order Gauss-Markov process c (m/s², body frame) beside the bias of the accelerometer,
+which is not in the model that the Kalman gain is computed from. With the error e of a state, the
+transition F of a step and its effect G of the bias on pose and velocity, what c adds to the
+covariance of e follows from
 
     e⁻ = F e + G c,    e⁺ = A e⁻,    A = E[e⁺ e⁻ᵀ] (P⁻)⁻¹ = P⁺ (P⁻)⁻¹,
 
-as the error after an optimal step is uncorrelated with the correction. A is the mean response: it
-does not tell apart what the other variables of the window have in common with the state.
+as the error after an optimal step is uncorrelated with the correction. This neglects that c is
+correlated with the other variables of the window.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ _DRIVEN = slice(0, 9)
 
 
 class VibrationCovariance:
-    """The covariance of the errors of a state and of c that a gain has not reckoned with."""
+    """What c adds to the covariance of a state, and its covariance with c.
+
+    Both are one matrix (18, 18): the tangent of `NavState.covariance` (15), then c (3).
+    """
 
     def __init__(self, accel_noise_density: float) -> None:
         """Begin without vibration.
@@ -81,10 +85,6 @@ class VibrationCovariance:
         A = np.eye(18)
         A[_STATE, _STATE] = np.linalg.solve(before, after).T
         self._X = self._ahead = A @ self._ahead @ A.T
-
-    def stay(self) -> None:
-        """At a standstill nothing moves: the last corrected frame goes on."""
-        self._ahead = self._X
 
     def added_to(self, state: NavState) -> NavState:
         """The state of the frame that was predicted or corrected last, with what vibration adds."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import null_space
 
-from slam_graph.arrays import FloatArray, skew
+from slam_graph.arrays import FloatArray, IntArray, skew
 from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.dynamic_refinement import MAX_SCALE_SIGMA
@@ -23,11 +23,11 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
 _CONFIDENCE = 0.9999
-"""Of the χ² tests: velocities and tilts of two solutions differ by more with 1e-4."""
-_LEAST = np.array([0.1, np.deg2rad(2.0)])
-"""Velocities (m/s) and tilts (rad) that differ by less are left to the filter: what images have in
-common over some frames, as in a dark second, contradicts a velocity that is known to 1 mm/s.
-"""
+"""Of the χ² tests. They take the two solutions as independent; both use the frames after the
+start, so that they differ by less."""
+_LEAST_VELOCITY, _LEAST_TILT_RAD = 0.1, np.deg2rad(2.0)
+"""Smaller differences (m/s, rad) are left to the estimator. Errors of images are correlated over
+frames, in a dark second for example, so that χ² alone doubts a velocity that is known to 1 mm/s."""
 _GIVE_UP_NS = 5_000_000_000
 """A start whose scale is known is compared within this time or not at all."""
 
@@ -55,6 +55,11 @@ class StartReview:
         if self._without_scale:
             message = f"start with a scale that is known to {scale_sigma:.0%} only"
             self._diagnostics.warn("scale_unknown", message)
+
+    @property
+    def outliers(self) -> IntArray:
+        """Ids (N,) of the features that did not fit the new solution, ascending."""
+        return self._initializer.outliers
 
     def better(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> Window | None:
         """A window to go on from, if the start was wrong.
@@ -96,7 +101,8 @@ def contradict(one: NavState, other: NavState) -> bool:
         difference[:3] @ np.linalg.solve(S[:3, :3], difference[:3]),
         tilt @ np.linalg.solve(tilt_S, tilt),
     ]
-    far = np.array([np.linalg.norm(difference[:3]), np.linalg.norm(tilt)]) > _LEAST
+    lengths = [np.linalg.norm(difference[:3]), np.linalg.norm(tilt)]
+    far = np.greater(lengths, [_LEAST_VELOCITY, _LEAST_TILT_RAD])
     return bool(np.any(far & (squares > threshold(np.array([3, 2]), _CONFIDENCE))))
 
 
