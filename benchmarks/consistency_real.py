@@ -98,7 +98,8 @@ def flown(path: Path, cameras: int, algorithm: str, seconds: float) -> list[Cons
     smoothed = algorithm == SMOOTHED_WITH
     run = Run(without_start(sequence), algorithm, cameras, final_ba=smoothed)
     if not run.ok:
-        return [Consistency(np.nan, _UNKNOWN, _UNKNOWN, run.result.message)]
+        failed = Consistency(np.nan, _UNKNOWN, _UNKNOWN, run.result.message)
+        return [failed] * (1 + smoothed)
     found = [_judged(run, smoothed=False)]
     return [*found, _judged(run, smoothed=True)] if smoothed else found
 

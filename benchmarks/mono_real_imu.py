@@ -26,6 +26,7 @@ from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.running import Run
 from benchmarks.suite import CORE, Benchmark, Outcome
+from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, nees_of_run
 from slam_graph.geometry import Trajectory
 
@@ -105,7 +106,10 @@ def _scale_error(truth: Trajectory, estimate: Trajectory) -> float:
     """Relative error of the scale of what follows the first seconds."""
     settled = estimate.stamps_ns[0] + round(SETTLED_S * 1e9)
     late = estimate.select(estimate.stamps_ns >= settled)
-    return abs(ape(truth, late, alignment="sim3").similarity.scale - 1.0)
+    try:
+        return abs(ape(truth, late, alignment="sim3").similarity.scale - 1.0)
+    except DataError:  # too little is left
+        return float("nan")
 
 
 def figures_of(runs: list[Flown]) -> Iterator[Metric]:
@@ -118,7 +122,7 @@ def figures_of(runs: list[Flown]) -> Iterator[Metric]:
     smoothed = [run.smoothed_m for run in ended if np.isfinite(run.smoothed_m)]
     if smoothed:
         yield Metric("smoothed", float(np.mean(smoothed)), "m", "lower", SMOOTHED_BAR_M)
-    scale = np.array([run.scale for run in ended] or [np.nan])
+    scale = [run.scale for run in ended if np.isfinite(run.scale)] or [np.nan]
     yield Metric("scale_error", float(np.mean(scale)), "share", "lower", SCALE_BAR)
     for k, part in enumerate(("position", "orientation")):
         nees = float(np.mean([run.nees[k] for run in ended] or [np.nan]))

@@ -10,12 +10,12 @@ has are simulated, on a generated path.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.flights import KIND, in_parallel
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import is_held_out
 from benchmarks.running import Run
@@ -166,10 +166,9 @@ def measure(data: Path) -> Outcome:
     flights = [(str(data / flight), is_held_out(flight)) for flight in BEGUN_S]
     flights.append((GENERATED, False))
     tasks = [(flight, cameras, held) for flight, held in flights for cameras in (1, 2)]
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(figures_of, *zip(*[task[:2] for task in tasks], strict=True)))
+    found = in_parallel(figures_of, [task[:2] for task in tasks])
     for (flight, cameras, held_out), (figures, notes) in zip(tasks, found, strict=True):
-        name = f"{Path(flight).name}.{'mono' if cameras == 1 else 'stereo'}"
+        name = f"{Path(flight).name}.{KIND[cameras]}"
         outcome.add(name, figures, held_out=held_out)
         outcome.notes += [f"{name}.{note}" for note in notes]
     return outcome

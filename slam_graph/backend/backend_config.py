@@ -17,8 +17,8 @@ class AdaptiveNoiseConfig(Settings):
 
     enabled: bool = expert(True)
     """Raise the IMU's noise densities while the images correct its predictions by more than these
-    allow. Switch it off to use the densities of the calibration as they are, for example for an IMU
-    without vibration whose noise was measured."""
+    allow, or the accelerometer vibrates. Switch it off to use the densities of the calibration as
+    they are, for example for an IMU without vibration whose noise was measured."""
 
     moved: ClassVar[Mapping[str, str]] = {
         name: f"is a constant now: {constant} in backend/cost/adaptive_imu_noise.py"

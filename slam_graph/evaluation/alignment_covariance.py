@@ -7,8 +7,8 @@ estimate are relative to its first state, where they vanish. An error against a 
 relative to whatever the alignment fits, and needs another covariance.
 
 The alignment here fits the smoothed trajectory to the truth over the whole run, so that it does not
-hang on the truth's orientation at one time, and carries the causal estimate along. Let the two
-coincide in position and yaw at the first causal state. The smoothed state is the best estimate from
+depend on the truth's orientation at one time. The same transformation is applied to the causal
+estimate. Let the two coincide in position and yaw at the first causal state. The smoothed state is the best estimate from
 all data y, so that its error is uncorrelated with every function of y, and so with d, the
 difference of the two estimates. With e the error of a causal state, s that of the smoothed one, and
 g the part of all errors s that the alignment takes away,
@@ -76,7 +76,7 @@ def aligned_by_smoothed(
 def _excess(causal: FloatArray, smoothed: FloatArray) -> FloatArray:
     """Causal less smoothed covariances (N, 6, 6), zero in directions where they are smaller.
 
-    All data never say less than some. Where they seem to, the two have assumed different noise.
+    With more data a covariance is not larger, unless other noise was assumed.
     """
     L = np.linalg.cholesky(smoothed)
     inverse = np.linalg.inv(L)

@@ -164,7 +164,11 @@ class Estimation:
 
     def finish(self) -> None:
         """Note the states of frames that waited for IMU samples which do not come."""
-        self._append(self.estimator.finish())
+        states = self.estimator.finish()
+        if self.estimator.replayed is None:
+            self._append(states)
+        else:
+            self._result.supersede(states)
 
     def _append(self, states: list[NavState]) -> None:
         for state in states:
@@ -203,6 +207,7 @@ class Estimation:
         logs.innovations.append(stamp_ns, estimator.innovations)
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             result.supersede(estimator.replayed)
+            self._agreement = Agreement(result.config.limits)
             result.corrected_rig = estimator.corrected_rig
             result.start_was_given &= estimator.start_is_given
         if frame.state is not None:

@@ -191,6 +191,7 @@ class Localization(Stage):
             DataError: if the run has descriptors of another kind than the map.
         """
         if frame.restarted:
+            self._count()
             self._localizer = self._new_localizer()
         state = frame.state
         if state is None or frame.waits:
@@ -231,16 +232,16 @@ class Localization(Stage):
             unknown,
         )
 
-    def finish(self) -> None:
+    def _count(self) -> None:
         """Count the comparisons with the map."""
-        localizer, log = self._localizer, self._log
-        log.count(
-            queries=localizer.queries,
-            matches=localizer.matches,
-            accepted=localizer.accepted,
-            starts=localizer.starts,
-        )
-        if len(log.located) and localizer.queries == 0:
+        names = ("queries", "matches", "accepted", "starts")
+        self._log.count(**{name: getattr(self._localizer, name) for name in names})
+
+    def finish(self) -> None:
+        """Count the comparisons, and say how much was located."""
+        self._count()
+        log = self._log
+        if len(log.located) and log.counts["queries"] == 0:
             self._diagnostics.warn(
                 "localization_impossible",
                 "nothing to recognise places by: no images, and tracks without descriptors",

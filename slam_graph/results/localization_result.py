@@ -68,8 +68,9 @@ class LocalizationLog:
         self._poses.extend([*world_T_body.translation(), *quaternion.coeffs()])
 
     def count(self, **counts: int) -> None:
-        """Set counts, by name."""
-        self.counts |= counts
+        """Add to counts, by name."""
+        for name, number in counts.items():
+            self.counts[name] = self.counts.get(name, 0) + number
 
     def __repr__(self) -> str:
         return f"LocalizationLog({int(self.located.sum())} of {len(self.located)} frames located)"

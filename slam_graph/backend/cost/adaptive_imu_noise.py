@@ -50,9 +50,9 @@ integration takes out, so that this is much smaller than the noise of single sam
 _FEWEST_SAMPLES = 20
 """Fewer samples within that time tell nothing."""
 _THIRD_DIFFERENCE = np.sqrt(20.0)
+"""Standard deviation of the third difference of white noise of 1."""
 _NORMAL_MEDIAN = 0.6745
-"""Standard deviation of the third difference of white noise of 1, and the median of its absolute
-value in units of that."""
+"""Median of the absolute value of a normal variable, in units of its standard deviation."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0

@@ -58,7 +58,8 @@ _MIN_INLIERS = 0.5
 MAX_NORMALIZED_COST = 3.0
 """Largest accepted mean squared residual, in σ²."""
 MAX_VELOCITY_SIGMA = 0.1
-"""Largest accepted standard deviation of the velocity, m/s."""
+"""Largest accepted standard deviation of the velocity, m/s; more at a speed at which the accepted
+error of the scale is more."""
 MAX_SCALE_SIGMA = 0.05
 """Largest accepted standard deviation of the scale, relative to it."""
 ROUGH_SCALE_SIGMA = 0.5

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gyroscope bias of a short window, from epipolar geometry alone.
 
-Rotations are right for which the epipolar planes share one line: for a
+With the right rotation all epipolar planes of two frames share the line of the translation. For a
 pair of frames with relative rotation R, the normals n = f₁ × R f₂ of the epipolar planes are all
 orthogonal to the translation, so the smallest eigenvalue of Σ n nᵀ vanishes (Kneip & Lynen 2013).
 With R integrated from the gyroscope this is a cost in its bias only: no depth, velocity or gravity

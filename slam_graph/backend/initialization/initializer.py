@@ -85,8 +85,8 @@ class Initializer:
         """
         outcome: Window | Refusal = Refusal("frames", "a state to start from (mode 'given')")
         self._latest = stamp_ns, frame
-        self._standstill.is_still(self._context.imu, stamp_ns, frame)
         if self._mode in ("auto", "static"):
+            self._standstill.is_still(self._context.imu, stamp_ns, frame)
             outcome = self._at_rest(stamp_ns)
         if self._mode in ("auto", "motion") and isinstance(outcome, Refusal):
             outcome = self._in_motion(stamp_ns, frame)
@@ -151,7 +151,9 @@ class Initializer:
 
     def _forget(self, stamp_ns: int, length_ns: int) -> None:
         """Forget frames before the window, but the last of them if none is at its beginning."""
-        stamps_ns = self._stamps_ns
+        stamps_ns, imu = self._stamps_ns, self._context.imu
+        while stamps_ns and not imu.covers(stamps_ns[0]):
+            del stamps_ns[0], self._frames[0]
         while stamps_ns and stamps_ns[0] < stamp_ns - length_ns - _SLACK_NS:
             spanned = len(stamps_ns) > 1 and stamps_ns[1] <= stamp_ns - length_ns
             if not spanned and stamps_ns[0] >= stamp_ns - _LONGEST * length_ns:

@@ -101,7 +101,8 @@ def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
 
     The velocity is eliminated; for gravity it is a secular equation in the Lagrange multiplier. Its
     solution is found by Newton's method on the inverse length of g, which is nearly linear in the
-    multiplier, from the left without safeguards (Moré & Sorensen 1983).
+    multiplier, from the left without safeguards (Moré & Sorensen 1983). Normal equations are good
+    enough for samples; `constrained_solution` is for the final one.
 
     Args:
         M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.

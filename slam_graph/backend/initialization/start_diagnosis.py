@@ -23,7 +23,7 @@ _FORCE_RATIO = (0.6, 1.7)
 _HARDLY_PX = 4.0
 """A camera whose features move less over the window hardly moves."""
 _RECENT_NS = 1_500_000_000
-"""What the data of this time show, s."""
+"""Samples and frames of so long before the last frame are looked at."""
 
 
 @dataclass(frozen=True, slots=True)
