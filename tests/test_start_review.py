@@ -105,7 +105,7 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
     assert estimator.diagnostics.counts["start_corrected"] == 1
     error = ape(sequence.groundtruth(), history.trajectory(), alignment="se3")
     assert error.statistics.rmse < 0.05
-    assert np.max(history.sigmas[:, 6:9]) < 0.1
+    assert np.max(history.sigmas()[:, 6:9]) < 0.1
 
 
 def test_a_start_without_a_metre_scale_is_a_choice() -> None:

@@ -8,10 +8,10 @@ relative to whatever the alignment fits, and needs another covariance.
 
 The alignment here fits the smoothed trajectory to the truth over the whole run, so that it does not
 depend on the truth's orientation at one time. The same transformation is applied to the causal
-estimate. Let the two coincide in position and yaw at the first causal state. The smoothed state is the best estimate from
-all data y, so that its error is uncorrelated with every function of y, and so with d, the
-difference of the two estimates. With e the error of a causal state, s that of the smoothed one, and
-g the part of all errors s that the alignment takes away,
+estimate. Let the two coincide in position and yaw at the first causal state. The smoothed state is
+the best estimate from all data y, so that its error is uncorrelated with every function of y, and
+so with d, the difference of the two estimates. With e the error of a causal state, s that of the
+smoothed one, and g the part of all errors s that the alignment takes away,
 
     e - N g = (s - N g) + d,    Cov(e - N g) = Cov(s - N g) + Cov(e) - Cov(s).
 
