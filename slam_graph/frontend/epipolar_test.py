@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, skew
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.outliers import (
     CONFIDENCE,
@@ -110,29 +110,40 @@ class EpipolarTest:
     def _wide_inliers(
         self, before: FloatArray, after: FloatArray, R: FloatArray | None, tolerance_px: float
     ) -> BoolArray:
-        """RANSAC on bearings, with samples of eight matches, or of two if the rotation is known."""
+        """RANSAC on bearings, with samples of eight matches, or of two if the rotation is known.
+
+        Two matches that fit a known rotation exactly tell no direction of motion. At a standstill
+        there may be no others, so no motion at all is a candidate too.
+        """
         count, size = len(before), 8 if R is None else 2
         if count < MIN_POINTS:
             return np.ones(count, np.bool_)
         matches = _Matches.of(before, after, self._camera)
         normals = None if R is None else np.cross(matches.a @ R.T, matches.b)
         best, lowest, drawn, needed = np.ones(count, np.bool_), np.inf, 0, float(_BATCH)
+        if R is not None:
+            unmoved = matches.rotation_distances_px(R)
+            best, lowest = unmoved < tolerance_px, float(_cost(unmoved, tolerance_px))
         while drawn < min(needed, _MAX_SAMPLES):
             samples = np.argsort(self._rng.random((_BATCH, count)), axis=1)[:, :size]
             if R is None or normals is None:
                 motions = _by_eight(matches.a[samples], matches.b[samples])
             else:
                 t = np.cross(normals[samples[:, 0]], normals[samples[:, 1]])
-                motions = _cross_matrices(t) @ R
+                length = np.linalg.norm(t, axis=1)
+                t = t[length > _TINY] / length[length > _TINY, None]
+                motions = skew(t) @ R
+            drawn += _BATCH
+            if len(motions) == 0:
+                continue
             distances = matches.distances_px(motions)
-            costs = np.sum(np.minimum(distances / tolerance_px, 1.0) ** 2, axis=1)  # MSAC
+            costs = _cost(distances, tolerance_px)
             first = int(np.argmin(costs))
             if costs[first] < lowest:
                 lowest, best = costs[first], distances[first] < tolerance_px
                 share = np.count_nonzero(best) / count
                 miss = np.log1p(-min(share**size, 1.0 - _TINY))
                 needed = np.log(1.0 - CONFIDENCE) / min(miss, -_TINY)
-            drawn += _BATCH
         return _refined(matches, best, R, tolerance_px)
 
 
@@ -182,6 +193,28 @@ class _Matches:
         residuals = np.einsum("ni,kni->kn", self.b, self.a @ F.transpose(0, 2, 1))
         return np.asarray(np.abs(residuals) / self.gradients(F))
 
+    def rotation_distances_px(self, R: FloatArray) -> FloatArray:
+        """Distances (N,) in pixels from a rotation R (3, 3) without translation.
+
+        To first order each is the length of the smallest correction of the four pixel coordinates
+        with which b is parallel to R a. It is the largest of Sampson's distances from [t]× R over
+        all directions t orthogonal to b: what fits a rotation fits it with any direction of motion.
+        """
+        turned = self.a @ R.T
+        normals = np.cross(turned, self.b)
+        by_a = np.cross(self.by_a @ R.T, self.b[:, None])
+        by_b = np.cross(turned[:, None], self.by_b)
+        J = np.concatenate([by_a, by_b], axis=1)  # transposed: (N, 4, 3)
+        # The normal is orthogonal to b; a large variance along b keeps the solution orthogonal too
+        S = J.transpose(0, 2, 1) @ J + self.b[:, :, None] * self.b[:, None]
+        weighted = np.linalg.solve(S, normals[:, :, None])[:, :, 0]
+        return np.asarray(np.sqrt(np.maximum(np.sum(normals * weighted, axis=1), 0.0)))
+
+
+def _cost(distances_px: FloatArray, tolerance_px: float) -> FloatArray:
+    """MSAC's cost (...) of distances (..., N): outliers count one, inliers less."""
+    return np.asarray(np.sum(np.minimum(distances_px / tolerance_px, 1.0) ** 2, axis=-1))
+
 
 def _on_sphere(m: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Unit bearings (N, 3) of normalised points (N, 2), and their derivatives (N, 2, 3)."""
@@ -211,16 +244,11 @@ def _fitted(matches: _Matches, near: FloatArray | None) -> FloatArray:
     return np.asarray(_by_eight((matches.a * weights[:, None])[None], matches.b[None])[0])
 
 
-def _cross_matrices(t: FloatArray) -> FloatArray:
-    """Matrices [t]× (K, 3, 3) of vectors (K, 3)."""
-    return np.asarray(np.cross(t[:, None, :], np.eye(3)).transpose(0, 2, 1))
-
-
 def _along(matches: _Matches, R: FloatArray) -> FloatArray:
     """The motion (3, 3) with a known rotation whose direction fits all matches."""
     normals = np.cross(matches.a @ R.T, matches.b)
     _, vectors = np.linalg.eigh(normals.T @ normals)
-    return np.asarray(_cross_matrices(vectors[:, :1].T)[0] @ R)
+    return np.asarray(skew(vectors[:, :1].T)[0] @ R)
 
 
 def _refined(

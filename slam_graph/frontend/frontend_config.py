@@ -112,7 +112,8 @@ class FrontendConfig(Settings):
     outliers: Literal["fundamental", "essential", "magsac", "gyroscope", "none"] = "fundamental"
     """RANSAC between two frames: on the fundamental matrix (7 points), the essential matrix (5),
     the fundamental matrix by MAGSAC++, or the direction of motion under the gyroscope's rotation
-    (2), which needs the fewest inliers."""
+    (2), which needs the fewest inliers. Wide lenses are tested on the sphere, with samples of two
+    matches for `gyroscope` and of eight for all others; `essential` and `magsac` do not apply."""
 
     ransac_px: PositivePixels | None = None
     """Largest epipolar distance of an inlier between two frames; null is 1 px for `klt` and 1.5 px

@@ -137,8 +137,6 @@ class PointPredictor:
 
     def __init__(self, mounted: RigCamera, motion: ImuMotion, config: FrontendConfig) -> None:
         self._camera = mounted.camera
-        wide = mounted.camera.model.sees_sideways
-        self._reach = mounted.camera.max_tangent if wide else MAX_TANGENT
         self._trends: dict[int, tuple[FloatArray, FloatArray]] = {}  # at the last two images
         self.mount(mounted)
         self._motion = motion
@@ -182,7 +180,7 @@ class PointPredictor:
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True
-        sane = np.all(np.abs(m) < self._reach, axis=1)
+        sane = self._camera.within_reach(m, MAX_TANGENT)
         pixels = before.pixels.copy()
         pixels[sane] = self._rolled(m[sane], stamp_ns)
         size = np.array([self._camera.width - 1, self._camera.height - 1])

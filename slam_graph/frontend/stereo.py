@@ -52,6 +52,9 @@ _SEARCH_STEP_PX = 1.0
 MIN_SCORE = 0.6
 """Smallest normalised cross-correlation of a candidate that Lucas-Kanade starts from."""
 
+_FAR_OFF_PX = -1e6
+"""Stands for the pixel of a point that a wide lens does not see."""
+
 LEVELS = 1
 """Pyramid levels of Lucas-Kanade: the guess is good, and more levels lead away from it."""
 
@@ -97,8 +100,7 @@ def _sees(mounted: RigCamera, points: FloatArray) -> BoolArray:
     camera = mounted.camera
     ahead = points[:, 2] > 0
     m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
-    reach = camera.max_tangent if camera.model.sees_sideways else MAX_TANGENT
-    ahead &= np.all(np.abs(m) < reach, axis=1)
+    ahead &= camera.within_reach(m, MAX_TANGENT)
     pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
     sees: BoolArray = (
         ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
@@ -145,7 +147,11 @@ class _EpipolarSearch:
             rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         points = rays @ self._R.T + self._t * inverse_depth_per_m[..., None]
         m = points[..., :2] / np.maximum(points[..., 2:], 1e-3)
-        return self._camera.distort(m.reshape(-1, 2))[0].reshape(m.shape)
+        m = m.reshape(-1, 2)
+        pixels = self._camera.distort(m)[0]
+        if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
+            pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
+        return pixels.reshape(points[..., :2].shape)
 
     def search(
         self, reference: Image, other: Image, pixels: Pixels, normalized: FloatArray

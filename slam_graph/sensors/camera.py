@@ -131,6 +131,19 @@ class Camera:
         q = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         return self.model.undistort(q, self.coefficients, near)
 
+    def within_reach(self, normalized: FloatArray, max_coordinate: float) -> BoolArray:
+        """Which normalised points (N, 2) are so near to the axis that the model holds.
+
+        Args:
+            normalized: (N, 2).
+            max_coordinate: limit of both coordinates for a narrow lens. A wide lens has its own
+                limit, of the length: a polynomial that folds back beyond it leads into the image
+                again.
+        """
+        if self.model.sees_sideways:
+            return np.asarray(np.linalg.norm(normalized, axis=1) < self.max_tangent)
+        return np.asarray(np.all(np.abs(normalized) < max_coordinate, axis=1))
+
     def visible(
         self, pixels: FloatArray, max_tangent: float = MAX_TANGENT
     ) -> tuple[FloatArray, BoolArray]:
