@@ -58,7 +58,10 @@ MOVING = CAMERA | {"flight": {"hover_s": 0.0}}
 
 
 def flown(
-    sequence: SimulatedSequence, overrides: list[str], review: bool = False
+    sequence: SimulatedSequence,
+    overrides: list[str],
+    review: bool = False,
+    late_ns: int = 0,
 ) -> tuple[Estimator, StateHistory, tuple[NavState, NavState] | None]:
     """States of a run, and where a review doubts a state of wrong velocity, the right one and its
     own."""
@@ -68,12 +71,14 @@ def flown(
     for packet in sequence.packets():
         assert isinstance(packet.frame, FeatureFrame)
         estimator.add_imu(packet.imu)
-        state = estimator.add_frame(packet.frame)
+        stamped = FeatureFrame(packet.frame.stamp_ns - late_ns, packet.frame.cameras)
+        state = estimator.add_frame(stamped)
         if estimator.replayed is not None:
             history = StateHistory()
+        for known in estimator.states:
+            history.append(known)
         if state is None:
             continue
-        history.append(state)
         if review and checked is None:
             checked = StartReview(estimator._context, state.stamp_ns, 0.01)
         elif checked is not None:
@@ -106,6 +111,20 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
     error = ape(sequence.groundtruth(), history.trajectory(), alignment="se3")
     assert error.statistics.rmse < 0.05
     assert np.max(history.sigmas()[:, 6:9]) < 0.1
+
+
+def test_so_it_does_where_frames_wait_for_the_imu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a time offset that the start has found, a frame may lead to several states or none."""
+    monkeypatch.setattr(start_review, "contradict", lambda one, other: True)
+    sequence = simulate(trajectory="figure8", duration_s=10.0, seed=5, **MOVING)
+    estimator, history, _ = flown(sequence, MOTION[:1], late_ns=40_000_000)
+    counts = estimator.diagnostics.counts
+    assert counts["calibration_corrected"] == 1
+    assert counts["start_corrected"] >= 1
+    trajectory = history.trajectory()
+    assert np.all(np.diff(trajectory.stamps_ns) > 0)
+    error = ape(sequence.groundtruth(), trajectory, alignment="se3")
+    assert error.statistics.rmse < 0.05
 
 
 def test_a_start_without_a_metre_scale_is_a_choice() -> None:
