@@ -21,6 +21,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation
+from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
@@ -70,6 +71,7 @@ class EngineContext:
         calibration: which parameters of the rig are variables.
         projection: into the cameras of the rig.
         propagation: predicts a new frame's state by the IMU.
+        pixels: noise of the observations, which the engine estimates on the way.
         imu: the recent samples.
     """
 
@@ -80,6 +82,7 @@ class EngineContext:
     calibration: CalibrationVariables
     projection: RigProjection
     propagation: Propagation
+    pixels: PixelNoise
     imu: ImuBuffer = field(default_factory=ImuBuffer)
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
