@@ -38,9 +38,9 @@ BLOCK = 5
 """Consecutive observations of a camera that are averaged."""
 _MIN_OBSERVATIONS = 8
 """Observations that a track needs: of shorter ones the point explains nearly all block means."""
-_MEMORY_S = 5.0
+_MEMORY_S = 20.0
 """Time constant with which tracks are forgotten."""
-_PRIOR_DOF = 100.0
+_PRIOR_DOF = 200.0
 """Degrees of freedom that the setting counts for at the start."""
 _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
