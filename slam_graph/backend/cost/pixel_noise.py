@@ -40,7 +40,7 @@ _MIN_OBSERVATIONS = 8
 """Observations that a track needs: of shorter ones the point explains nearly all block means."""
 _MEMORY_S = 20.0
 """Time constant with which tracks are forgotten."""
-_PRIOR_DOF = 200.0
+_PRIOR_DOF = 100.0
 """Degrees of freedom that the setting counts for at the start."""
 _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
@@ -104,13 +104,17 @@ class PixelNoise:
             return
         residuals, by_point = _whitened(cost, known, self.sigma_px)
         for camera in range(len(self.sigma_px)):
-            means = block_means(known.obs, residuals, by_point, camera)
+            try:
+                means = block_means(known.obs, residuals, by_point, camera)
+            except np.linalg.LinAlgError:  # a point that its observations do not determine
+                return
             self._dof[camera] += np.sum(means.dof)
             share = float(means.dof @ means.winsorised())
             self._squares[camera] += share * self.sigma_px[camera] ** 2
-        sigma_px = np.sqrt(self._squares / self._dof)
         setting = self._config.pixel_sigma
+        sigma_px = np.sqrt(self._squares / self._dof)
         self.sigma_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
+        self._squares = self._dof * self.sigma_px**2  # what is beyond the bounds does not pile up
 
 
 def _whitened(
