@@ -22,7 +22,7 @@ from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 
 CAMERAS = 2
-MOST_NEES = 12.0
+MOST_NEES = 3.6
 """Mean over a flight of a pose's NEES, which is 6 on average over many flights."""
 Tracks = tuple[Observations, Geometry, FloatArray]
 
