@@ -7,7 +7,7 @@ import pytest
 from flight import Flight, rig, room, scene
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend import estimator
+from slam_graph.backend import engine_protocol
 from slam_graph.backend.backend_config import BackendConfig, NoiseConfig
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
@@ -148,7 +148,7 @@ class Recorded(PixelNoise):
 def test_a_flight_finds_its_noise_and_knows_its_errors(
     name: str, sigma_px: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(estimator, "PixelNoise", Recorded)
+    monkeypatch.setattr(engine_protocol, "PixelNoise", Recorded)
     tree = {"duration_s": 11.0, "seed": 1, "tracks": {"pixel_sigma": sigma_px}}
     off = ["final_ba.enabled=false", "backend.initialization.fix_gauge=false"]
     config = load_config(name, [*off, "backend.noise.adaptive_pixels=true"])

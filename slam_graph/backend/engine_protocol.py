@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -71,7 +72,6 @@ class EngineContext:
         calibration: which parameters of the rig are variables.
         projection: into the cameras of the rig.
         propagation: predicts a new frame's state by the IMU.
-        pixels: noise of the observations, which the engine estimates on the way.
         imu: the recent samples.
     """
 
@@ -82,8 +82,12 @@ class EngineContext:
     calibration: CalibrationVariables
     projection: RigProjection
     propagation: Propagation
-    pixels: PixelNoise
     imu: ImuBuffer = field(default_factory=ImuBuffer)
+
+    @cached_property
+    def pixels(self) -> PixelNoise:
+        """Noise of the observations, which the engine estimates on the way."""
+        return PixelNoise(self.config.noise, len(self.rig.cameras))
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
         """Add the observations of the window's current frame to its tracks."""

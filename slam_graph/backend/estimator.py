@@ -21,7 +21,6 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation
-from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine import SquareRootEngine
@@ -116,15 +115,7 @@ class Estimator:
         projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
         propagation = Propagation(rig.imu, config, diagnostics)
         context = EngineContext(
-            rig,
-            self.algorithm,
-            config,
-            diagnostics,
-            calibration,
-            projection,
-            propagation,
-            PixelNoise(config.noise, len(rig.cameras)),
-            imu,
+            rig, self.algorithm, config, diagnostics, calibration, projection, propagation, imu
         )
         self._engine: Engine = self._make_engine(context)
         self._context = context
