@@ -9,6 +9,7 @@ from flight import Flight, rig, room, scene
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import engine_protocol
 from slam_graph.backend.backend_config import BackendConfig, NoiseConfig
+from slam_graph.backend.cost import pixel_noise
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.pixel_noise import BLOCK, BlockMeans, PixelNoise, block_means
@@ -132,6 +133,14 @@ def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
     np.testing.assert_allclose(learned(tracks, (0.05, 0.05), on), [0.25, 0.25])
     np.testing.assert_allclose(learned(tracks, (20.0, 20.0), on), [4.0, 4.0])
     np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), NoiseConfig()), [1.0, 1.0])
+
+
+def test_tracks_that_have_hardly_moved_say_nothing(
+    tracks: Tracks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pixel_noise, "_LEAST_MOTION_PX", 1e4)
+    on = NoiseConfig(adaptive_pixels=True)
+    np.testing.assert_allclose(learned(tracks, (0.5, 2.0), on), [1.0, 1.0], rtol=1e-12)
 
 
 class Recorded(PixelNoise):

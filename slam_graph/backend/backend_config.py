@@ -45,8 +45,8 @@ class NoiseConfig(Settings):
     """White noise of the IMU that is estimated from how the images correct its predictions."""
     adaptive_pixels: bool = expert(False)
     """Estimate the noise of the observations of each camera from the residuals of tracks, between a
-    quarter of `pixel_sigma` and four times it. Use it where `pixel_sigma` is not known, for example
-    with sharp or with very noisy images. GTSAM's smoothers keep `pixel_sigma`."""
+    quarter of `pixel_sigma` and four times it. Use it where the noise may be
+    larger than `pixel_sigma`. GTSAM's smoothers keep `pixel_sigma`."""
     gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""

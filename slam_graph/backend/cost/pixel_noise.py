@@ -34,13 +34,15 @@ from slam_graph.backend.cost.feature_factors import orthonormal_columns
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry
 
-BLOCK = 5
-"""Consecutive observations of a camera that are averaged."""
-_MIN_OBSERVATIONS = 8
+BLOCK = 8
+"""Consecutive observations of a camera that are averaged. Shorter blocks miss what lasts longer."""
+_MIN_OBSERVATIONS = 11
 """Observations that a track needs: of shorter ones the point explains nearly all block means."""
+_LEAST_MOTION_PX = 50.0
+"""Motion that a track needs: a patch that has hardly moved has not slid off its point yet."""
 _MEMORY_S = 20.0
 """Time constant with which tracks are forgotten."""
-_PRIOR_DOF = 100.0
+_PRIOR_DOF = 50.0
 """Degrees of freedom that the setting counts for at the start."""
 _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
@@ -99,7 +101,8 @@ class PixelNoise:
         self._stamp_ns = stamp_ns
         if tracks is None:
             return
-        known = tracks.subset(tracks.obs.counts >= _MIN_OBSERVATIONS)
+        moved = _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
+        known = tracks.subset(moved & (tracks.obs.counts >= _MIN_OBSERVATIONS))
         if len(known.obs) == 0:
             return
         residuals, by_point = _whitened(cost, known, self.sigma_px)
@@ -115,6 +118,15 @@ class PixelNoise:
         sigma_px = np.sqrt(self._squares / self._dof)
         self.sigma_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
         self._squares = self._dof * self.sigma_px**2  # what is beyond the bounds does not pile up
+
+
+def _extents_px(obs: Observations, cameras: int) -> FloatArray:
+    """Diagonals (J,) of the smallest boxes around the tracks, in the camera where it is largest."""
+    least = np.full((len(obs.ids), cameras, 2), np.inf)
+    largest = -least
+    np.minimum.at(least, (obs.feature, obs.camera), obs.pixels)
+    np.maximum.at(largest, (obs.feature, obs.camera), obs.pixels)
+    return np.asarray(np.linalg.norm(np.maximum(largest - least, 0.0), axis=2).max(axis=1))
 
 
 def _whitened(
