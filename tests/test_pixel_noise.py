@@ -128,18 +128,21 @@ def learned(tracks: Tracks, sigmas: tuple[float, float], config: NoiseConfig) ->
 
 
 def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
-    on = NoiseConfig(adaptive_pixels=True)
+    on = NoiseConfig(adaptive_pixels="any")
     np.testing.assert_allclose(learned(tracks, (0.5, 2.0), on), [0.5, 2.0], rtol=0.08)
     np.testing.assert_allclose(learned(tracks, (0.05, 0.05), on), [0.25, 0.25])
     np.testing.assert_allclose(learned(tracks, (20.0, 20.0), on), [4.0, 4.0])
-    np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), NoiseConfig()), [1.0, 1.0])
+    np.testing.assert_allclose(learned(tracks, (0.5, 2.0), NoiseConfig()), [1.0, 2.0], rtol=0.08)
+    np.testing.assert_array_equal(learned(tracks, (1.1, 0.9), NoiseConfig()), [1.0, 1.0])
+    never = NoiseConfig(adaptive_pixels="never")
+    np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), never), [1.0, 1.0])
 
 
 def test_tracks_that_have_hardly_moved_say_nothing(
     tracks: Tracks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pixel_noise, "_LEAST_MOTION_PX", 1e4)
-    on = NoiseConfig(adaptive_pixels=True)
+    on = NoiseConfig(adaptive_pixels="any")
     np.testing.assert_allclose(learned(tracks, (0.5, 2.0), on), [1.0, 1.0], rtol=1e-12)
 
 
@@ -160,7 +163,7 @@ def test_a_flight_finds_its_noise_and_knows_its_errors(
     monkeypatch.setattr(engine_protocol, "PixelNoise", Recorded)
     tree = {"duration_s": 11.0, "seed": 1, "tracks": {"pixel_sigma": sigma_px}}
     off = ["final_ba.enabled=false", "backend.initialization.fix_gauge=false"]
-    config = load_config(name, [*off, "backend.noise.adaptive_pixels=true"])
+    config = load_config(name, [*off, "backend.noise.adaptive_pixels=any"])
     result = run(simulate(SimulationConfig.model_validate(tree)), config)
     found = Recorded.last.sigma_px
     np.testing.assert_allclose(found, sigma_px, rtol=0.05 if sigma_px == 1.0 else 0.1)

@@ -136,7 +136,7 @@ def test_so_it_has_with_the_calibration_as_variables(name: str, cameras: int) ->
 
 @pytest.mark.parametrize("name", OWN)
 def test_so_it_has_while_it_learns_the_noise_of_each_camera(name: str) -> None:
-    learns = NoiseConfig(adaptive_pixels=True)
+    learns = NoiseConfig(adaptive_pixels="any")
     before = np.ones(2)
     for number, estimator in enumerate(steps(name, noise=learns)):
         pixels = estimator._context.pixels

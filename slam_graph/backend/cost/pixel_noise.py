@@ -48,6 +48,8 @@ _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
 _MAX_RATIO = 4.0
 """Largest ratio of the estimate to the setting, and of the setting to the estimate."""
+_CLEARLY_LARGER = 1.25
+"""Ratio of the estimate to the setting from which `larger` takes the estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,12 +76,13 @@ class PixelNoise:
     """Standard deviation of the observations of each camera, as the tracks show it.
 
     Attributes:
-        sigma_px: (C,) current standard deviations; that of the settings at the start.
+        sigma_px: (C,) that the cost takes; that of the settings at the start.
+        estimate_px: (C,) that the tracks show.
     """
 
     def __init__(self, config: NoiseConfig, cameras: int) -> None:
         self._config = config
-        self.sigma_px = np.full(cameras, config.pixel_sigma)
+        self.sigma_px = self.estimate_px = np.full(cameras, config.pixel_sigma)
         self._dof = np.full(cameras, _PRIOR_DOF)
         self._squares = self._dof * self.sigma_px**2
         self._stamp_ns: int | None = None
@@ -93,7 +96,7 @@ class PixelNoise:
                 noise that is larger than assumed would not be seen.
             stamp_ns: time of the step.
         """
-        if not self._config.adaptive_pixels:
+        if self._config.adaptive_pixels == "never":
             return
         if self._stamp_ns is not None:
             memory = np.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / _MEMORY_S)
@@ -116,8 +119,13 @@ class PixelNoise:
             self._squares[camera] += share * self.sigma_px[camera] ** 2
         setting = self._config.pixel_sigma
         sigma_px = np.sqrt(self._squares / self._dof)
-        self.sigma_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
-        self._squares = self._dof * self.sigma_px**2  # what is beyond the bounds does not pile up
+        self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
+        self._squares = self._dof * self.estimate_px**2  # what is beyond does not pile up
+        if self._config.adaptive_pixels == "any":
+            self.sigma_px = self.estimate_px
+        else:
+            larger = self.estimate_px > _CLEARLY_LARGER * setting
+            self.sigma_px = np.where(larger, self.estimate_px, setting)
 
 
 def _extents_px(obs: Observations, cameras: int) -> FloatArray:
