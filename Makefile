@@ -44,8 +44,9 @@ format: $(VENV)/.installed-dev  ## Put the sources into the agreed format
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-docs: $(VENV)/.installed  ## Write docs/configuration.md anew from the settings in the code
+docs: $(VENV)/.installed-docs  ## Write the pages of settings anew and build the site in build/site
 	@$(BIN)/python docs/generate_configuration.py
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(VENV)/.installed  ## Measure accuracy and speed
 	@$(BIN)/python -m benchmarks.run $(ARGS)
@@ -60,8 +61,8 @@ clean:  ## Remove what was built, installed and cached, but no results
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamps: installed again only when a requirement or a pin has changed. The second installation
-# contains the first.
+# The stamps: installed again only when a requirement or a pin has changed. The second and third
+# installation contain the first.
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(call install,.)
@@ -69,6 +70,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@$(call install,.[dev])
+	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-docs: pyproject.toml constraints.txt
+	@$(call install,.[docs])
 	@touch $(VENV)/.installed $@
 
 define install

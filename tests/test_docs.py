@@ -4,15 +4,24 @@
 
 import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+from limits import HANG_S
+from test_questions import CODE, file_of, names
+
 from slam_graph.config import algorithm_names, load_config
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
 from slam_graph.pipeline.run_recording import run
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+THEORY = sorted((ROOT / "docs" / "theory").glob("*.md"))
 
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)")
 SOURCE = re.compile(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|yaml|md|ipynb|png))`")
@@ -64,9 +73,30 @@ def test_sources_that_are_named_exist() -> None:
 
 def test_every_page_is_in_the_index() -> None:
     linked = {target for target, _ in LINK.findall((ROOT / "docs" / "index.md").read_text())}
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    docs = ROOT / "docs"
+    pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
     notebooks = {f"../notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert not (pages | notebooks | {"../README.md", "../CONTRIBUTING.md"}) - linked
+
+
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    """Notebooks and the pages at the top of the checkout are added when the site is built."""
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
+    docs = ROOT / "docs"
+    pages = sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
+    assert sorted(re.findall(r"([\w/]+\.md)$", nav, re.MULTILINE)) == pages
+
+
+@pytest.mark.parametrize("page", THEORY, ids=lambda page: page.stem)
+def test_functions_that_hold_the_equations_exist(page: Path) -> None:
+    named = CODE.findall(page.read_text(encoding="utf-8"))
+    missing = [
+        f"{path}:{function}"
+        for path, function in named
+        if (file := file_of(path)) is None or (function and function not in names(file))
+    ]
+    assert not missing
+    assert len(named) >= (1 if page.stem == "index" else 6)
 
 
 def test_every_group_of_entry_points_is_in_the_documents() -> None:
@@ -136,3 +166,42 @@ def test_the_algorithm_of_the_documents_runs(tmp_path: Path) -> None:
     result = run(open_dataset("demo"), config)
     result.check()
     assert len(result.history) > 100
+
+
+def test_the_recipe_for_phones_makes_one_table(tmp_path: Path, monkeypatch: Any) -> None:
+    """The script of the page, and the calibration that it shows."""
+    page = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
+    (script,) = re.findall(r"^```python\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
+    (chain,) = re.findall(r"^```yaml\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    stamps = np.arange(5)[:, None] * 5_000_000 + 123_456_789_000
+    rates, forces = np.ones((5, 3)), np.arange(5)[:, None] + [0.0, 1.0, 2.0]
+    np.savetxt("walk_gyro.csv", np.hstack([rates, stamps + 1_000_000]), "%.9f", ",")
+    np.savetxt("walk_accel.csv", np.hstack([forces, stamps]), "%.9f", ",")
+    exec(compile(script, "own_data.md", "exec"), {})
+    table = np.loadtxt("walk.imu.csv", delimiter=",")
+    assert np.array_equal(table[:, 0], stamps[:4, 0] + 1_000_000)  # the last has no force after it
+    assert np.allclose(table[:, 1:4], 1.0)
+    assert np.allclose(table[:, 4:], forces[:4] + 0.2)
+    Path("phone.yaml").write_text(chain, encoding="utf-8")
+    (camera,) = read_kalibr("phone.yaml").cameras
+    assert not camera.rotation_known
+
+
+def test_the_pose_selection_of_the_page_on_extending_runs() -> None:
+    """In a process of its own, as a name that is registered stays."""
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
+    (override,) = re.findall(r'overrides=\["(algorithm\.cost\.past_poses=\w+)"\]', page)
+    use = f"""
+import slam_graph as sg
+config = sg.load_config(overrides=["{override}", "duration_s=8"])
+result = sg.run(sg.open_dataset("demo"), config)
+result.check()
+print(len(result.history))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", block + use], capture_output=True, text=True, timeout=HANG_S
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[-1]) > 100

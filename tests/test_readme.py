@@ -16,9 +16,9 @@ from slam_graph.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [README, *((ROOT / "docs" / page).read_text() for page in ("results.md", "datasets.md"))]
+PAGES = [README, *(page.read_text("utf-8") for page in sorted((ROOT / "docs").rglob("*.md")))]
 
-GROUPS = ("data", "config", "frontend")
+GROUPS = ("data", "config", "frontend", "map")
 """Commands of `slam-graph` that have commands of their own."""
 
 
@@ -28,7 +28,9 @@ def blocks(language: str, page: str = README) -> list[str]:
 
 def shell_lines() -> list[str]:
     """The commands of all pages, once each."""
-    shown = [line for page in PAGES for block in blocks("sh", page) for line in block.splitlines()]
+    scripts = [block.replace("\\\n", " ") for page in PAGES for block in blocks("sh", page)]
+    shown = [line for script in scripts for line in script.splitlines() if line]
+    shown += [line for page in PAGES for line in re.findall(r"`(slam-graph [a-z][^`…]*)`", page)]
     typed = [line for block in blocks("console") for line in block.splitlines()]
     return sorted({*shown, *(line.removeprefix("$ ") for line in typed if line.startswith("$ "))})
 
@@ -59,6 +61,8 @@ def fault_of(line: str) -> str:
     if program == "make":
         done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
         return done.stderr if done.returncode else ""
+    if program == "dask":  # of another package
+        return ""
     if program != "slam-graph":
         return "neither make nor slam-graph"
     command = words[: 2 if words[0] in GROUPS else 1]
