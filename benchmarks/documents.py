@@ -39,7 +39,7 @@ class Figures:
 
 
 def results(figures: Figures) -> Iterator[str]:
-    """The table of the README."""
+    """The table of the README and of the page of measured results."""
     yield "| recording | | msckf | swf | OpenVINS | Basalt | OKVIS2, causal |"
     yield "|---|---|---:|---:|---:|---:|---:|"
     position, orientation = ("position [m]", 4), ("orientation [deg]", 2)

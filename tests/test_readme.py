@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the README shows is true: its Python runs, its commands exist, the demo prints its lines."""
+"""What README and pages show is true: Python runs, commands exist, the demo prints its lines."""
 
 import os
 import re
@@ -31,8 +31,9 @@ def shell_lines() -> list[str]:
     scripts = [block.replace("\\\n", " ") for page in PAGES for block in blocks("sh", page)]
     shown = [line for script in scripts for line in script.splitlines() if line]
     shown += [line for page in PAGES for line in re.findall(r"`(slam-graph [a-z][^`…]*)`", page)]
-    typed = [line for block in blocks("console") for line in block.splitlines()]
-    return sorted({*shown, *(line.removeprefix("$ ") for line in typed if line.startswith("$ "))})
+    typed = [block for page in PAGES for block in blocks("console", page)]
+    ours = re.findall(r"^\$ ((?:slam-graph|make) .*)$", "\n".join(typed), re.MULTILINE)
+    return sorted({*shown, *ours})
 
 
 def first_words(text: str) -> list[str]:
@@ -89,7 +90,8 @@ def test_targets_that_are_named_exist() -> None:
 
 
 def test_demo_prints_what_is_shown(tmp_path: Path) -> None:
-    shown = blocks("console")[0].splitlines()
+    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    shown = blocks("console", page)[0].splitlines()
     done = subprocess.run(
         [sys.executable, "-m", "slam_graph.cli.main", "run", "demo", "--no-progress"],
         cwd=tmp_path,

@@ -35,8 +35,6 @@ def on_config(config: MkDocsConfig) -> None:
     tutorials += [{_title(path): _page_of(path)} for path in _notebooks()]
     (extending,) = [entry["Extending"] for entry in config.nav or [] if "Extending" in entry]
     extending += [{"Contributing": "contributing.md"}, {"Changelog": "changelog.md"}]
-    (results,) = [entry["Results"] for entry in config.nav or [] if "Results" in entry]
-    results.insert(0, {"Measured results": "readme.md"})
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
