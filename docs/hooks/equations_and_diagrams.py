@@ -11,7 +11,7 @@ import html
 import re
 from functools import cache
 
-import mermaidx
+import mermaidx  # type: ignore[import-untyped]
 from math_core import LatexError, LatexToMathML
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os.path
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,20 +79,26 @@ def _page_of(notebook: Path) -> str:
 def _title(notebook: Path) -> str:
     """The first heading of a notebook, with its number."""
     number = notebook.stem.split("_")[0].lstrip("0")
-    body, _ = MarkdownExporter().from_filename(str(notebook))
-    found = HEADING.search(body)
+    found = HEADING.search(_converted(notebook)[0])
     return f"{number}. {found[1]}" if found else notebook.stem
 
 
 def _add_notebook(files: Files, config: MkDocsConfig, path: Path) -> None:
     """Add a notebook as a page, with the pictures that are stored in it, and as a file."""
-    place = f"{path.stem}_files"
-    resources: dict[str, Any] = {"output_files_dir": place, "unique_key": "output"}
-    body, resources = MarkdownExporter().from_filename(str(path), resources=resources)
+    body, pictures = _converted(path)
     _add(files, config, _page_of(path), _with_download(body, path.name))
-    for name, content in resources["outputs"].items():
+    for name, content in pictures.items():
         files.append(File.generated(config, f"tutorials/{name}", content=content))
     files.append(File.generated(config, f"tutorials/{path.name}", abs_src_path=str(path)))
+
+
+@cache
+def _converted(path: Path) -> tuple[str, dict[str, bytes]]:
+    """A notebook as Markdown, and the pictures that are stored in it, by name."""
+    resources = {"output_files_dir": f"{path.stem}_files", "unique_key": "output"}
+    exporter: Any = MarkdownExporter()  # type: ignore[no-untyped-call]
+    body, found = exporter.from_filename(str(path), resources=resources)
+    return body, found["outputs"]
 
 
 def _with_download(body: str, name: str) -> str:
