@@ -278,8 +278,7 @@ class Estimator:
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
             scale_sigma = self._initializer.scale_sigma
-            if scale_sigma is not None:
-                self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            self._review = StartReview(self._context, stamp_ns, scale_sigma)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
