@@ -22,7 +22,7 @@ from slam_graph.experiment.comparison_results import (
 )
 from slam_graph.experiment.tasks import RunTask
 from slam_graph.results import ResultFolder
-from slam_graph.visualization import Panel, plot_panels
+from slam_graph.visualization import Panel, panel_figure
 
 _BINS = 200
 """Number of equal bins of time or distance in which series are averaged, also over the seeds."""
@@ -82,8 +82,8 @@ def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel
             _TIME[1],
             f"NEES of the {part}",
             _curves(runs, "nees_time_s", f"nees_{part}"),
-            mean_bounds(dof, seeds),
-            "95 % of χ²",
+            band=mean_bounds(dof, seeds),
+            band_label="95 % of χ²",
         )
         for part, dof in NEES_DOF.items()
     ]
@@ -152,5 +152,5 @@ def _draw_panels(
     shown = [panel for panel in panels if panel.curves]
     if shown:
         with folder.appearing(name) as partial:
-            plot_panels(partial, title, shown)
+            panel_figure(title, shown).savefig(partial, format="png")
         yield Figure(folder.files[-1], title)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolutio
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder, appearing, write_text
+
+if TYPE_CHECKING:
+    from slam_graph.visualization import Picture
 
 
 @dataclass(eq=False, repr=False)
@@ -102,7 +106,8 @@ class BalResult:
         files.json("metrics.json", self.metrics)
         adjusted = self.solution.adjusted
         write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
-        self._draw(files)
+        with files.appearing("bundle_adjustment.png") as partial:
+            self.plot().savefig(partial, format="png")
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -114,15 +119,18 @@ class BalResult:
         with appearing(path) as partial:
             partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
-    def _draw(self, files: ResultFolder) -> None:
-        from slam_graph.visualization import plot_bundle
+    def plot(self) -> Picture:
+        """Three projections of the scene, and a histogram of the reprojection errors."""
+        from slam_graph.visualization import bundle_figure
 
         part, adjusted = self.solution.part.problem, self.solution.adjusted
-        title = f"{self.name}: {part.cameras} cameras, {part.points} points"
-        with files.appearing("bundle_adjustment.png") as partial:
-            plot_bundle(
-                partial, title, adjusted.points, adjusted.centres(), self.solution.errors_px
-            )
+        return bundle_figure(
+            f"{self.name}  ·  {part.cameras} cameras, {part.points} points, "
+            f"{len(part.camera)} observations",
+            adjusted.points,
+            adjusted.centres(),
+            self.solution.errors_px,
+        )
 
 
 @dataclass(eq=False, repr=False)
@@ -209,7 +217,8 @@ class PoseGraphResult:
             files.text("covariances.csv", self._covariance_lines(self.covariances))
         if self.certificate is not None:
             files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
-        self._draw(files)
+        with files.appearing("pose_graph.png") as partial:
+            self.plot().savefig(partial, format="png")
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -244,17 +253,17 @@ class PoseGraphResult:
         for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
-    def _draw(self, files: ResultFolder) -> None:
-        from slam_graph.visualization import plot_pose_graph
+    def plot(self) -> Picture:
+        """The graph before and after, with its edges."""
+        from slam_graph.visualization import pose_graph_figure
 
-        graph, weights = self.solution.graph, self.solution.weights
-        title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"
-        with files.appearing("pose_graph.png") as partial:
-            plot_pose_graph(
-                partial,
-                title,
-                self.solution.before.translations,
-                self.solution.poses.translations,
-                graph.edges,
-                weights < 0.5,
-            )
+        graph, solution = self.solution.graph, self.solution
+        return pose_graph_figure(
+            f"{graph.name}  ·  {len(graph.keys)} poses, {len(graph.edges)} edges, "
+            f"cost {solution.minimum.cost:.6g}",
+            solution.before.translations,
+            solution.poses.translations,
+            graph.edges,
+            graph.is_odometry,
+            solution.weights < 0.5,
+        )
