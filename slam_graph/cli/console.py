@@ -34,6 +34,37 @@ def echo_table(rows: Iterable[Sequence[str]], indent: str = "") -> None:
         typer.echo((indent + "  ".join(cells)).rstrip())
 
 
+_WIDTH = 100
+"""Tables are no wider, also where the output is no terminal."""
+
+_TEXT_COLUMNS = ("data", "algorithm", "status")
+
+
+def echo_rich_table(
+    titles: Sequence[str], rows: Iterable[Sequence[str]], caption: str = ""
+) -> None:
+    """Print a table of numbers on stdout, at most 100 columns wide.
+
+    Args:
+        titles: of the columns.
+        rows: cells, as many as titles.
+        caption: below the table.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, caption=caption, caption_justify="left")
+    for title in titles:
+        text = title in _TEXT_COLUMNS
+        table.add_column(Text(title), justify="left" if text else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    Console(width=min(console.width, _WIDTH) if console.is_terminal else _WIDTH).print(table)
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """A number with so many decimals, or a dash for none."""
     return "-" if value is None else f"{value:.{digits}f}"
