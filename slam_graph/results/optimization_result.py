@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolutio
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder, appearing, write_text
-
-if TYPE_CHECKING:
-    from slam_graph.visualization import Picture
 
 
 @dataclass(eq=False, repr=False)
@@ -119,18 +116,9 @@ class BalResult:
         with appearing(path) as partial:
             partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
-    def plot(self) -> Picture:
-        """Three projections of the scene, and a histogram of the reprojection errors."""
-        from slam_graph.visualization import bundle_figure
-
-        part, adjusted = self.solution.part.problem, self.solution.adjusted
-        return bundle_figure(
-            f"{self.name}  ·  {part.cameras} cameras, {part.points} points, "
-            f"{len(part.camera)} observations",
-            adjusted.points,
-            adjusted.centres(),
-            self.solution.errors_px,
-        )
+    def plot(self) -> Any:
+        """The scene from three sides, and a histogram of the reprojection errors, as a figure."""
+        return self.solution.plot()
 
 
 @dataclass(eq=False, repr=False)
@@ -253,17 +241,6 @@ class PoseGraphResult:
         for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
-    def plot(self) -> Picture:
-        """The graph before and after, with its edges."""
-        from slam_graph.visualization import pose_graph_figure
-
-        graph, solution = self.solution.graph, self.solution
-        return pose_graph_figure(
-            f"{graph.name}  ·  {len(graph.keys)} poses, {len(graph.edges)} edges, "
-            f"cost {solution.minimum.cost:.6g}",
-            solution.before.translations,
-            solution.poses.translations,
-            graph.edges,
-            graph.is_odometry,
-            solution.weights < 0.5,
-        )
+    def plot(self) -> Any:
+        """The graph before and after, with its edges, as a figure."""
+        return self.solution.plot()

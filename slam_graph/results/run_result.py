@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import FinalBa, WindowGraph
@@ -32,13 +32,10 @@ from slam_graph.results.run_picture import (
     SMOOTHED,
     PoseEstimate,
     RunView,
-    run_figure,
     with_covariances_after_alignment,
 )
+from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
-
-if TYPE_CHECKING:
-    from slam_graph.visualization import Picture
 
 Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
 
@@ -89,7 +86,7 @@ class Ending:
 
 
 @dataclass(eq=False, repr=False)
-class RunResult:
+class RunResult(RunSummary):
     """What a run found out.
 
     The accessors that `SavedRun` has too (`trajectory`, `metrics`, …) say the same of a result
@@ -316,8 +313,7 @@ class RunResult:
             save_map(self.slam_map, files.path(MAP_NAME), force=True)
         return files.files
 
-    def plot(self) -> Picture:
-        """Paths from above and from the side, and errors (or what smoothing changed) in ±3σ."""
+    def _view(self) -> RunView:
         histories = {CAUSAL: self.history}
         if self.final_ba is not None:
             histories[SMOOTHED] = self.final_ba.history
@@ -328,7 +324,6 @@ class RunResult:
             self.points,
             self.input.start_ns,
         )
-        view = with_covariances_after_alignment(
+        return with_covariances_after_alignment(
             view, histories, self.start_was_given, self.final_ba
         )
-        return run_figure(view, self.metrics)

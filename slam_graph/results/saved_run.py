@@ -21,6 +21,14 @@ from slam_graph.maps import SlamMap
 from slam_graph.results import result_files as names
 from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
 from slam_graph.results.result_files import LATEST
+from slam_graph.results.run_picture import (
+    CAUSAL,
+    LOOPS_CLOSED,
+    SMOOTHED,
+    PoseEstimate,
+    RunView,
+)
+from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
 
 
@@ -43,7 +51,7 @@ def load_result(folder: Path | str) -> SavedRun:
     )
 
 
-class SavedRun:
+class SavedRun(RunSummary):
     """A result that was saved; each file is read when it is first asked for.
 
     It has the accessors of `RunResult` as far as the files allow; there are no full covariances.
@@ -169,6 +177,22 @@ class SavedRun:
     def coverage(self) -> float:
         """Estimated time over the time asked for, from 0 to 1."""
         return float(self.metrics["extent"]["coverage"])
+
+    def _view(self) -> RunView:
+        estimates = {CAUSAL: PoseEstimate.of_sigmas(self.trajectory, self.sigmas)}
+        if self.smoothed is not None:
+            sigmas = self.smoothed_sigmas
+            if sigmas is None:  # of an earlier version
+                sigmas = np.full((len(self.smoothed), len(names.SIGMAS)), np.nan)
+            estimates[SMOOTHED] = PoseEstimate.of_sigmas(self.smoothed, sigmas)
+        view = RunView(
+            estimates,
+            {} if self.loop_closed is None else {LOOPS_CLOSED: self.loop_closed},
+            self.groundtruth,
+            self.points,
+            self.metrics["extent"]["start_ns"],
+        )
+        return view if self.metrics["extent"]["start_was_given"] else view.aligned()
 
     @cached_property
     def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:

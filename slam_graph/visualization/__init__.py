@@ -11,15 +11,11 @@ __all__ = [
     "Picture",
     "RerunViewer",
     "TrackPictures",
-    "bundle_figure",
     "panel_figure",
-    "pose_graph_figure",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.visualization.bundle_picture import bundle_figure
     from slam_graph.visualization.panels import Panel, panel_figure
-    from slam_graph.visualization.pose_graph_picture import pose_graph_figure
     from slam_graph.visualization.rerun_viewer import RerunViewer
     from slam_graph.visualization.style import Picture
     from slam_graph.visualization.track_picture import TrackPictures
@@ -27,9 +23,7 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "bundle_picture": ("bundle_figure",),
             "panels": ("Panel", "panel_figure"),
-            "pose_graph_picture": ("pose_graph_figure",),
             "rerun_viewer": ("RerunViewer",),
             "style": ("Picture",),
             "track_picture": ("TrackPictures",),

@@ -8,11 +8,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.lines import Line2D
 
 from slam_graph.arrays import FloatArray
 from slam_graph.visualization.style import VERMILION, Picture, drawing, line_styles
 
-_INCHES = (10.0, 8.2)
+_WIDTH_INCHES = 6.4
+"""Of the projection on the two longest axes."""
+_LOWEST_INCHES, _HIGHEST_INCHES = 2.4, 6.0
+"""Between these are the heights of projections, so that a flat scene has room for labels."""
+_BORDER_INCHES = (1.6, 2.3)
 _MOST_POINTS = 50_000
 """Of larger scenes an even selection of the points is drawn."""
 _SHOWN_SHARE = 0.96
@@ -36,21 +41,21 @@ def bundle_figure(
         title: of the picture.
         points: (P, 3) in the world, in the unit of the problem.
         centres: (C, 3) of the cameras.
-        errors_px: lengths of the reprojection errors, by the name of the stage.
+        errors_px: lengths of the reprojection errors, by the name of the stage, if they are known.
     """
     scene, cameras = _along_principal_axes(points, centres)
     low, high = _shown(scene, cameras)
     inside = ((scene >= low) & (scene <= high)).all(axis=1)
     hidden = len(scene) - int(inside.sum())
     drawn = scene[inside][:: 1 + int(inside.sum()) // _MOST_POINTS]
-    size = max(0.4, min(2.0, 60.0 / np.sqrt(max(len(drawn), 1))))
-    with drawing(title, _INCHES) as figure:
-        extents = high - low
+    size = float(np.clip(130.0 / np.sqrt(max(len(drawn), 1)), 0.8, 6.0))
+    scale = _WIDTH_INCHES / (high - low)[0]
+    upper, lower = np.clip(scale * (high - low)[1:], _LOWEST_INCHES, _HIGHEST_INCHES)
+    right = max(float(lower), 3.0) if errors_px else float(lower)
+    inches = (_WIDTH_INCHES + right + _BORDER_INCHES[0], upper + lower + _BORDER_INCHES[1])
+    with drawing(title, inches) as figure:
         grid = figure.add_gridspec(
-            2,
-            2,
-            width_ratios=(extents[0], max(extents[2], 0.45 * extents[0])),
-            height_ratios=(max(extents[1], 0.3 * extents[0]), max(extents[2], 0.3 * extents[0])),
+            2, 2, width_ratios=(_WIDTH_INCHES, right), height_ratios=(upper, lower)
         )
         for cell, (a, b) in {(0, 0): (0, 1), (1, 0): (0, 2), (0, 1): (2, 1)}.items():
             axes = figure.add_subplot(grid[cell])
@@ -62,8 +67,9 @@ def bundle_figure(
                 xlim=(low[a], high[a]),
                 ylim=(low[b], high[b]),
             )
-            axes.set_aspect("equal", adjustable="datalim")
-        _draw_histogram(figure.add_subplot(grid[1, 1]), errors_px)
+            axes.set_aspect("equal", adjustable="box", anchor="W")
+        if errors_px:
+            _draw_histogram(figure.add_subplot(grid[1, 1]), errors_px)
         _legend(figure, hidden)
     return figure
 
@@ -80,13 +86,11 @@ def _draw_histogram(axes: Any, errors_px: Mapping[str, FloatArray]) -> None:
         axes.hist(errors, bins=bins, color=colour, alpha=0.25)
         axes.hist(errors, bins=bins, color=colour, histtype="step", linewidth=1.4, label=label)
     axes.set(xscale="log", xlabel="reprojection error [px]", ylabel="observations")
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=1)
 
 
 def _legend(figure: Picture, hidden: int) -> None:
     """Points and cameras, and how many points are too far away to be shown."""
-    from matplotlib.lines import Line2D
-
     style = {"linestyle": "", "mew": 0}
     entries = {
         "points": Line2D([], [], marker=".", ms=7, color="0.35", **style),  # type: ignore[arg-type]

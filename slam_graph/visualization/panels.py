@@ -37,8 +37,8 @@ class Panel:
         xlabel, ylabel: labels of its axes.
         curves: its lines by their labels: x and y (N,) each, NaN where there is a gap; one label
             has one colour in all panels of a picture.
-        kind: `curves` from zero on, logarithmic where they differ much; `errors` with a sign,
-            around zero; `path` with the same scale on both axes.
+        kind: `curves` from zero on, logarithmic where they differ much; `series` of any values;
+            `errors` with a sign, around zero; `path` with the same scale on both axes.
         band: lower and upper bound of a shaded band, if there is one.
         band_label: label of the band.
         bounds: by the label of a curve x and the half width (N,) of what is shaded around zero.
@@ -50,7 +50,7 @@ class Panel:
     xlabel: str
     ylabel: str
     curves: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    kind: Literal["curves", "errors", "path"] = "curves"
+    kind: Literal["curves", "series", "errors", "path"] = "curves"
     band: tuple[float, float] | None = None
     band_label: str = ""
     bounds: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
@@ -126,21 +126,26 @@ def _draw(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
             x, -half, half, color=colour, alpha=0.16, linewidth=0, label=f"±3σ {label}"
         )
         axes.plot(x, half, x, -half, color=colour, alpha=0.5, linewidth=0.6)
+    compared = set(panel.curves) - set(_REFERENCES)
     for label, (x, y) in panel.curves.items():
-        _draw_curve(axes, label, x, y, styles[label])
+        reference = bool(compared) and label in _REFERENCES
+        _draw_curve(axes, label, x, y, styles[label], reference)
     if panel.kind == "path":
         axes.set_aspect("equal", adjustable="datalim")
         _mark_start(axes, panel.curves)
     elif panel.kind == "errors":
         _limit_errors(axes, panel)
+    elif panel.kind == "series":
+        return
     elif _spread([y for _, y in panel.curves.values()]) > _LOGARITHMIC_RANGE:
         axes.set_yscale("log")
-    elif panel.curves:
+    else:
         axes.set_ylim(bottom=0.0)
 
 
-def _draw_curve(axes: Any, label: str, x: FloatArray, y: FloatArray, style: LineStyle) -> None:
-    reference = label in _REFERENCES
+def _draw_curve(
+    axes: Any, label: str, x: FloatArray, y: FloatArray, style: LineStyle, reference: bool
+) -> None:
     axes.plot(
         x,
         y,
@@ -241,7 +246,11 @@ def _share_x(axes: Sequence[Any], panels: Sequence[Panel]) -> None:
     """Series above one another with the same x get one axis, labelled at the lowest."""
     for k in range(len(panels) - 1):
         upper, lower = panels[k], panels[k + 1]
-        if upper.kind == lower.kind == "errors" and upper.xlabel == lower.xlabel:
+        if (
+            upper.kind == lower.kind != "curves"
+            and upper.kind != "path"
+            and upper.xlabel == lower.xlabel
+        ):
             axes[k].sharex(axes[k + 1])
             axes[k].tick_params(labelbottom=False)
             axes[k].set_xlabel("")
@@ -253,7 +262,7 @@ def _legend(figure: Picture, cells: Iterable[Any]) -> None:
     for axes in cells:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    if len(entries) > 0:
+    if len(set(entries) - {"start"}) > 1:
         figure.legend(
             entries.values(),
             entries.keys(),

@@ -1,51 +1,56 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a pose graph: the positions before and after, joined by the edges."""
+"""The picture of a pose graph: the positions before and after, joined by its edges."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.lines import Line2D
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.visualization.style import BLUE, VERMILION, Picture, drawing
 
-_INCHES = (10.0, 5.0)
+_INCHES = (5.0, 5.0)
+"""Of one state."""
 
 
 def pose_graph_figure(
     title: str,
-    before: FloatArray,
-    after: FloatArray,
+    states: Mapping[str, FloatArray],
     edges: IntArray,
     is_odometry: BoolArray,
-    rejected: BoolArray,
+    rejected: BoolArray | None = None,
 ) -> Picture:
-    """A pose graph before and after its optimisation, side by side.
+    """A pose graph in one or more states, side by side, such as before and after optimisation.
 
     Args:
         title: of the picture.
-        before: (N, 2 or 3) positions in metres.
-        after: (N, 2 or 3).
+        states: (N, 2 or 3) positions in metres, by the name of the state.
         edges: (M, 2) rows of the poses that each edge joins.
         is_odometry: (M,) which edges join consecutive poses; the others close loops.
-        rejected: (M,) which edges the optimisation rejected; they are drawn only before it.
+        rejected: (M,) which edges the optimisation rejected; they are drawn in the first state.
     """
-    in_space = before.shape[1] == 3
-    with drawing(title, _INCHES) as figure:
-        for place, (name, positions) in enumerate((("before", before), ("after", after)), 1):
-            axes: Any = figure.add_subplot(1, 2, place, projection="3d" if in_space else None)
-            good = ~rejected
-            loops = edges[good & ~is_odometry]
-            _draw_edges(axes, positions, loops, color=BLUE, linewidth=0.35, alpha=0.5)
-            _draw_edges(axes, positions, edges[good & is_odometry], color="0.2", linewidth=0.7)
-            if name == "before":
-                _draw_edges(
-                    axes, positions, edges[rejected], color=VERMILION, linewidth=0.5, alpha=0.6
-                )
-            _dress(axes, name, positions, in_space)
-        _legend(figure, bool(rejected.any()))
+    rejected = np.zeros(len(edges), bool) if rejected is None else rejected
+    kinds = {
+        "loop closure": (edges[~rejected & ~is_odometry], BLUE, 0.35, 0.5),
+        "odometry": (edges[~rejected & is_odometry], "0.2", 0.7, 1.0),
+        "rejected": (edges[rejected], VERMILION, 0.5, 0.6),
+    }
+    with drawing(title, (_INCHES[0] * len(states), _INCHES[1])) as figure:
+        for place, (name, positions) in enumerate(states.items(), 1):
+            in_space = positions.shape[1] == 3
+            axes: Any = figure.add_subplot(
+                1, len(states), place, projection="3d" if in_space else None
+            )
+            for kind, (rows, colour, width, alpha) in kinds.items():
+                if kind != "rejected" or place == 1:
+                    _draw_edges(axes, positions, rows, color=colour, linewidth=width, alpha=alpha)
+            _dress(axes, name if len(states) > 1 else "", positions, in_space)
+        shown = {kind: colour for kind, (rows, colour, _, _) in kinds.items() if len(rows)}
+        _legend(figure, shown)
     return figure
 
 
@@ -71,12 +76,7 @@ def _draw_edges(axes: Any, positions: FloatArray, edges: IntArray, **style: Any)
     axes.plot(*points.reshape(-1, positions.shape[1]).T, **style)
 
 
-def _legend(figure: Picture, rejected: bool) -> None:
+def _legend(figure: Picture, kinds: Mapping[str, str]) -> None:
     """The kinds of edges, with lines that are thick enough to be seen."""
-    from matplotlib.lines import Line2D
-
-    kinds = {"odometry": "0.2", "loop closure": BLUE}
-    if rejected:
-        kinds["rejected"] = VERMILION
     handles = [Line2D([], [], color=colour, linewidth=1.5) for colour in kinds.values()]
-    figure.legend(handles, list(kinds), loc="outside lower center", ncols=len(kinds))
+    figure.legend(handles, list(kinds), loc="outside lower center", ncols=len(kinds) or 1)

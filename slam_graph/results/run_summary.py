@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a result shows of itself: a picture, a table in Jupyter, and the Rerun viewer in a notebook.
+
+The same of a result in memory and of one that was read back.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
+
+from slam_graph.display import Displayed
+from slam_graph.results.run_picture import RunView, run_figure
+
+if TYPE_CHECKING:
+    from slam_graph.visualization import Picture
+
+
+class RunSummary(Displayed):
+    """Base of the results of a run."""
+
+    metrics: Any  # a table; declared here, computed or read by the subclasses
+
+    @abstractmethod
+    def _view(self) -> RunView:
+        """What the picture shows, in the world of the truth if there is one."""
+
+    def plot(self) -> Picture:
+        """The picture of the run: paths, and errors or what smoothing changed, in ±3σ.
+
+        It is what `trajectory.png` shows, as a matplotlib figure.
+        """
+        return run_figure(self._view(), self.metrics)
+
+    def show(self, width: int = 950, height: int = 600) -> None:
+        """The run in the Rerun viewer, inside the notebook.
+
+        Args:
+            width: of the viewer, pixels.
+            height: of the viewer, pixels.
+
+        Raises:
+            ConfigError: if the viewer for notebooks is not installed.
+        """
+        view = self._view()
+        paths = {name: estimate.trajectory for name, estimate in view.estimates.items()}
+        paths |= dict(view.paths)
+        self._drawn("inline_viewer.show_inline", paths, view.truth, view.points, (width, height))
+
+    def _facts(self) -> dict[str, object]:
+        metrics = self.metrics
+        data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
+        cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
+        return {
+            "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
+            "algorithm": f"{metrics['algorithm']}, seed {metrics['seed']}",
+            "status": f"{metrics['status']}. {metrics['message']}".rstrip(". "),
+            "estimated": f"{extent['estimated_frames']} of {extent['frames']} frames, "
+            f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
+            "error": _errors(metrics["accuracy"]),
+            "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy")),
+            "error, loops closed": _errors((metrics["loop_closure"] or {}).get("accuracy")),
+            "speed": (
+                None
+                if timing["real_time_factor"] is None
+                else f"{timing['frames_per_s']:.0f} frames/s, "
+                f"{timing['real_time_factor']:.1f} x real time"
+            ),
+            "warnings": ", ".join(f"{k} {n}" for k, n in metrics["warnings"].items()) or None,
+        }
+
+    def _sketch(self) -> Any:
+        return self.plot()
+
+
+def _errors(accuracy: dict[str, Any] | None) -> str | None:
+    """Root mean square errors after alignment of yaw and position."""
+    table = (accuracy or {}).get("yaw", {}).get("ate")
+    if table is None:
+        return None
+    return (
+        f"{table['translation_m']['rmse']:.4f} m, {table['rotation_deg']['rmse']:.3f}° RMS, "
+        "aligned in yaw and position"
+    )
