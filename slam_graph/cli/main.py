@@ -20,6 +20,7 @@ from slam_graph.cli import (
     compare,
     data_commands,
     evaluate,
+    export,
     frontend,
     map,
     optimize,
@@ -84,6 +85,7 @@ app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
 app.command("rpe")(evaluate.rpe)
+app.command("export")(export.export)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)

@@ -313,6 +313,9 @@ class RunResult(RunSummary):
             save_map(self.slam_map, files.path(MAP_NAME), force=True)
         return files.files
 
+    def _known_map(self) -> SlamMap | None:
+        return self.slam_map
+
     def _view(self) -> RunView:
         histories = {CAUSAL: self.history}
         if self.final_ba is not None:

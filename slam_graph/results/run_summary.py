@@ -8,10 +8,25 @@ The same of a result in memory and of one that was read back.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
+from slam_graph.errors import DataError, closest
+from slam_graph.geometry import Trajectory
+from slam_graph.maps import SlamMap
 from slam_graph.results.run_picture import RunView, run_figure
+from slam_graph.results.scene import SceneParts, export_scene
+from slam_graph.results.scene_files import (
+    SCENE_FORMATS,
+    require_models,
+    write_colmap,
+    write_nerfstudio,
+)
+from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
     from slam_graph.visualization import Picture
@@ -20,11 +35,30 @@ if TYPE_CHECKING:
 class RunSummary(Displayed):
     """Base of the results of a run."""
 
-    metrics: Any  # a table; declared here, computed or read by the subclasses
+    metrics: Any  # a table, which the subclasses compute or read
+
+    @property
+    @abstractmethod
+    def rig(self) -> Rig:
+        """The sensors that were used, with the calibration from before the run."""
+
+    @property
+    @abstractmethod
+    def best_trajectory(self) -> Trajectory:
+        """The smoothed trajectory if there is one, else the causal one."""
+
+    @property
+    @abstractmethod
+    def points(self) -> FloatArray:
+        """(P, 3) last estimates of the features that were in the state, in the world, m."""
 
     @abstractmethod
     def _view(self) -> RunView:
         """What the picture shows, in the world of the truth if there is one."""
+
+    @abstractmethod
+    def _known_map(self) -> SlamMap | None:
+        """The map of the run, if there is one."""
 
     def plot(self) -> Picture:
         """The picture of the run: paths, and errors or what smoothing changed, in ±3σ.
@@ -47,6 +81,41 @@ class RunSummary(Displayed):
         paths = {name: estimate.trajectory for name, estimate in view.estimates.items()}
         paths |= dict(view.paths)
         self._drawn("inline_viewer.show_inline", paths, view.truth, view.points, (width, height))
+
+    def export(
+        self, folder: Path | str, recording: Sequence, formats: Iterable[str] = SCENE_FORMATS
+    ) -> list[Path]:
+        """Write keyframes with their images, and points, for COLMAP or nerfstudio.
+
+        Of a run that saved a map these are the keyframes and points of the map, with the
+        observations of the first camera; otherwise keyframes are chosen by motion.
+
+        Args:
+            folder: is given `images/`, and for `colmap` a model in `sparse/0/`, for `nerfstudio`
+                `transforms.json` and `points.ply`.
+            recording: that was run, for its images.
+            formats: `colmap`, `nerfstudio`, or both.
+
+        Returns:
+            The files, without the images.
+
+        Raises:
+            DataError: if a format is unknown, there are no images, or the formats lack the camera
+                model.
+        """
+        folder, formats = Path(folder), list(formats)
+        for name in formats:
+            if name not in SCENE_FORMATS:
+                raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
+        require_models(self.rig)
+        parts = SceneParts(self.rig, self.best_trajectory, self.points, self._known_map())
+        scene = export_scene(parts, recording, folder / "images")
+        files = []
+        if "colmap" in formats:
+            files += write_colmap(folder / "sparse" / "0", scene)
+        if "nerfstudio" in formats:
+            files += write_nerfstudio(folder, scene)
+        return files
 
     def _facts(self) -> dict[str, object]:
         metrics = self.metrics

@@ -178,6 +178,9 @@ class SavedRun(RunSummary):
         """Estimated time over the time asked for, from 0 to 1."""
         return float(self.metrics["extent"]["coverage"])
 
+    def _known_map(self) -> SlamMap | None:
+        return self.slam_map
+
     def _view(self) -> RunView:
         estimates = {CAUSAL: PoseEstimate.of_sigmas(self.trajectory, self.sigmas)}
         if self.smoothed is not None:
