@@ -3,8 +3,8 @@
 """The command `slam-graph`: launches a command and turns errors into exit codes.
 
 Exit codes: 0 success; 1 expected failure, with one line on stderr; 2 usage or configuration error;
-3 ran, but never initialised, diverged or covered less than asked; 130 interrupted. Modules that are
-slow to import are imported inside the commands.
+3 ran, but never initialised, diverged, covered less than asked or made no map; 130 interrupted.
+Modules that are slow to import are imported inside the commands.
 """
 
 from __future__ import annotations

@@ -37,7 +37,9 @@ from slam_graph.results.run_picture import (
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
 
-Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
+Status = Literal[
+    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
+]
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
@@ -262,7 +264,8 @@ class RunResult(RunSummary):
         """Raise what kept the run from ending well, if anything did.
 
         Raises:
-            EstimationError: if it never initialised, diverged, or covered less than was asked.
+            EstimationError: if it never initialised, diverged, covered less than was asked, or
+                left no map although it was to.
             KeyboardInterrupt: if it was interrupted.
             BaseException: whatever else ended it.
         """
