@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import bz2
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalPolicy, BalSolution
+from slam_graph.display import Displayed
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
@@ -23,7 +24,7 @@ from slam_graph.results.result_files import ResultFolder, appearing, write_text
 
 
 @dataclass(eq=False, repr=False)
-class BalResult:
+class BalResult(Displayed):
     """What a bundle adjustment found out.
 
     Attributes:
@@ -116,13 +117,19 @@ class BalResult:
         with appearing(path) as partial:
             partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
+    def _facts(self) -> dict[str, object]:
+        return {"solution": self.solution, "seconds": _seconds_text(self.seconds)}
+
+    def _sketch(self) -> Any:
+        return self.plot()
+
     def plot(self) -> Any:
         """The scene from three sides, and a histogram of the reprojection errors, as a figure."""
         return self.solution.plot()
 
 
 @dataclass(eq=False, repr=False)
-class PoseGraphResult:
+class PoseGraphResult(Displayed):
     """What an optimisation found out.
 
     Attributes:
@@ -241,6 +248,21 @@ class PoseGraphResult:
         for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
+    def _facts(self) -> dict[str, object]:
+        return {
+            "solution": self.solution,
+            "certificate": self._certificate(),
+            "seconds": _seconds_text(self.seconds),
+        }
+
+    def _sketch(self) -> Any:
+        return self.plot()
+
     def plot(self) -> Any:
         """The graph before and after, with its edges, as a figure."""
         return self.solution.plot()
+
+
+def _seconds_text(seconds: Mapping[str, float]) -> str | None:
+    """Wall time of each part."""
+    return ", ".join(f"{part} {value:.2f}" for part, value in seconds.items()) or None
