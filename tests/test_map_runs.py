@@ -163,7 +163,7 @@ def test_two_flights_through_one_place_by_the_recipe(
     start = page.index("slam-graph simulate monday")
     recipe = page[start : page.index("```", start)].splitlines()
     assert [line.split()[1] for line in recipe] == ["simulate", "simulate", "run", "localize"]
-    shorter = {"60": "24", "30": "12"}
+    shorter = {"60": "24", "30": "8"}
     options = (
         "--rate",
         4,
