@@ -163,18 +163,9 @@ def test_two_flights_through_one_place_by_the_recipe(
     start = page.index("slam-graph simulate monday")
     recipe = page[start : page.index("```", start)].splitlines()
     assert [line.split()[1] for line in recipe] == ["simulate", "simulate", "run", "localize"]
-    shorter = {"60": "24", "30": "8"}
-    options = (
-        "--rate",
-        4,
-        "--cameras",
-        1,
-        "--features",
-        80,
-        "--set",
-        "landmarks.density=4",
-        "--no-progress",
-    )
+    shorter = {"60": "24", "30": "12"}
+    sparse = ("--features", 80, "--set", "landmarks.density=4")
+    options = ("--rate", 5, *sparse, "--no-progress")
     for line in recipe:
         words = [shorter.get(word, word) for word in line.split()[1:]]
         done = call(*words, *(options if words[0] == "simulate" else ()))
