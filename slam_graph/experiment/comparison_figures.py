@@ -197,5 +197,5 @@ def _draw_panels(
     shown = [panel for panel in panels if panel.curves or panel.samples]
     if shown:
         with folder.appearing(name) as partial:
-            panel_figure(title, shown).savefig(partial, format="png")
+            panel_figure(title, shown).write(partial)
         yield Figure(folder.files[-1], title)

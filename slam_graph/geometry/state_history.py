@@ -35,6 +35,9 @@ class StateHistory:
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
+    def __repr__(self) -> str:
+        return f"StateHistory({len(self)} states)"
+
     def append(self, state: NavState) -> None:
         """Add the state of the next frame."""
         pose = state.world_T_body

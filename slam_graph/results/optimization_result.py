@@ -105,7 +105,7 @@ class BalResult(Displayed):
         adjusted = self.solution.adjusted
         write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
         with files.appearing("bundle_adjustment.png") as partial:
-            self.plot().savefig(partial, format="png")
+            self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -213,7 +213,7 @@ class PoseGraphResult(Displayed):
         if self.certificate is not None:
             files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
         with files.appearing("pose_graph.png") as partial:
-            self.plot().savefig(partial, format="png")
+            self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:

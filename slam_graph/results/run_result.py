@@ -311,7 +311,7 @@ class RunResult(RunSummary):
             for name, text in graph.texts().items():
                 files.text(f"graph_{stamp_ns}_{name}", [text])
         with files.appearing("trajectory.png") as partial:
-            self.plot().savefig(partial, format="png")
+            self.plot().write(partial)
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for
             save_map(self.slam_map, files.path(MAP_NAME), force=True)
         return files.files

@@ -115,10 +115,17 @@ class SavedRun(RunSummary):
     @cached_property
     def trajectory(self) -> Trajectory:
         """The causal estimate, with velocities and biases."""
-        poses = _trajectory(self.folder, names.TRAJECTORY)
-        stamps, states = self._states
-        if poses is None or not np.array_equal(stamps, poses.stamps_ns):
-            raise DataError(f"{self.folder}: {names.STATES} and {names.TRAJECTORY} differ in time")
+        return self._with_states(names.read_tum(self.folder / names.TRAJECTORY), names.STATES)
+
+    def _with_states(self, poses: Trajectory, file: str) -> Trajectory:
+        """Poses with the velocities and biases of a file of states.
+
+        Raises:
+            DataError: if the two are not of the same times.
+        """
+        stamps, states = names.read_states(self.folder / file)
+        if not np.array_equal(stamps, poses.stamps_ns):
+            raise DataError(f"{self.folder}: {file} and the trajectory differ in time")
         return replace(
             poses,
             velocities=_columns(states, names.VELOCITY),
@@ -134,7 +141,10 @@ class SavedRun(RunSummary):
     @cached_property
     def smoothed(self) -> Trajectory | None:
         """The trajectory of the final bundle adjustment, if there is one."""
-        return _trajectory(self.folder, names.SMOOTHED)
+        poses = _trajectory(self.folder, names.SMOOTHED)
+        if poses is None or not (self.folder / names.SMOOTHED_STATES).is_file():
+            return poses
+        return self._with_states(poses, names.SMOOTHED_STATES)
 
     @cached_property
     def smoothed_sigmas(self) -> FloatArray | None:

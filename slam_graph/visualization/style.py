@@ -12,6 +12,7 @@ import io
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
@@ -43,7 +44,7 @@ _KNOWN = {
 _VARIANT = "_no_fej"
 """What ends with this has the colour of the name before it, and is dashed."""
 
-_DPI = 150
+_FILE_DPI, _NOTEBOOK_DPI = 150, 100
 
 _LOOK: dict[Any, Any] = {
     "font.size": 9.0,
@@ -108,14 +109,18 @@ def line_styles(names: Iterable[str]) -> dict[str, LineStyle]:
 class Picture(Figure):
     """A figure that needs no window, and shows itself in Jupyter without `%matplotlib`."""
 
-    def png(self, dpi: int = _DPI) -> bytes:
+    def png(self, dpi: int = _FILE_DPI) -> bytes:
         """The picture as a PNG file."""
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", dpi=dpi)
         return buffer.getvalue()
 
+    def write(self, path: Path) -> None:
+        """Write the picture as a PNG file, whatever its name ends with."""
+        path.write_bytes(self.png())
+
     def _repr_png_(self) -> bytes:
-        return self.png(dpi=110)
+        return self.png(_NOTEBOOK_DPI)
 
 
 @contextmanager
@@ -127,7 +132,7 @@ def drawing(title: str, size_inches: tuple[float, float]) -> Iterator[Picture]:
         size_inches: width and height.
     """
     with rc_context(_LOOK):
-        figure = Picture(figsize=size_inches, dpi=_DPI, layout="constrained")
+        figure = Picture(figsize=size_inches, dpi=_NOTEBOOK_DPI, layout="constrained")
         FigureCanvasAgg(figure)
         engine: Any = figure.get_layout_engine()
         engine.set(w_pad=0.07, h_pad=0.06)
