@@ -127,7 +127,6 @@ def _print_task(task: str, failure: str | None, count: int, total: int) -> None:
 
 
 _SHOWN = {
-    "data": "data",
     "algorithm": "algorithm",
     "ATE yaw [m]": "ATE [m]",
     "orientation [deg]": "rot. [°]",
@@ -147,9 +146,12 @@ _MEANING = (
 
 
 def _echo(comparison: Comparison) -> None:
-    """Print the table and the names of the files."""
-    titles, *rows = _informative(comparison.table)
-    echo_rich_table(titles, rows, _MEANING)
+    """Print a table for each data set, and the names of the files."""
+    titles, *rows = comparison.table
+    names = list(dict.fromkeys(row[0] for row in rows))
+    for name in names:
+        shown = _informative([titles, *(row for row in rows if row[0] == name)])
+        echo_rich_table(shown[0], shown[1:], name, caption=_MEANING if name == names[-1] else "")
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
@@ -157,13 +159,11 @@ def _echo(comparison: Comparison) -> None:
 
 
 def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """The printed columns that are not empty, and `data` only if there is more than one."""
+    """The columns that are printed and have any number."""
     columns = [
         (_SHOWN[values[0]], *values[1:])
         for values in zip(*table, strict=True)
-        if values[0] in _SHOWN
-        and set(values[1:]) != {"-"}
-        and (values[0] != "data" or len(set(values[1:])) > 1)
+        if values[0] in _SHOWN and set(values[1:]) != {"-"}
     ]
     return list(zip(*columns, strict=True))
 

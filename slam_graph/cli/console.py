@@ -37,17 +37,18 @@ def echo_table(rows: Iterable[Sequence[str]], indent: str = "") -> None:
 _WIDTH = 100
 """Tables are no wider, also where the output is no terminal."""
 
-_TEXT_COLUMNS = ("data", "algorithm", "status")
+_TEXT_COLUMNS = ("algorithm", "status")
 
 
 def echo_rich_table(
-    titles: Sequence[str], rows: Iterable[Sequence[str]], caption: str = ""
+    titles: Sequence[str], rows: Iterable[Sequence[str]], heading: str, caption: str = ""
 ) -> None:
     """Print a table of numbers on stdout, at most 100 columns wide.
 
     Args:
         titles: of the columns.
         rows: cells, as many as titles.
+        heading: above the table.
         caption: below the table.
     """
     from rich.box import SIMPLE_HEAD
@@ -55,14 +56,22 @@ def echo_rich_table(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, caption=caption, caption_justify="left")
+    table = Table(
+        title=Text(heading, style="bold"),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+    )
     for title in titles:
         text = title in _TEXT_COLUMNS
         table.add_column(Text(title), justify="left" if text else "right", overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    console = Console()
-    Console(width=min(console.width, _WIDTH) if console.is_terminal else _WIDTH).print(table)
+    terminal = Console()
+    console = Console(width=min(terminal.width, _WIDTH) if terminal.is_terminal else _WIDTH)
+    console.print(table)
+    if caption:
+        console.print(Text(caption))
 
 
 def number(value: float | None, digits: int = 4) -> str:

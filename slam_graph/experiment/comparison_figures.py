@@ -59,7 +59,7 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     over = f", {seeds} seeds" if seeds > 1 else ""
     folder = ResultFolder(comparison.folder / "figures")
     yield from _draw_panels(folder, f"{data}_paths.png", f"{data}: causal paths", _paths(runs))
-    title = f"{data}: errors (RMS of a run) and cost{over}"
+    title = f"{data}: errors (root mean square of a run) and cost{over}"
     yield from _draw_panels(folder, f"{data}_summary.png", title, _summary_panels(tasks))
     panels = [
         Panel(_TIME, label, _curves(runs, "time_s", f"{part}_{SHOWN_ALIGNMENT}"))

@@ -25,6 +25,9 @@ _REFERENCES = ("ground truth",)
 _MOST_DOTS = 4000
 """Of more points an even selection is drawn."""
 
+_LEAST_ROWS = 4
+"""Bars are no thicker than those of so many."""
+
 _BOUNDS_REACH = 3.0
 """Bounds are shown as far as this many times the largest value, or their own median."""
 
@@ -219,7 +222,7 @@ def _draw_samples(
     else:
         axes.set_xlim(left=0.0)
     axes.set_yticks(places, list(samples))
-    axes.set_ylim(0.4, len(samples) + 0.6)
+    axes.set_ylim(min(0.4, len(samples) - _LEAST_ROWS + 0.4), len(samples) + 0.6)
     axes.margins(x=0.14)
     axes.grid(visible=False, axis="y")
 
