@@ -58,14 +58,17 @@ def export(
             "--recording", metavar="DATA", help="The recording that was run, for its images."
         ),
     ] = None,
+    spacing: Annotated[
+        float, typer.Option("--spacing", min=0.0, help="Metres between keyframes with images.")
+    ] = 0.1,
     format_: Format = None,
     calibration: Calibration = None,
     sources: Sources = None,
 ) -> None:
     """Write a result for other programs: trajectories, or keyframes with images and points.
 
-    A run with --save-map exports the keyframes and points of its map, with the observations of the
-    first camera; otherwise keyframes are chosen by motion.
+    After a run with --save-map the keyframes and points of its map are exported too, with the
+    observations of the first camera.
     """
     from slam_graph.errors import ConfigError
     from slam_graph.results import load_result
@@ -88,7 +91,7 @@ def export(
     sequence = open_recording(recording, format_, calibration, None, sources)
     for folder in dict.fromkeys(scenes.values()):
         wanted = [name for name, path in scenes.items() if path == folder]
-        for file in saved.export(folder, sequence, wanted):
+        for file in saved.export(folder, sequence, wanted, spacing):
             typer.echo(str(file))
 
 

@@ -49,6 +49,11 @@ class RunSummary(Displayed):
 
     @property
     @abstractmethod
+    def loop_closed(self) -> Trajectory | None:
+        """The best trajectory after loop closure, if loops were to be closed."""
+
+    @property
+    @abstractmethod
     def points(self) -> FloatArray:
         """(P, 3) last estimates of the features that were in the state, in the world, m."""
 
@@ -83,18 +88,23 @@ class RunSummary(Displayed):
         self._drawn("inline_viewer.show_inline", paths, view.truth, view.points, (width, height))
 
     def export(
-        self, folder: Path | str, recording: Sequence, formats: Iterable[str] = SCENE_FORMATS
+        self,
+        folder: Path | str,
+        recording: Sequence,
+        formats: Iterable[str] = SCENE_FORMATS,
+        spacing_m: float = 0.1,
     ) -> list[Path]:
         """Write keyframes with their images, and points, for COLMAP or nerfstudio.
 
-        Of a run that saved a map these are the keyframes and points of the map, with the
-        observations of the first camera; otherwise keyframes are chosen by motion.
+        Keyframes are chosen by motion. Of a run that saved a map its keyframes are among them, the
+        points are those of the map, and observations of the first camera are known.
 
         Args:
             folder: is given `images/`, and for `colmap` a model in `sparse/0/`, for `nerfstudio`
                 `transforms.json` and `points.ply`.
             recording: that was run, for its images.
             formats: `colmap`, `nerfstudio`, or both.
+            spacing_m: between keyframes; a turn of 0.1 rad makes one too.
 
         Returns:
             The files, without the images.
@@ -108,7 +118,8 @@ class RunSummary(Displayed):
             if name not in SCENE_FORMATS:
                 raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
         require_models(self.rig)
-        parts = SceneParts(self.rig, self.best_trajectory, self.points, self._known_map())
+        trajectory = self.loop_closed or self.best_trajectory
+        parts = SceneParts(self.rig, trajectory, self.points, self._known_map(), spacing_m)
         scene = export_scene(parts, recording, folder / "images")
         files = []
         if "colmap" in formats:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframes with their images, and points: what programs for dense reconstruction start from.
 
-Where the run saved a map these are its keyframes and points, with the observations of the first
-camera. Otherwise keyframes are chosen by motion, and points have no observations.
+Keyframes are chosen by motion. Where the run saved a map, its keyframes are among them, the points
+are those of the map, and the first camera's observations in its keyframes are known.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ from slam_graph.geometry import Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
 
-_SPACING_M = 0.1
-_SPACING_RAD = 0.1
-"""Without a map a frame is a keyframe when the body has moved or turned so far since the last."""
+_TURN_RAD = 0.1
+"""A frame is also a keyframe when the body has turned so far since the last."""
 
 _SAME_FRAME_NS = 5_000_000
 """A keyframe of the map is the frame nearest in time, at most so far away."""
@@ -42,15 +41,17 @@ class SceneParts:
 
     Attributes:
         rig: calibration before the run.
-        trajectory: poses of the body.
+        trajectory: poses of the body, in the world of the map if there is one.
         points: (P, 3) features in the world, m.
-        known: the map of the run, which takes the place of all three, if there is one.
+        known: the map of the run, if there is one; it takes the place of rig and points.
+        spacing_m: a frame is a keyframe when the body has moved so far since the last.
     """
 
     rig: Rig
     trajectory: Trajectory
     points: FloatArray
     known: SlamMap | None
+    spacing_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
         raise DataError(
             f"{info.name}: has feature tracks and no images; there is nothing to export"
         )
-    chosen = _ByMotion(parts) if parts.known is None else _OfMap(parts.known)
+    chosen = _Keyframes(parts)
     shades = np.zeros((len(chosen.points), 2))
     images: list[SceneImage] = []
     for frame in _frames(recording):
@@ -136,48 +137,48 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
 _Keyframe = tuple[gtsam.Pose3, FloatArray, IntArray]
 
 
-class _OfMap:
-    """The keyframes of a map, with what they observe."""
-
-    def __init__(self, known: SlamMap) -> None:
-        if len(known.recordings) != 1:
-            raise DataError("the map is of several recordings; export the run of one of them")
-        self._map, self._left = known, set(range(len(known)))
-        self.rig, self.points = known.recordings[0].rig, known.points
-
-    def take(self, stamp_ns: int) -> _Keyframe | None:
-        """Pose and observations at a time; None where there is no keyframe."""
-        row = int(np.argmin(np.abs(self._map.stamps_ns - stamp_ns)))
-        if row not in self._left or abs(self._map.stamps_ns[row] - stamp_ns) > _SAME_FRAME_NS:
-            return None
-        self._left.remove(row)
-        observed = slice(self._map.offsets[row], self._map.offsets[row + 1])
-        features = self._map.features[observed]
-        seen = features >= 0
-        pixels = self.rig.cameras[0].camera.distort(self._map.normalized[observed][seen])[0]
-        return self._map.pose(row), pixels, features[seen]
-
-
-class _ByMotion:
-    """Frames between which the body has moved or turned enough."""
+class _Keyframes:
+    """Chooses frames, those of the map and those between which the body has moved enough."""
 
     def __init__(self, parts: SceneParts) -> None:
-        self.rig, self.points = parts.rig, parts.points
-        self._trajectory = parts.trajectory
+        self.rig, self.points, self._map = parts.rig, parts.points, parts.known
+        if self._map is not None:
+            if len(self._map.recordings) != 1:
+                raise DataError("the map is of several recordings; export the run of one of them")
+            self.rig, self.points = self._map.recordings[0].rig, self._map.points
+        self._parts = parts
         self._last: gtsam.Pose3 | None = None
 
     def take(self, stamp_ns: int) -> _Keyframe | None:
-        """The pose at a time; None where there is none, or it is too near to the last."""
+        """Pose and observations at a time; None if this is no keyframe."""
+        found = self._of_map(stamp_ns) or self._by_motion(stamp_ns)
+        if found is not None:
+            self._last = found[0]
+        return found
+
+    def _of_map(self, stamp_ns: int) -> _Keyframe | None:
+        known = self._map
+        if known is None or not len(known):
+            return None
+        row = int(np.argmin(np.abs(known.stamps_ns - stamp_ns)))
+        if abs(known.stamps_ns[row] - stamp_ns) > _SAME_FRAME_NS:
+            return None
+        observed = slice(known.offsets[row], known.offsets[row + 1])
+        features = known.features[observed]
+        seen = features >= 0
+        pixels = self.rig.cameras[0].camera.distort(known.normalized[observed][seen])[0]
+        return known.pose(row), pixels, features[seen]
+
+    def _by_motion(self, stamp_ns: int) -> _Keyframe | None:
         try:
-            pose = self._trajectory.at(stamp_ns)
-        except DataError:
+            pose = self._parts.trajectory.at(stamp_ns)
+        except DataError:  # before the estimate starts, or after its end
             return None
         if self._last is not None:
             step = self._last.between(pose)
             angle = float(np.linalg.norm(gtsam.Rot3.Logmap(step.rotation())))
-            if np.linalg.norm(step.translation()) < _SPACING_M and angle < _SPACING_RAD:
+            if np.linalg.norm(step.translation()) < self._parts.spacing_m and angle < _TURN_RAD:
                 return None
-        self._last = pose
         return pose, np.zeros((0, 2)), np.zeros(0, np.int64)
 
 
