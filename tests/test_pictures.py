@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import slam_graph as sg
-from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.evaluation.evaluation_report import nees_of_run
+from slam_graph.geometry.trajectory import Trajectory, interpolate
 from slam_graph.results.run_picture import PoseEstimate
 from slam_graph.visualization.bundle_picture import bundle_figure
 from slam_graph.visualization.panels import Panel, panel_figure
@@ -75,3 +76,25 @@ def test_scenes_of_any_size_keep_their_proportions(points: int) -> None:
         assert axes.get_xlabel()
         assert axes.get_ylabel()
         assert np.ptp(axes.get_xlim()) < 1e4, "one point far away makes the others no smaller"
+
+
+def test_errors_and_bounds_of_a_picture_are_those_of_the_nees() -> None:
+    """Without a given start the estimate is aligned, and its covariance is of what is left."""
+    flight = sg.simulate(duration_s=8.0, rate_hz=10.0, cameras=1, flight={"hover_s": 2.0})
+    result = sg.run(flight, overrides={"backend.initialization.mode": "static"})
+    result.check()
+    truth = result.groundtruth
+    assert truth is not None
+    assert not result.start_was_given
+    view = result._view()
+    for name, history in (("causal", result.history), ("smoothed", result.final_ba.history)):
+        judged, alignment = nees_of_run(truth, history, False, result.final_ba)
+        assert alignment == "yaw"
+        estimate = view.estimates[name]
+        own = np.isin(estimate.trajectory.stamps_ns, judged.stamps_ns)
+        true, _ = interpolate(truth, judged.stamps_ns)
+        error = estimate.trajectory.positions[own] - true.positions
+        R = Rotation.from_quat(estimate.trajectory.quaternions[own]).as_matrix()
+        P = R @ estimate.covariances[own, 3:, 3:] @ R.transpose(0, 2, 1)
+        nees = np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])
+        np.testing.assert_allclose(nees, judged.position, rtol=1e-6)
