@@ -5,6 +5,7 @@
 import importlib
 import re
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,3 +146,10 @@ def test_the_viewer_of_a_notebook_is_asked_for_by_name(
     monkeypatch.setattr("slam_graph.visualization.inline_viewer.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="rerun-sdk\\[notebook\\]"):
         result.show()
+
+
+def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult) -> None:
+    pytest.importorskip("rerun_notebook")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result.show(400, 300)

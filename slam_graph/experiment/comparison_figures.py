@@ -34,6 +34,8 @@ _TIME = "time [s]"
 
 _ERRORS = (("translation_m", "position error [m]"), ("rotation_deg", "orientation error [deg]"))
 
+_NEES_LABEL = "NEES of the pose"
+
 NEES_DOF = {"orientation": 3, "position": 3, "pose": 6}
 
 
@@ -110,13 +112,14 @@ def _summary_panels(tasks: list[RunTask]) -> list[Panel]:
         label: lambda m, part=part: m["accuracy"][SHOWN_ALIGNMENT]["ate"][part]["rmse"]  # type: ignore[misc]
         for part, label in _ERRORS
     }
-    quantities["NEES of the pose (ideal: 6)"] = lambda m: m["nees"]["pose"]["mean"]
+    quantities[_NEES_LABEL] = lambda m: m["nees"]["pose"]["mean"]
     quantities["back end, ms per frame"] = lambda m: m["timing"]["stages"][STAGE]["mean_ms"]
     panels = []
     for label, get in quantities.items():
         samples = {name: np.array(list(numbers(metrics, get))) for name, metrics in runs.items()}
         if any(len(values) for values in samples.values()):
-            panels.append(Panel(label, "", samples=samples))
+            ideal = float(NEES_DOF["pose"]) if label == _NEES_LABEL else None
+            panels.append(Panel(label, "", samples=samples, ideal=ideal))
     return panels
 
 

@@ -46,6 +46,7 @@ class Panel:
         band_label: label of the band.
         bounds: by the label of a curve x and the half width (N,) of what is shaded around zero.
         samples: values (N,) by their labels: a bar where all have one value, else boxes.
+        ideal: the value that samples should have, if there is one.
         dots: (N, 2) points in the background, if there are any.
         title: above the panel.
     """
@@ -58,6 +59,7 @@ class Panel:
     band_label: str = ""
     bounds: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     samples: Mapping[str, FloatArray] = field(default_factory=dict)
+    ideal: float | None = None
     dots: FloatArray | None = None
     title: str = ""
 
@@ -113,6 +115,11 @@ def _draw(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
     if panel.samples:
         _draw_samples(axes, panel.samples, styles)
+        if panel.ideal is not None:
+            axes.axvline(panel.ideal, color=GREY, linestyle="--", linewidth=1.0, zorder=0.5)
+            axes.annotate(
+                " ideal", (panel.ideal, axes.get_ylim()[1]), va="top", color="0.4", size=8
+            )
         return
     if not panel.curves and not panel.bounds:
         axes.set(xticks=[], yticks=[])
