@@ -3,8 +3,8 @@
 """The command `slam-graph`: launches a command and turns errors into exit codes.
 
 Exit codes: 0 success; 1 expected failure, with one line on stderr; 2 usage or configuration error;
-3 ran, but never initialised, diverged or covered less than asked; 130 interrupted. Modules that are
-slow to import are imported inside the commands.
+3 ran, but never initialised, diverged, covered less than asked or made no map; 130 interrupted.
+Modules that are slow to import are imported inside the commands.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from slam_graph.cli import (
     compare,
     data_commands,
     evaluate,
+    export,
     frontend,
     map,
     optimize,
@@ -84,6 +85,7 @@ app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
 app.command("rpe")(evaluate.rpe)
+app.command("export")(export.export)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)

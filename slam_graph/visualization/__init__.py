@@ -8,36 +8,24 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "Panel",
+    "Picture",
     "RerunViewer",
     "TrackPictures",
-    "plot_bundle",
-    "plot_errors",
-    "plot_panels",
-    "plot_pose_graph",
+    "panel_figure",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.visualization.plots import (
-        Panel,
-        plot_bundle,
-        plot_errors,
-        plot_panels,
-        plot_pose_graph,
-    )
+    from slam_graph.visualization.panels import Panel, panel_figure
     from slam_graph.visualization.rerun_viewer import RerunViewer
+    from slam_graph.visualization.style import Picture
     from slam_graph.visualization.track_picture import TrackPictures
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "plots": (
-                "Panel",
-                "plot_bundle",
-                "plot_errors",
-                "plot_panels",
-                "plot_pose_graph",
-            ),
+            "panels": ("Panel", "panel_figure"),
             "rerun_viewer": ("RerunViewer",),
+            "style": ("Picture",),
             "track_picture": ("TrackPictures",),
         },
     )
