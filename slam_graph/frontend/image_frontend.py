@@ -146,6 +146,7 @@ class ImageFrontend:
                 FeatureObservations.empty() if image is None else tracks.observations()
                 for image, tracks in zip(images, self._tracks, strict=True)
             ),
+            tuple(tracker.outliers.observations() for tracker in self._trackers),
         )
 
     def drop(self, ids: IntArray) -> None:

@@ -8,7 +8,7 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "Panel",
-    "RerunViewer",
+    "RerunRecording",
     "TrackPictures",
     "plot_bundle",
     "plot_errors",
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         plot_panels,
         plot_pose_graph,
     )
-    from slam_graph.visualization.rerun_viewer import RerunViewer
+    from slam_graph.visualization.rerun_recording import RerunRecording
     from slam_graph.visualization.track_picture import TrackPictures
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -37,7 +37,7 @@ else:
                 "plot_panels",
                 "plot_pose_graph",
             ),
-            "rerun_viewer": ("RerunViewer",),
+            "rerun_recording": ("RerunRecording",),
             "track_picture": ("TrackPictures",),
         },
     )
