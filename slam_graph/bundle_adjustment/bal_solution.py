@@ -8,10 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
 from slam_graph.bundle_adjustment.bal_file import bal_lines
-from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
+from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem, usable
+from slam_graph.diagnostics import Diagnostics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +53,17 @@ class BalSolution:
     part: BalPart
     minimum: BalMinimum
     estimates: BalEstimates
+
+    @staticmethod
+    def unsolved(problem: BalProblem) -> BalSolution:
+        """A problem as it is: what could be adjusted of it, with its own estimates.
+
+        Raises:
+            DataError: if nothing of it can be estimated.
+        """
+        part = usable(problem, Diagnostics())
+        minimum = BalMinimum(part.problem.estimates, np.nan, np.nan, 0, 0, False)
+        return BalSolution(problem, part, minimum, problem.estimates)
 
     @cached_property
     def adjusted(self) -> BalEstimates:

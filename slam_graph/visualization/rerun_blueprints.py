@@ -105,22 +105,30 @@ def plot_view(plot: Plot) -> Any:
         name=plot.title,
         origin=plot.entity,
         contents="$origin/**",
+        axis_x=whole_axis(),
         # with bounds it would have nine lines, and colours are those of the plot of the velocity
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=len(plot.bounds) < 6),
     )
 
 
-def whole(*views: Any, follow: bool = True, timeline: str = SENSOR_TIME) -> Any:
-    """A layout with the panels out of the way, which opens at the end of the time."""
+def whole_axis() -> Any:
+    """An axis of time that shows all of it, also while the view follows the end."""
     import rerun.blueprint as rrb
 
+    ends = rrb.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=ends, end=ends))
+
+
+def whole(*views: Any, timeline: str | None = SENSOR_TIME) -> Any:
+    """A layout with the panels out of the way, which opens at the end of the time, if there is any."""
+    import rerun.blueprint as rrb
+
+    time = rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
     return rrb.Blueprint(
         *views,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline=timeline, play_state="following" if follow else "paused"
-        ),
+        rrb.TimePanel(state="hidden") if timeline is None else time,
         auto_views=False,
     )
 

@@ -15,6 +15,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, Rig, RigCamera
 from slam_graph.visualization.rerun_palette import (
     GREEN,
+    LIGHT_GREY,
     ORANGE,
     PURPLE,
     SKY,
@@ -77,7 +78,7 @@ class CameraViews:
                 image_from_camera=K,
                 resolution=(camera.width // shrink, camera.height // shrink),
                 image_plane_distance=frustum_m,
-                color=SKY,
+                color=LIGHT_GREY,
                 line_width=-1.0,
             )
             entity = self._entity(index)

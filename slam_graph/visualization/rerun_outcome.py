@@ -40,12 +40,12 @@ _TRUTH_POINTS = 2000
 LEGEND = """\
 # What is shown
 
-**Space.** Orange: causal path. Light blue: smoothed path. Light grey: ground truth, aligned in yaw
+**Space.** Light blue: causal path. Red: smoothed path. Light grey: ground truth, aligned in yaw
 and position over the whole run. Small points: the map, coloured by height (dark blue is low, yellow
 is high). Larger points are features of this frame: green, in the state; yellow, used in this step;
-red, rejected by the gate. White points: past poses in the window; purple: keyframes. Purple
-lines: loop closures. The arrow at the start is gravity. Ellipsoids at the body: 1σ and 3σ of its
-position.
+red, rejected by the gate. White points: past poses in the window; purple: keyframes. Green:
+loop closures and the path after them. The arrow at the start is gravity. Ellipsoids at the body: 1σ
+and 3σ of its position.
 
 **Cameras.** Tails are the last 12 places of a feature; dark is young, yellow is old. Points: green,
 tracked; yellow, new; light blue, seen by another camera too; red, rejected by the gate; orange,
@@ -215,7 +215,7 @@ class OutcomeLog:
             colors=LIGHT_GREY,
             radii=-1.5,
             labels=["gravity"],
-            show_labels=False,
+            show_labels=True,
         )
         self._stream.log(f"{self._world}/gravity", arrow, static=True)
 

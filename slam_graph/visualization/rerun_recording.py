@@ -4,13 +4,36 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from slam_graph.arrays import FloatArray
+from slam_graph.bundle_adjustment import BalSolution
+from slam_graph.datasets import Sequence
+from slam_graph.maps import SlamMap
+from slam_graph.pose_graph import PoseGraphSolution
+from slam_graph.sensors import Rig
 from slam_graph.visualization.rerun_images import ImagesMode
+from slam_graph.visualization.rerun_outcome import FinishedRun
+from slam_graph.visualization.rerun_problems import show_bundle, show_pose_graph
+from slam_graph.visualization.rerun_screenshot import (
+    open_recording,
+    save_screenshot,
+    serve_recording,
+)
 from slam_graph.visualization.rerun_stream import RerunMode, RerunStream
 from slam_graph.visualization.rerun_viewer import DetailMode, RerunViewer
+from slam_graph.visualization.rerun_world import (
+    ComparedRun,
+    SavedDetails,
+    show_comparison,
+    show_map,
+    show_recording,
+    show_saved_run,
+)
 
 
 class RerunRecording:
@@ -59,3 +82,77 @@ class RerunRecording:
             detail: `graph` adds the factor graph of every window and its information.
         """
         return RerunViewer(self._stream, images, detail)
+
+    def show_run(
+        self,
+        run: FinishedRun,
+        points: FloatArray,
+        timing: Mapping[str, FloatArray],
+        rig: Rig | None = None,
+        log: Iterable[str] = (),
+        known_map: SlamMap | None = None,
+    ) -> None:
+        """A run that has ended, from what its files hold.
+
+        Args:
+            run: trajectories and errors.
+            points: (P, 3) its map, m.
+            timing: (F,) milliseconds of stages by their names, and `stamp_ns`.
+            rig: the sensors, if they are known.
+            log: lines.
+            known_map: the map that it was located in, if it is at hand.
+        """
+        details = SavedDetails(rig, points, timing, log, known_map)
+        show_saved_run(self._stream, run, details)
+
+    def show_map(self, content: SlamMap) -> None:
+        """A map."""
+        show_map(self._stream, content)
+
+    def show_recording(self, sequence: Sequence, images: bool = True) -> None:
+        """A recording as it is; images only if wanted."""
+        show_recording(self._stream, sequence, images)
+
+    def show_pose_graph(self, solution: PoseGraphSolution) -> None:
+        """A pose graph before and after its optimisation."""
+        show_pose_graph(self._stream, solution)
+
+    def show_bundle(self, solution: BalSolution) -> None:
+        """A bundle adjustment before and after."""
+        show_bundle(self._stream, solution)
+
+    def show_comparison(
+        self, runs: Mapping[str, Mapping[str, FloatArray]], true_path: FloatArray | None
+    ) -> None:
+        """Several runs over one another.
+
+        Args:
+            runs: for each name `path` (N, 3) in m, `time_s` (N,), and errors (N,) by the titles of
+                their plots.
+            true_path: (M, 3) in the same world, if there is one.
+        """
+        compared = [
+            ComparedRun(
+                name,
+                columns["path"],
+                columns["time_s"],
+                {title: c for title, c in columns.items() if title not in ("path", "time_s")},
+            )
+            for name, columns in runs.items()
+        ]
+        show_comparison(self._stream, compared, true_path)
+
+    @staticmethod
+    def screenshot(recording: Path, picture: Path, size: tuple[int, int] = (1600, 1000)) -> None:
+        """A picture of how a saved recording opens; see `save_screenshot` for arguments."""
+        save_screenshot(recording, picture, size)
+
+    @staticmethod
+    def open(recording: Path) -> None:
+        """Open a saved recording in a window, and go on; see `open_recording` for errors."""
+        open_recording(recording)
+
+    @staticmethod
+    def serve(recording: Path) -> tuple[subprocess.Popen[bytes], str]:
+        """Serve a saved recording to browsers: the server, and the address to open."""
+        return serve_recording(recording)

@@ -108,6 +108,16 @@ class RerunStream:
         ]
         self._raw.send_columns(entity, indexes=times, columns=columns)
 
+    def send_along(self, entity: str, times: Any, columns: Any) -> None:
+        """Log N rows on a timeline of their own.
+
+        Args:
+            entity: where.
+            times: `TimeColumn` of Rerun.
+            columns: of an archetype of Rerun.
+        """
+        self._raw.send_columns(entity, indexes=[times], columns=columns)
+
     def arrange(self, blueprint: Any) -> None:
         """Send the layout of the viewer."""
         self._raw.send_blueprint(blueprint)

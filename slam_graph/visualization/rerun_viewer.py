@@ -22,7 +22,6 @@ from slam_graph.visualization.rerun_palette import (
     CAUSAL,
     GREEN,
     PURPLE,
-    SKY,
     VERMILLION,
     YELLOW,
     robust_range,
@@ -192,7 +191,7 @@ class RerunViewer:
         return rr.Ellipsoids3D(
             half_sizes=[sigmas, 3 * sigmas],
             quaternions=[rr.Quaternion(xyzw=quaternion)] * 2,
-            colors=[(*SKY, 255), (*SKY, 120)],
+            colors=[(*YELLOW, 255), (*YELLOW, 120)],
             line_radii=-0.6,
             fill_mode="majorwireframe",
         )
