@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -46,6 +47,24 @@ class Watching:
         if self.mode == "off":
             return None
         return self.recording(path, name).viewer(self.images, self.detail)
+
+    def show(self, folder: Path, name: str, log: Callable[[RerunRecording], None]) -> list[Path]:
+        """Show a result, if that was asked for.
+
+        Args:
+            folder: of the result; a recording is saved there.
+            name: of the recording.
+            log: logs the result.
+
+        Returns:
+            The file that was written, if one was.
+        """
+        if self.mode == "off":
+            return []
+        path = folder / "recording.rrd"
+        with self.recording(path, name) as recording:
+            log(recording)
+        return [path] if self.mode == "save" else []
 
     def recording(self, path: Path, name: str) -> RerunRecording:
         """The recording that was asked for; arguments and errors as for `viewer`."""

@@ -20,6 +20,9 @@ _SPREAD_PERCENT = (8.0, 92.0)
 TAIL_FRAMES, TAIL_S = 12, 0.6
 """How long the way of a feature stays behind it, on either timeline."""
 
+WINDOW_BOUNDS = ((-140.0, 1140.0), (-420.0, 250.0))
+"""Ranges of x and y in which the graph of a window is drawn."""
+
 _DISTANCE = 0.95
 """Distance of the eye from what it looks at, in diameters of that."""
 
@@ -120,7 +123,7 @@ def whole_axis() -> Any:
 
 
 def whole(*views: Any, timeline: str | None = SENSOR_TIME) -> Any:
-    """A layout with the panels out of the way, which opens at the end of the time, if there is any."""
+    """A layout with the panels out of the way, which opens at the end of a timeline, if any."""
     import rerun.blueprint as rrb
 
     time = rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
@@ -230,8 +233,13 @@ def window() -> Any:
     """The factor graph of the window, and its information before and after marginalization."""
     import rerun.blueprint as rrb
 
+    across, down = WINDOW_BOUNDS
+    bounds = rrb.VisualBounds2D(x_range=across, y_range=down)
+
     return rrb.Vertical(
-        rrb.Spatial2DView(name="Factor graph of the window", origin="/window/graph"),
+        rrb.Spatial2DView(
+            name="Factor graph of the window", origin="/window/graph", visual_bounds=bounds
+        ),
         rrb.Horizontal(
             rrb.Spatial2DView(name="Information before marginalization", origin="/window/before"),
             rrb.Spatial2DView(name="After: the prior of the next window", origin="/window/after"),

@@ -36,6 +36,9 @@ _VIRIDIS: Colours = np.ascontiguousarray(
     cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8
 )
 
+_DARKEST = 55
+"""Where the scale begins: darker colours cannot be seen on the background."""
+
 _ROBUST_PERCENT = (3.0, 97.0)
 """What is below or above these percentiles gets the colour at the end of the scale."""
 
@@ -43,7 +46,7 @@ _ROBUST_PERCENT = (3.0, 97.0)
 def scaled(values: FloatArray, low: float, high: float) -> Colours:
     """Colours (N, 3) of values (N,) on the scale viridis, from dark blue (low) to yellow (high)."""
     part = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
-    return _VIRIDIS[(255 * part).astype(np.uint8)]
+    return _VIRIDIS[(_DARKEST + (255 - _DARKEST) * part).astype(np.uint8)]
 
 
 def robust_range(values: FloatArray) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from slam_graph.visualization.rerun_stream import RerunStream
 EDGE = "edge"
 """Timeline of pose graphs: the number of the edge."""
 
-_LEAST_CHI2 = 1e-6
+_LEAST_CHI2 = 1e-3
 _BINS = 60
 _ERROR_PERCENTILE = 98.0
 _VIEWED_PERCENT = (2.0, 98.0)
@@ -125,7 +125,7 @@ def _pose_graph_layout(eyes: list[Eye | None]) -> Any:
     residuals = rrb.TimeSeriesView(
         name="log10 χ² of each edge",
         origin="/residuals",
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
         axis_x=whole_axis(),
     )
     text = rrb.TextDocumentView(name="Summary", origin="/summary")

@@ -30,6 +30,7 @@ from slam_graph.visualization.rerun_palette import (
 from slam_graph.visualization.rerun_progress import ShownFrame, StepSeries
 from slam_graph.visualization.rerun_series import SeriesLog
 from slam_graph.visualization.rerun_stream import RerunStream
+from slam_graph.visualization.rerun_window import show_window
 
 DetailMode = Literal["normal", "graph"]
 
@@ -129,8 +130,7 @@ class RerunViewer:
         self._show_features(frame, estimator)
         self._show_window(estimator)
         if self._detail == "graph":
-            pass
-
+            show_window(self._stream, estimator)
         if self._truth is not None and number % _ALIGN_FRAMES == 0:
             given = estimator.start_is_given
             self._outcome.show_truth(self._truth, self._history.trajectory(), given)

@@ -220,7 +220,9 @@ def show_comparison(
     for number, run in enumerate(runs):
         colour, name = CYCLE[number % len(CYCLE)], rr.escape_entity_path_part(run.name)
         places.append(run.path)
-        line = rr.LineStrips3D([run.path], colors=colour, radii=-1.2, labels=[run.name])
+        line = rr.LineStrips3D(
+            [run.path], colors=colour, radii=-1.2, labels=[run.name], show_labels=False
+        )
         stream.log(f"paths/{name}", line, static=True)
         row = [run.name]
         for index, (title, values) in enumerate(run.errors.items()):
@@ -233,7 +235,9 @@ def show_comparison(
             row.append(f"{np.sqrt(np.mean(values**2)):.4g}")
         rows.append("| " + " | ".join(row) + " |")
     if true_path is not None:
-        line = rr.LineStrips3D([true_path], colors=TRUTH, radii=-0.8, labels=["ground truth"])
+        line = rr.LineStrips3D(
+            [true_path], colors=TRUTH, radii=-0.8, labels=["ground truth"], show_labels=False
+        )
         stream.log("paths/ground_truth", line, static=True)
         places.append(true_path)
     head = "| RMSE | " + " | ".join(titles) + " |\n" + "|---" * (1 + len(titles)) + "|\n"
