@@ -34,7 +34,7 @@ from slam_graph.cli.options import (
     run_settings,
 )
 from slam_graph.cli.run import execute, report
-from slam_graph.cli.watching import Watching
+from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.maps import MapRecording, SlamMap
@@ -100,6 +100,7 @@ def localize(
         watching = Watching(rerun, rerun_images, rerun_detail, rerun_address)
         result, folder, files = execute(sequence, settings, output, watching, progress, log, known)
     report(result, folder, files, as_json)
+    keep_serving(rerun)
     if result.localization is None or result.localization.located.any():
         return
     if result.localization.counts["queries"] == 0:

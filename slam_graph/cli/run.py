@@ -308,7 +308,7 @@ def execute(
     from slam_graph.results import ResultFolder
 
     with ResultFolder.of_run(output, sequence.info().name) as made:
-        viewer = watching.viewer(made.folder / "recording.rrd", sequence.info().name)
+        viewer = watching.viewer(made.folder / "recording.rrd", sequence.info().name, known_map)
         with _progress(sequence, settings, progress) as bar:
             result = run_pipeline(
                 sequence,

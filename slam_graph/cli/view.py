@@ -48,6 +48,10 @@ def view(
     images: Annotated[
         bool, typer.Option("--images/--no-images", help="Whether images of a recording are shown.")
     ] = True,
+    known_map: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAP", help="Map that the run was located in."),
+    ] = None,
     rerun_address: RerunAddress = None,
     format_: Format = None,
     calibration: Calibration = None,
@@ -70,7 +74,7 @@ def view(
     if existing is not None:
         _show_existing(existing, mode, output, screenshot, pixels)
         return
-    name, show = _shown(what, images, (format_, calibration, groundtruth, sources))
+    name, show = _shown(what, images, known_map, (format_, calibration, groundtruth, sources))
     with tempfile.TemporaryDirectory(prefix="slam_graph_") as folder:
         files = output is not None or screenshot is not None
         path = output or Path(folder) / f"{name}{_RRD}"
@@ -139,6 +143,7 @@ def _show_existing(
 def _shown(
     what: list[str],
     images: bool,
+    known_map: Path | None,
     options: tuple[str | None, Path | None, Path | None, list[str] | None],
 ) -> tuple[str, _Show]:
     """The name of what is meant, and what logs it.
@@ -152,7 +157,7 @@ def _shown(
         return "comparison", files.runs_compared([Path(path) for path in what])
     path = Path(what[0])
     for folder in (path, path / "latest"):
-        if folder.is_dir() and (found := files.of_folder(folder)) is not None:
+        if folder.is_dir() and (found := files.of_folder(folder, known_map)) is not None:
             return folder.resolve().parent.name or path.name, found
     if path.is_file() and options[0] is None and (found := files.of_file(path)) is not None:
         return path.stem, found

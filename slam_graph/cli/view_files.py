@@ -20,7 +20,7 @@ _Show = Callable[["RerunRecording"], None]
 _GRAPH_SUFFIXES = {".g2o", ".graph", ".toro"}
 
 
-def of_folder(folder: Path) -> _Show | None:
+def of_folder(folder: Path, known_map: Path | None = None) -> _Show | None:
     """What logs a folder of results; None if it is none."""
     if (folder / "optimized.g2o").is_file():
         return _optimized_graph(folder)
@@ -29,7 +29,7 @@ def of_folder(folder: Path) -> _Show | None:
     if (folder / "runs").is_dir() and (folder / "summary.json").is_file():
         return _comparison(folder)
     if (folder / "metrics.json").is_file() and (folder / "trajectory.tum").is_file():
-        return _run(folder)
+        return _run(folder, known_map)
     if (folder / "map.slam").is_file():
         return _map(folder / "map.slam")
     return None
@@ -101,12 +101,13 @@ def _map(path: Path) -> _Show:
     return lambda recording: recording.show_map(content)
 
 
-def _run(folder: Path) -> _Show:
+def _run(folder: Path, known_map: Path | None) -> _Show:
     """A run from its files."""
     from slam_graph.errors import SlamGraphError
-    from slam_graph.results import load_result
+    from slam_graph.results import load_map, load_result
 
     saved = load_result(folder)
+    known = None if known_map is None else load_map(known_map)
     log = folder / "run.log"
     lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
     try:
@@ -116,7 +117,7 @@ def _run(folder: Path) -> _Show:
 
     def show(recording: RerunRecording) -> None:
         timing = _timing(folder / "timing.csv")
-        recording.show_run(saved, saved.points, timing, rig, lines, saved.slam_map)
+        recording.show_run(saved, saved.points, timing, rig, lines, known)
 
     return show
 

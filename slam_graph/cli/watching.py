@@ -15,6 +15,7 @@ import typer
 from slam_graph.cli.options import RerunMode
 
 if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
     from slam_graph.visualization import RerunRecording
 
 
@@ -34,19 +35,20 @@ class Watching:
     detail: Literal["normal", "graph"] = "normal"
     address: str | None = None
 
-    def viewer(self, path: Path, name: str) -> Any:
+    def viewer(self, path: Path, name: str, known_map: SlamMap | None = None) -> Any:
         """The viewer that was asked for, or None.
 
         Args:
             path: of the file, if the run is saved.
             name: of the recording.
+            known_map: the map that the run is located in, if there is one.
 
         Raises:
             DataError: if it cannot be shown or reached.
         """
         if self.mode == "off":
             return None
-        return self.recording(path, name).viewer(self.images, self.detail)
+        return self.recording(path, name).viewer(self.images, self.detail, known_map)
 
     def show(self, folder: Path, name: str, log: Callable[[RerunRecording], None]) -> list[Path]:
         """Show a result, if that was asked for.

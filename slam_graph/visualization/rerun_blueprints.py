@@ -20,7 +20,10 @@ _SPREAD_PERCENT = (8.0, 92.0)
 TAIL_FRAMES, TAIL_S = 12, 0.6
 """How long the way of a feature stays behind it, on either timeline."""
 
-WINDOW_BOUNDS = ((-140.0, 1140.0), (-420.0, 250.0))
+KNOWN_MAP = "known_map"
+"""Entity of the world of a map in which a run is located."""
+
+WINDOW_BOUNDS = ((-140.0, 2040.0), (-400.0, 240.0))
 """Ranges of x and y in which the graph of a window is drawn."""
 
 _DISTANCE = 0.95
@@ -146,7 +149,8 @@ class Shown:
         plots: entities of the plots that have values.
         log: whether there is a log.
         window: whether the factor graph of every window is shown.
-        in_map: whether the run was located in a map.
+        in_map: whether the run is located in a map.
+        map_path: (N, 3) path in that map, if it is known already.
     """
 
     world: str = "world"
@@ -155,6 +159,7 @@ class Shown:
     log: bool = False
     window: bool = False
     in_map: bool = False
+    map_path: FloatArray | None = None
 
 
 GROWING = ("path/causal", "path/smoothed", "map/points", "keyframes")
@@ -180,10 +185,13 @@ def odometry(shown: Shown, eye: Eye | None = None) -> Any:
     grown = [f"{root}/{name}" for name in GROWING]
     spaces = [space("Run", root, ["$origin/**", *flat], grown, eye, body)]
     if shown.in_map:
-        spaces.insert(0, space("Map", "/known_map", grown=["/known_map/path"]))
+        place = Eye.on(shown.map_path) if shown.map_path is not None else None
+        view = space("In the map", f"/{KNOWN_MAP}", grown=[f"/{KNOWN_MAP}/path"], eye=place)
+        spaces.insert(0, view)
     if shown.window:
         spaces.append(window())
-    three = spaces[0] if len(spaces) == 1 else rrb.Tabs(*spaces, active_tab=0)
+    active = len(spaces) - 1 if shown.window else 0
+    three = spaces[0] if len(spaces) == 1 else rrb.Tabs(*spaces, active_tab=active)
     cameras = [_camera(f"cam{number}", f"{body}/cam{number}") for number in range(shown.cameras)]
     left = rrb.Vertical(three, rrb.Horizontal(*cameras), row_shares=[67, 33]) if cameras else three
     right = _plots(shown)

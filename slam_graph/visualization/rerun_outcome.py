@@ -29,8 +29,8 @@ from slam_graph.visualization.rerun_palette import (
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 from slam_graph.visualization.rerun_stream import RerunStream
 
-PATH_RADIUS = -1.2
-"""Of paths: negative radii are in pixels of the screen."""
+PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.1, TRUTH: -0.7, IN_MAP: -2.6}
+"""Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
 POINT_RADIUS = -1.3
 
@@ -189,7 +189,9 @@ class OutcomeLog:
 
     def style(self, entity: str, colour: Colour) -> None:
         """Say how the pieces of a path look; each piece has its points only."""
-        lines = self._stream.rr.LineStrips3D.from_fields(colors=[colour], radii=[PATH_RADIUS])
+        lines = self._stream.rr.LineStrips3D.from_fields(
+            colors=[colour], radii=[PATH_RADII[colour]]
+        )
         self._stream.log(entity, lines, static=True)
 
     def show_truth(self, truth: Trajectory, estimate: Trajectory, given: bool) -> None:
@@ -202,7 +204,7 @@ class OutcomeLog:
         if not self._truth_sent:
             self._truth_sent = True
             step = max(1, len(truth) // _TRUTH_POINTS)
-            line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=-0.8)
+            line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=PATH_RADII[TRUTH])
             self._stream.log(entity, line, static=True)
         placed = rr.Transform3D(translation=onto.translation, mat3x3=onto.rotation)
         self._stream.log(entity, placed, static=True)

@@ -17,6 +17,7 @@ from slam_graph.maps import SlamMap
 from slam_graph.pose_graph import PoseGraphSolution
 from slam_graph.sensors import Rig
 from slam_graph.visualization.rerun_images import ImagesMode
+from slam_graph.visualization.rerun_map import show_map
 from slam_graph.visualization.rerun_outcome import FinishedRun
 from slam_graph.visualization.rerun_problems import show_bundle, show_pose_graph
 from slam_graph.visualization.rerun_screenshot import (
@@ -30,7 +31,6 @@ from slam_graph.visualization.rerun_world import (
     ComparedRun,
     SavedDetails,
     show_comparison,
-    show_map,
     show_recording,
     show_saved_run,
 )
@@ -74,14 +74,20 @@ class RerunRecording:
         """Send what is left; a saved file appears under its name."""
         self._stream.close()
 
-    def viewer(self, images: ImagesMode = "all", detail: DetailMode = "normal") -> RerunViewer:
+    def viewer(
+        self,
+        images: ImagesMode = "all",
+        detail: DetailMode = "normal",
+        known_map: SlamMap | None = None,
+    ) -> RerunViewer:
         """A viewer of a run for the pipeline, which closes the recording.
 
         Args:
             images: of which frames images are sent.
             detail: `graph` adds the factor graph of every window and its information.
+            known_map: the map that the run is located in, if there is one.
         """
-        return RerunViewer(self._stream, images, detail)
+        return RerunViewer(self._stream, images, detail, known_map)
 
     def show_run(
         self,

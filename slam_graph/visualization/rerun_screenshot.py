@@ -140,7 +140,7 @@ def _settled_picture(viewer: subprocess.Popen[bytes], address: str) -> np.ndarra
 def _reason(said: str) -> str:
     """Why there is no picture, from what the viewer said."""
     low = said.lower()
-    if any(word in low for word in ("adapter", "vulkan", "wgpu", "graphics")):
+    if any(word in low for word in ("adapter", "vulkan", "render context", "graphics")):
         return _NO_GRAPHICS
     lines = [line for line in said.splitlines() if line.strip()]
     return f"no picture could be made: {lines[-1] if lines else 'the viewer ended'}"

@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend import Estimator
 from slam_graph.geometry import NavState, StateHistory, Trajectory
+from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
-from slam_graph.visualization.rerun_blueprints import Eye, Shown, odometry
+from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
+from slam_graph.visualization.rerun_map import log_map
 from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
@@ -48,12 +50,18 @@ class RerunViewer:
         stream: where it goes.
         images: of which frames images are sent.
         detail: `graph` adds the factor graph of every window and its information.
+        known_map: the map that the run is located in, if there is one.
     """
 
     def __init__(
-        self, stream: RerunStream, images: ImagesMode = "all", detail: DetailMode = "normal"
+        self,
+        stream: RerunStream,
+        images: ImagesMode = "all",
+        detail: DetailMode = "normal",
+        known_map: SlamMap | None = None,
     ) -> None:
         self._stream, self._images, self._detail = stream, images, detail
+        self._known_map = known_map
         self._series = SeriesLog(self._stream)
         self._steps = StepSeries(self._series)
         self._log_handler = _LogHandler(self._stream)
@@ -75,6 +83,8 @@ class RerunViewer:
         """Send what does not change, and the layout."""
         logging.getLogger("slam_graph").addHandler(self._log_handler)
         self._truth = truth
+        if self._known_map is not None:
+            log_map(self._stream, KNOWN_MAP, self._known_map)
         self._set_world(rig)
 
     def _set_world(self, rig: Rig) -> None:
@@ -86,9 +96,14 @@ class RerunViewer:
         self._cameras.mount(rig)
         self._outcome.style(f"{self._world}/path/causal", CAUSAL)
         self._outcome.show_legend()
-        self._arrange(frozenset(), None)
+        self._arrange()
 
-    def _arrange(self, outcome_plots: frozenset[str], eye: Eye | None) -> None:
+    def _arrange(
+        self,
+        outcome_plots: frozenset[str] = frozenset(),
+        eye: Eye | None = None,
+        in_map: Trajectory | None = None,
+    ) -> None:
         """Send the layout."""
         plots = outcome_plots | StepSeries.PLOTS
         if self._truth is not None:
@@ -99,6 +114,8 @@ class RerunViewer:
             plots,
             log=True,
             window=self._detail == "graph",
+            in_map=self._known_map is not None,
+            map_path=None if in_map is None or not len(in_map) else in_map.positions,
         )
         self._stream.arrange(odometry(shown, eye))
 
@@ -143,7 +160,7 @@ class RerunViewer:
         plots = self._outcome.show(result)
         best = result.smoothed or result.trajectory
         points = np.concatenate([*self._heights, np.zeros((0, 3))])
-        self._arrange(plots, Eye.on(best.positions, points))
+        self._arrange(plots, Eye.on(best.positions, points), result.in_map)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""

@@ -33,7 +33,7 @@ from slam_graph.visualization.rerun_palette import (
 )
 from slam_graph.visualization.rerun_stream import RerunStream
 
-_WIDTH, _ROW, _LANDMARK_ROWS = 1000.0, 34.0, 7
+_WIDTH, _ROW, _LANDMARK_ROWS = 1900.0, 34.0, 7
 _LEAST = -4.0
 """Logarithm of the smallest normalised information that has a colour of its own."""
 

@@ -14,18 +14,24 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
-from slam_graph.visualization.rerun_blueprints import Eye, Shown, odometry, space, whole, whole_axis
+from slam_graph.visualization.rerun_blueprints import (
+    KNOWN_MAP,
+    Eye,
+    Shown,
+    odometry,
+    space,
+    whole,
+    whole_axis,
+)
 from slam_graph.visualization.rerun_images import CameraViews
-from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
-from slam_graph.visualization.rerun_palette import CYCLE, GREEN, TRUTH, robust_range, scaled
+from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
+from slam_graph.visualization.rerun_palette import CYCLE, TRUTH
 from slam_graph.visualization.rerun_series import SeriesLog
 from slam_graph.visualization.rerun_stream import RerunStream
 
 _SINCE_START = "since_start"
 """Timeline of comparisons."""
-
-KNOWN_MAP = "known_map"
-"""Entity of the world of a map in which a run is located."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
     if details.rig is not None:
         CameraViews(stream, details.rig, "world/body").mount(details.rig)
     if details.known_map is not None:
-        _log_map(stream, KNOWN_MAP, details.known_map)
+        log_map(stream, KNOWN_MAP, details.known_map)
     lines = list(details.log)
     if lines and len(stamps_ns):
         stream.at(len(stamps_ns) - 1, int(stamps_ns[-1]))
@@ -70,7 +76,9 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
             level = next((word for word in ("ERROR", "WARNING") if f" {word} " in line), "INFO")
             stream.log("log", stream.rr.TextLog(line.rstrip(), level=level))
     best = run.smoothed or run.trajectory
-    shown = Shown(plots=plots, log=bool(lines), in_map=run.in_map is not None)
+    inside = run.in_map
+    place = None if inside is None else inside.positions
+    shown = Shown(plots=plots, log=bool(lines), in_map=inside is not None, map_path=place)
     stream.arrange(odometry(shown, Eye.on(best.positions, details.points)))
 
 
@@ -93,56 +101,6 @@ def _show_timing(
         series.send(entity, np.arange(len(stamps_ns)), stamps_ns, values)
         shown.add(entity)
     return frozenset(shown)
-
-
-def show_map(stream: RerunStream, content: SlamMap) -> None:
-    """Log a map: points by the number of their observations, keyframes and links."""
-    _log_map(stream, "map", content)
-    sizes = content.summary()
-    rows = "\n".join(
-        f"| {name.replace('_', ' ')} | {sizes[name]} |"
-        for name in ("keyframes", "features", "observations", "links", "words", "created")
-    )
-    names = ", ".join(recording.name for recording in content.recordings)
-    text = (
-        f"# Map of {names}\n\n| | |\n|---|---|\n{rows}\n\n**Points** are coloured by the number of "
-        "their observations: dark blue few, yellow many. Lines through the keyframes have a colour "
-        "for each recording; green lines are links between keyframes of the same place."
-    )
-    stream.log("summary", stream.rr.TextDocument(text, media_type="text/markdown"), static=True)
-    import rerun.blueprint as rrb
-
-    eye = Eye.on(content.poses.translations, content.points)
-    stream.arrange(
-        whole(
-            rrb.Horizontal(
-                space("Map", "/map", eye=eye),
-                rrb.TextDocumentView(name="Summary", origin="/summary"),
-                column_shares=[78, 22],
-            ),
-            timeline=None,
-        )
-    )
-
-
-def _log_map(stream: RerunStream, entity: str, content: SlamMap) -> None:
-    rr, places = stream.rr, content.poses.translations
-    stream.log(entity, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    known = content.features[content.features >= 0]
-    views = np.bincount(known, minlength=len(content.points)).astype(np.float64)
-    colours = scaled(np.log(np.maximum(views, 1.0)), 0.0, robust_range(np.log1p(views))[1])
-    cloud = rr.Points3D(content.points, colors=colours, radii=POINT_RADIUS)
-    stream.log(f"{entity}/points", cloud, static=True)
-    for number, trajectory in enumerate(content.trajectories()):
-        colour = CYCLE[number % len(CYCLE)]
-        name = f"{entity}/recordings/{number}"
-        path = rr.LineStrips3D([trajectory.positions], colors=colour, radii=-1.0)
-        stream.log(name, path, static=True)
-        marks = rr.Points3D(trajectory.positions, colors=colour, radii=-2.0)
-        stream.log(f"{name}/keyframes", marks, static=True)
-    if len(content.links):
-        lines = rr.LineStrips3D(places[content.links.ends], colors=GREEN, radii=-0.7)
-        stream.log(f"{entity}/links", lines, static=True)
 
 
 def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True) -> None:
