@@ -111,7 +111,7 @@ def test_a_path_is_one_entity_with_a_piece_for_each_frame(
 ) -> None:
     result, found = watched
     states = len(result.trajectory)
-    assert found.rows["/world/path/causal"] == states - 1
+    assert found.rows["/world/path/causal"] == states
     assert found.rows["/world/body"] == states
     assert result.smoothed is not None
     assert found.rows["/world/path/smoothed"] == len(result.smoothed) - 1

@@ -20,6 +20,7 @@ from slam_graph.visualization.rerun_palette import (
     PURPLE,
     SKY,
     VERMILLION,
+    WHITE,
     YELLOW,
     scaled,
 )
@@ -64,6 +65,7 @@ class CameraViews:
         self._shrink = [-(-mounted.camera.width // MAX_WIDTH) for mounted in rig.cameras]
         self._tails = [_Tails() for _ in rig.cameras]
         self._frames = 0
+        self._rejecting: set[int] = set()
 
     def mount(self, rig: Rig, frustum_m: float = 0.25) -> None:
         """Send what does not change: places and lenses of the cameras, names of the fates."""
@@ -91,6 +93,19 @@ class CameraViews:
                 )
             ]
             self._stream.log(entity, rr.AnnotationContext(names), static=True)
+            self._style(entity)
+
+    def _style(self, entity: str) -> None:
+        """Send once how features look, so that a frame has their places only."""
+        points, lines = self._stream.rr.Points2D, self._stream.rr.LineStrips2D
+        for name, style in {
+            "features": points.from_fields(radii=[-2.2]),
+            "rejected": points.from_fields(radii=[-2.2], class_ids=[_OUTLIER]),
+            "tails": lines.from_fields(radii=[-0.8]),
+            "residuals": lines.from_fields(radii=[-1.0], colors=[VERMILLION]),
+            "residuals/reprojected": points.from_fields(radii=[-1.0], colors=[WHITE]),
+        }.items():
+            self._stream.log(f"{entity}/{name}", style, static=True)
 
     def show_images(self, frame: CameraFrame) -> None:
         """Log the images of a frame."""
@@ -123,17 +138,23 @@ class CameraViews:
             fates[np.isin(camera.ids, dynamic)] = _DYNAMIC
             fates[np.isin(camera.ids, rejected)] = _GATED
             entity = self._entity(index)
-            points = rr.Points2D(camera.pixels / shrink, class_ids=fates, radii=-2.2)
-            self._stream.log(f"{entity}/features", points)
+            places = _on_screen(camera.pixels, shrink)
+            marks = rr.Points2D.from_fields(positions=places, class_ids=fates)
+            self._stream.log(f"{entity}/features", marks)
             if self._frames % _TAIL_STRIDE == 0 and index < self._detailed:
                 pieces, ages = tails.pieces()
-                lines = rr.LineStrips2D(pieces, colors=scaled(ages, 0.0, FULL_AGE), radii=-0.8)
+                colours = scaled(ages, 0.0, FULL_AGE)
+                lines = rr.LineStrips2D.from_fields(strips=pieces, colors=colours)
                 self._stream.log(f"{entity}/tails", lines)
         self._frames += 1
         for index, outliers in enumerate(features.outliers):
-            marks = rr.Points2D(
-                outliers.pixels / self._shrink[index], class_ids=_OUTLIER, radii=-2.2
-            )
+            if not len(outliers) and index not in self._rejecting:
+                continue  # nothing to show, and nothing to take away
+            self._rejecting.add(index)
+            if not len(outliers):
+                self._rejecting.remove(index)
+            places = _on_screen(outliers.pixels, self._shrink[index])
+            marks = rr.Points2D.from_fields(positions=places)
             self._stream.log(f"{self._entity(index)}/rejected", marks)
 
     def show_residuals(
@@ -158,12 +179,10 @@ class CameraViews:
             seen = camera.pixels[rows][in_front]
             ends = seen + RESIDUAL_GAIN * (predicted - seen)
             shrink = self._shrink[index]
-            lines = rr.LineStrips2D(
-                np.stack([seen, ends], axis=1) / shrink, colors=VERMILLION, radii=-1.0
-            )
+            ways = _on_screen(np.stack([seen, ends], axis=1), shrink)
             entity = f"{self._entity(index)}/residuals"
-            self._stream.log(entity, lines)
-            marks = rr.Points2D(predicted / shrink, colors=(255, 255, 255), radii=-1.0)
+            self._stream.log(entity, rr.LineStrips2D.from_fields(strips=ways))
+            marks = rr.Points2D.from_fields(positions=_on_screen(predicted, shrink))
             self._stream.log(f"{entity}/reprojected", marks)
 
     def _entity(self, index: int) -> str:
@@ -189,7 +208,7 @@ class _Tails:
         )
         ages = np.ones(len(camera), np.int64)
         ages[now] += self.ages[before]
-        self._ids, self._pixels, self.ages = camera.ids, camera.pixels / shrink, ages
+        self._ids, self._pixels, self.ages = camera.ids, _on_screen(camera.pixels, shrink), ages
 
     def pieces(self) -> tuple[FloatArray, FloatArray]:
         """Ways (M, 2, 2) of the features since this was asked for last, and ages (M,)."""
@@ -199,6 +218,11 @@ class _Tails:
         ways = np.stack([self._starts[before], self._pixels[now]], axis=1)
         self._start_ids, self._starts = self._ids, self._pixels
         return ways, self.ages[now].astype(np.float64)
+
+
+def _on_screen(pixels: FloatArray, shrink: int) -> FloatArray:
+    """Where pixels (…, 2) are on the shrunken image: Rerun's pixel (0, 0) is from 0 to 1."""
+    return np.asarray((pixels + 0.5) / shrink)
 
 
 def _jpeg(image: NDArray[np.uint8], shrink: int) -> bytes:

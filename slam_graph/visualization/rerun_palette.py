@@ -22,6 +22,7 @@ VERMILLION: Colour = (213, 94, 0)
 PURPLE: Colour = (204, 121, 167)
 GREY: Colour = (150, 150, 150)
 LIGHT_GREY: Colour = (205, 205, 205)
+WHITE: Colour = (255, 255, 255)
 
 CAUSAL, SMOOTHED, TRUTH, LOOP, IN_MAP = SKY, VERMILLION, LIGHT_GREY, GREEN, PURPLE
 """Colours of the paths of a run."""

@@ -9,11 +9,10 @@ from typing import Literal
 
 import numpy as np
 from gtsam.symbol_shorthand import X
-from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend import Estimator
-from slam_graph.geometry import NavState, StateHistory, Trajectory
+from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
@@ -31,6 +30,7 @@ from slam_graph.visualization.rerun_palette import (
 )
 from slam_graph.visualization.rerun_progress import ShownFrame, StepSeries
 from slam_graph.visualization.rerun_series import SeriesLog
+from slam_graph.visualization.rerun_states import StateRows
 from slam_graph.visualization.rerun_stream import RerunStream
 from slam_graph.visualization.rerun_window import show_window
 
@@ -73,7 +73,8 @@ class RerunViewer:
         """Begin with an empty world; a run that starts anew is in another one than before."""
         self._world = world
         self._outcome = OutcomeLog(self._stream, world, self._series, self._stamps_ns)
-        self._history, self._last = StateHistory(), np.zeros(3)
+        self._history = StateHistory()
+        self._states = StateRows(self._stream, world)
         self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
         self._heights: list[FloatArray] = []
         self._keyframes: set[int] = set()
@@ -95,6 +96,9 @@ class RerunViewer:
         self._cameras = CameraViews(self._stream, rig, f"{self._world}/body", brief)
         self._cameras.mount(rig)
         self._outcome.style(f"{self._world}/path/causal", CAUSAL)
+        for name, radius in {"features": -2.4, "map/points": POINT_RADIUS, "window": -3.0}.items():
+            style = rr.Points3D.from_fields(radii=[radius])
+            self._stream.log(f"{self._world}/{name}", style, static=True)
         self._outcome.show_legend()
         self._arrange()
 
@@ -131,6 +135,7 @@ class RerunViewer:
         self._stamps_ns.append(stamp_ns)
         self._stream.at(number, stamp_ns)
         if frame.restarted:
+            self._states.flush()
             self._begin(f"world_from_{number}")
             self._set_world(frame.corrected_rig or self._rig)
         images = frame.packet.frame
@@ -143,7 +148,10 @@ class RerunViewer:
         if not frame.waits:
             ids, points = frame.landmark_ids, frame.landmarks
             self._cameras.show_residuals(features, frame.state, ids, points)
-        self._show_state(frame.state)
+        if not len(self._history):
+            self._outcome.show_gravity(np.asarray(frame.state.world_T_body.translation()))
+        self._history.append(frame.state)
+        self._states.add(number, stamp_ns, frame.state)
         self._show_features(frame, estimator)
         self._show_window(estimator)
         if self._detail == "graph":
@@ -155,6 +163,7 @@ class RerunViewer:
     def finish(self, result: FinishedRun) -> None:
         """Send what is known at the end only, and show everything at once."""
         self._series.flush()
+        self._states.flush()
         self._stream.at(max(len(self._stamps_ns) - 1, 0), self._stamps_ns[-1])
         self._show_map(np.ones(len(self._ids), np.bool_))
         plots = self._outcome.show(result)
@@ -166,6 +175,7 @@ class RerunViewer:
         """Send what is left; a saved file appears under its name."""
         logging.getLogger("slam_graph").removeHandler(self._log_handler)
         self._series.flush()
+        self._states.flush()
         self._stream.close()
 
     def _wants_images(self, estimator: Estimator, stamp_ns: int) -> bool:
@@ -182,37 +192,6 @@ class RerunViewer:
             return True
         return False
 
-    def _show_state(self, state: NavState) -> None:
-        """The pose with its uncertainty, and the next piece of the path."""
-        rr, body = self._stream.rr, f"{self._world}/body"
-        pose = state.world_T_body
-        position = np.asarray(pose.translation())
-        placed = rr.Transform3D(translation=position, mat3x3=pose.rotation().matrix())
-        self._stream.log(body, placed)
-        if len(self._history):
-            piece = rr.LineStrips3D.from_fields(strips=[[self._last, position]])
-            self._stream.log(f"{self._world}/path/causal", piece)
-        else:
-            self._outcome.show_gravity(position)
-        self._last = position
-        self._history.append(state)
-        if state.covariance is not None:
-            values, vectors = np.linalg.eigh(state.covariance[3:6, 3:6])
-            vectors[:, 0] *= np.sign(np.linalg.det(vectors))
-            sigmas = np.sqrt(np.maximum(values, 0.0))
-            self._stream.log(f"{body}/position_sigma", self._ellipsoids(sigmas, vectors))
-
-    def _ellipsoids(self, sigmas: FloatArray, axes: FloatArray) -> object:
-        """1σ and 3σ of the position, in the axes of the body."""
-        rr, quaternion = self._stream.rr, _quaternion(axes)
-        return rr.Ellipsoids3D(
-            half_sizes=[sigmas, 3 * sigmas],
-            quaternions=[rr.Quaternion(xyzw=quaternion)] * 2,
-            colors=[(*YELLOW, 255), (*YELLOW, 120)],
-            line_radii=-0.6,
-            fill_mode="majorwireframe",
-        )
-
     def _show_features(self, frame: ShownFrame, estimator: Estimator) -> None:
         """The landmarks of this frame by what they are, and those that left to the map."""
         window, ids, points = estimator.window, frame.landmark_ids, frame.landmarks
@@ -220,7 +199,7 @@ class RerunViewer:
         if window is not None:
             colours[np.isin(ids, window.state_features)] = GREEN
         colours[np.isin(ids, frame.rejected)] = VERMILLION
-        cloud = self._stream.rr.Points3D(points, colors=colours, radii=-2.4)
+        cloud = self._stream.rr.Points3D.from_fields(positions=points, colors=colours)
         self._stream.log(f"{self._world}/features", cloud)
         self._show_map(~np.isin(self._ids, ids))
         self._ids, self._points = ids, points
@@ -233,7 +212,7 @@ class RerunViewer:
         self._heights.append(left)
         heights = np.concatenate([part[:, 2] for part in self._heights])
         colours = scaled(left[:, 2], *robust_range(heights))
-        cloud = self._stream.rr.Points3D(left, colors=colours, radii=POINT_RADIUS)
+        cloud = self._stream.rr.Points3D.from_fields(positions=left, colors=colours)
         self._stream.log(f"{self._world}/map/points", cloud)
 
     def _show_window(self, estimator: Estimator) -> None:
@@ -246,7 +225,9 @@ class RerunViewer:
         poses = np.array([values.atPose3(X(number)).translation() for number in past])
         held = np.array([number in window.keyframes for number in past], np.bool_)
         colours = np.where(held[:, None], np.array(PURPLE), np.full(3, 255)).astype(np.uint8)
-        cloud = rr.Points3D(poses.reshape(-1, 3), colors=colours.reshape(-1, 3), radii=-3.0)
+        cloud = rr.Points3D.from_fields(
+            positions=poses.reshape(-1, 3), colors=colours.reshape(-1, 3)
+        )
         self._stream.log(f"{self._world}/window", cloud)
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
@@ -254,11 +235,6 @@ class RerunViewer:
             marks = rr.Points3D(places, colors=PURPLE, radii=-2.0)
             self._stream.log(f"{self._world}/keyframes", marks)
         self._keyframes |= set(window.keyframes)
-
-
-def _quaternion(rotation: FloatArray) -> FloatArray:
-    """A rotation matrix as a quaternion (x, y, z, w)."""
-    return np.asarray(Rotation.from_matrix(rotation).as_quat())
 
 
 class _LogHandler(logging.Handler):
