@@ -23,8 +23,11 @@ TAIL_FRAMES, TAIL_S = 12, 0.6
 KNOWN_MAP = "known_map"
 """Entity of the world of a map in which a run is located."""
 
-WINDOW_BOUNDS = ((-140.0, 2040.0), (-400.0, 240.0))
+WINDOW_BOUNDS = ((-140.0, 2040.0), (-390.0, 330.0))
 """Ranges of x and y in which the graph of a window is drawn."""
+
+_BEHIND_BODY = ((-4.0, -3.0, 3.0), (0.0, 0.0, 0.0))
+"""Where the eye is, and what it looks at, when it begins to follow the body, m."""
 
 _DISTANCE = 0.95
 """Distance of the eye from what it looks at, in diameters of that."""
@@ -66,7 +69,14 @@ def _controls(eye: Eye | None, tracked: str | None = None) -> Any:
     import rerun.blueprint as rrb
 
     if eye is None:
-        return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, tracking_entity=tracked)
+        position, target = _BEHIND_BODY
+        return rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=position,
+            look_target=target,
+            eye_up=(0, 0, 1),
+            tracking_entity=tracked,
+        )
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.target, eye_up=(0, 0, 1)
     )

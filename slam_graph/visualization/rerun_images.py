@@ -41,8 +41,9 @@ FULL_AGE = 25.0
 RESIDUAL_GAIN = 10.0
 """Residuals are drawn so many times as long as they are."""
 
-_TAIL_STRIDE = 3
-"""Frames from one piece of a tail to the next: tails are most of a recording without images."""
+_BRIEF_STRIDE = 3
+"""Frames from one piece of a tail to the next where it is to be brief: most of a recording without
+images would be tails."""
 
 FATES = ("tracked", "new", "in another camera too", "gate", "RANSAC", "dynamic")
 _TRACKED, _NEW, _SHARED, _GATED, _OUTLIER, _DYNAMIC = range(1, len(FATES) + 1)
@@ -56,12 +57,13 @@ class CameraViews:
         stream: where it goes.
         rig: the cameras.
         body: entity of the body.
-        brief: whether only the first camera has tails and residuals.
+        brief: whether tails are coarse, and only the first camera has tails and residuals.
     """
 
     def __init__(self, stream: RerunStream, rig: Rig, body: str, brief: bool = False) -> None:
         self._stream, self._rig, self._body = stream, rig, body
         self._detailed = 1 if brief else len(rig.cameras)
+        self._stride = _BRIEF_STRIDE if brief else 1
         self._shrink = [-(-mounted.camera.width // MAX_WIDTH) for mounted in rig.cameras]
         self._tails = [_Tails() for _ in rig.cameras]
         self._frames = 0
@@ -99,8 +101,8 @@ class CameraViews:
         """Send once how features look, so that a frame has their places only."""
         points, lines = self._stream.rr.Points2D, self._stream.rr.LineStrips2D
         for name, style in {
-            "features": points.from_fields(radii=[-2.2]),
-            "rejected": points.from_fields(radii=[-2.2], class_ids=[_OUTLIER]),
+            "features": points.from_fields(radii=[-2.2], show_labels=False),
+            "rejected": points.from_fields(radii=[-2.2], class_ids=[_OUTLIER], show_labels=False),
             "tails": lines.from_fields(radii=[-0.8]),
             "residuals": lines.from_fields(radii=[-1.0], colors=[VERMILLION]),
             "residuals/reprojected": points.from_fields(radii=[-1.0], colors=[WHITE]),
@@ -141,7 +143,7 @@ class CameraViews:
             places = _on_screen(camera.pixels, shrink)
             marks = rr.Points2D.from_fields(positions=places, class_ids=fates)
             self._stream.log(f"{entity}/features", marks)
-            if self._frames % _TAIL_STRIDE == 0 and index < self._detailed:
+            if self._frames % self._stride == 0 and index < self._detailed:
                 pieces, ages = tails.pieces()
                 colours = scaled(ages, 0.0, FULL_AGE)
                 lines = rr.LineStrips2D.from_fields(strips=pieces, colors=colours)

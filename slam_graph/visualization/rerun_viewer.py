@@ -110,8 +110,6 @@ class RerunViewer:
     ) -> None:
         """Send the layout."""
         plots = outcome_plots | StepSeries.PLOTS
-        if self._truth is not None:
-            plots |= {"error/position"}
         shown = Shown(
             self._world,
             len(self._rig.cameras),

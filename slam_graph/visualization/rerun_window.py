@@ -132,7 +132,7 @@ def _log_graph(stream: RerunStream, shown: _Window) -> None:
             lines["prior"] += [[prior, places[key]] for key in keys if _kind(key) != "l"]
             known = [places[key] for key in keys if _kind(key) == "l"]
             lines["prior"] += [[prior, place] for place in known]
-            mark = rr.Points2D([prior], colors=PURPLE, radii=9.0, labels=["prior"])
+            mark = rr.Points2D([prior], colors=PURPLE, radii=13.0, labels=["prior"])
             stream.log("window/graph/prior_factor", mark)
             continue
         name = "projections" if any(_kind(key) == "l" for key in keys) else "dynamics"
@@ -147,7 +147,7 @@ def _log_graph(stream: RerunStream, shown: _Window) -> None:
         stream.log(f"window/graph/{name}", strips)
     keys = shown.keys
     colours = [VERMILLION if k not in shown.stays else _COLOURS.get(_kind(k), PURPLE) for k in keys]
-    radii = [4.5 if _kind(key) == "l" else 9.0 for key in keys]
+    radii = [8.0 if _kind(key) == "l" else 13.0 for key in keys]
     labels = [gtsam.DefaultKeyFormatter(key) for key in keys]
     named = [key for key in keys if _kind(key) != "l"]
     points = rr.Points2D(
@@ -183,7 +183,7 @@ def _places(shown: _Window, seen: dict[int, list[int]]) -> dict[int, FloatArray]
         kind = _kind(key)
         if kind in "xvb":
             x = columns[gtsam.Symbol(key).index()]
-            places[key] = np.array([x, 1.5 * _ROW * "xvb".index(kind)])
+            places[key] = np.array([x, 2.4 * _ROW * "xvb".index(kind)])
     landmarks = [key for key in shown.keys if _kind(key) == "l"]
     centres = {
         key: float(np.mean([places[pose][0] for pose in seen[key]])) if seen[key] else _WIDTH / 2
