@@ -11,6 +11,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from flight import rig
 from map_flights import World
 from pose_graphs import laps
 from rerun.chunk import RrdReader
@@ -257,6 +258,13 @@ def test_a_viewer_that_fails_does_not_end_the_run(tmp_path: Path) -> None:
     result = sg.run(sequence, viewer=viewer, final_ba={"enabled": False})
     assert result.status == "ok"
     assert result.warnings["viewer_failed"] == 1
+
+
+def test_an_estimator_tells_which_features_move_by_themselves() -> None:
+    estimator = sg.Estimator(rig(), sg.load_config().algorithm)
+    assert len(estimator.dynamic) == 0
+    estimator._standstill.add_dynamic(np.array([7, 3]))
+    assert estimator.dynamic.tolist() == [3, 7]
 
 
 def drivers() -> Iterator[Path]:

@@ -130,6 +130,8 @@ class ImageFrontend:
         with self._stats.timed("prepare_ms"):
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id
+        for tracker in self._trackers:
+            tracker.outliers = Tracks.empty()
         for i, image in enumerate(images):
             if image is not None and (
                 self._references[i] == i or images[self._references[i]] is None
