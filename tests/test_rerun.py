@@ -252,13 +252,14 @@ def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.Mo
     assert "not of the form WxH" in refused("demo", "--size", "big")
 
 
-def test_a_viewer_that_fails_does_not_end_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("call", ["open", "show", "finish"])
+def test_a_viewer_that_fails_does_not_end_the_run(call: str, tmp_path: Path) -> None:
     viewer = RerunRecording("save", "flight", tmp_path / "recording.rrd").viewer()
 
     def fail(*_: object) -> None:
         raise RuntimeError("the window was closed")
 
-    viewer.show = fail  # type: ignore[method-assign]
+    setattr(viewer, call, fail)
     sequence = sg.simulate(trajectory="figure8", duration_s=2.0)
     result = sg.run(sequence, viewer=viewer, final_ba={"enabled": False})
     assert result.status == "ok"

@@ -7,7 +7,7 @@ Factor graphs of single frames: a stage that keeps those that are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from typing import Protocol, TypeGuard
 
@@ -193,13 +193,17 @@ class Viewing(Stage):
         """Open the viewer; it is closed however the run ends."""
         resources.enter_context(self._closing)
         self._closing.callback(self._viewer.close)
-        self._viewer.open(self._result.input.rig, self._result.groundtruth)
+        self._try(lambda: self._viewer.open(self._result.input.rig, self._result.groundtruth))
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Show a frame."""
+        self._try(lambda: self._viewer.show(frame, self._estimator))
+
+    def _try(self, show: Callable[[], None]) -> None:
+        """Show something; a viewer that cannot is not asked again."""
         failed = True
         with self._warning("not all of the run is shown"):
-            self._viewer.show(frame, self._estimator)
+            show()
             failed = False
         if failed:
             self._viewer = NullViewer()

@@ -29,7 +29,7 @@ _BINS = 60
 _ERROR_PERCENTILE = 98.0
 _VIEWED_PERCENT = (2.0, 98.0)
 _MANY_POINTS = 2000
-_INDEX_LENGTH = 0.03
+_INDEX_LENGTH = 0.08
 """Length of the optical axes that are drawn, as a part of the scene."""
 
 
