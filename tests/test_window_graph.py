@@ -18,6 +18,7 @@ from slam_graph.backend.backend_config import (
     BackendConfig,
     CalibrationConfig,
     InitializationConfig,
+    NoiseConfig,
 )
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.estimator import Estimator
@@ -42,11 +43,13 @@ def steps(
     cameras: int = 2,
     calibration: CalibrationConfig | None = None,
     outliers: float = 0.0,
+    noise: NoiseConfig | None = None,
 ) -> Iterator[Estimator]:
     """An estimator after each frame of a noisy flight of 1.6 s, with a share of wrong pixels."""
     config = BackendConfig(
         initialization=InitializationConfig(mode="given"),
         calibration=calibration or CalibrationConfig(),
+        noise=noise or NoiseConfig(),
     )
     mounted, rng = rig(cameras, camera), np.random.default_rng(5)
     estimator = Estimator(mounted, load_config(algorithm=name).algorithm, config)
@@ -129,6 +132,23 @@ def test_so_it_has_at_every_frame_with_outliers(name: str) -> None:
 @pytest.mark.parametrize("name", OWN)
 def test_so_it_has_with_the_calibration_as_variables(name: str, cameras: int) -> None:
     check(flown(name, cameras=cameras, calibration=EVERYTHING))
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_so_it_has_while_it_learns_the_noise_of_each_camera(name: str) -> None:
+    learns = NoiseConfig(adaptive_pixels="any")
+    before = np.ones(2)
+    for number, estimator in enumerate(steps(name, noise=learns)):
+        pixels = estimator._context.pixels
+        if number == 0:  # what was learned in one camera counts in it only
+            before = pixels.sigma_px = np.array([0.7, 1.4])
+            continue
+        engine = estimator._engine
+        assert isinstance(engine, SquareRootEngine)
+        assert engine._cost is not None
+        np.testing.assert_array_equal(engine._cost.sigma_px, before)  # not what came later
+        check(estimator)
+        before = pixels.sigma_px
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, DOUBLE_SPHERE], ids=lambda c: c.distortion)

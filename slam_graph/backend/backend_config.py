@@ -43,6 +43,11 @@ class NoiseConfig(Settings):
     a data sheet, or if images contradict the state and runs diverge: the IMU then counts less."""
     adaptive: AdaptiveNoiseConfig = AdaptiveNoiseConfig()
     """White noise of the IMU that is estimated from how the images correct its predictions."""
+    adaptive_pixels: Literal["never", "larger", "any"] = expert("larger")
+    """Estimate the noise of the observations of each camera from the residuals of tracks. larger:
+    take it where it is clearly larger than `pixel_sigma`, up to four times that. any: also where
+    it is smaller, down to a quarter; covariances are then more often too small. never: take
+    `pixel_sigma`, as GTSAM's smoothers always do."""
     gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""

@@ -29,7 +29,11 @@ class SquareRootEngine:
         self._context = context
         self._policies = context.algorithm
         self._construction = CostConstruction(
-            context.algorithm.cost, context.projection, context.config, context.diagnostics
+            context.algorithm.cost,
+            context.projection,
+            context.config,
+            context.diagnostics,
+            context.pixels,
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None
@@ -56,6 +60,7 @@ class SquareRootEngine:
         context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
+        context.pixels.learn(constructed.cost, constructed.offered, stamp_ns)
         return context.propagation.reported(state)
 
     def _minimize(
@@ -95,4 +100,4 @@ class SquareRootEngine:
             cost = Cost(window.state, self._context.projection, self._context.config, window.prior)
         everything = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)
         determined = cost.part(cost.factors, everything)  # without features that lost observations
-        return window_graph(determined, self._context.config.noise.pixel_sigma)
+        return window_graph(determined)

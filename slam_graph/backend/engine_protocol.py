@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation
+from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
@@ -81,6 +83,11 @@ class EngineContext:
     projection: RigProjection
     propagation: Propagation
     imu: ImuBuffer = field(default_factory=ImuBuffer)
+
+    @cached_property
+    def pixels(self) -> PixelNoise:
+        """Noise of the observations, which the engine estimates on the way."""
+        return PixelNoise(self.config.noise, len(self.rig.cameras))
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
         """Add the observations of the window's current frame to its tracks."""

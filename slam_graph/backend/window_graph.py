@@ -109,13 +109,8 @@ class WindowGraph:
         }
 
 
-def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
-    """A cost as a factor graph.
-
-    Args:
-        cost: of the engine.
-        sigma_px: standard deviation of an observation.
-    """
+def window_graph(cost: Cost) -> WindowGraph:
+    """A cost of the engine as a factor graph."""
     graph = gtsam.NonlinearFactorGraph()
     values, first = gtsam.Values(cost.state.estimate), gtsam.Values(cost.state.first)
     losses: list[RobustLoss | None] = []
@@ -126,7 +121,7 @@ def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
         graph.push_back(factor)
         losses.append(None)
     loss = cost.robust
-    projections = _Projections(cost.rig, cost.state, sigma_px, loss)
+    projections = _Projections(cost)
     if cost.landmarks is not None:
         projections.add(graph, cost.landmarks)
     if cost.tracks is not None:
@@ -143,10 +138,9 @@ def window_graph(cost: Cost, sigma_px: float) -> WindowGraph:
 class _Projections:
     """Makes projection factors: GTSAM's own where it has them, else in Python."""
 
-    def __init__(self, rig: RigProjection, state: State, sigma_px: float, loss: RobustLoss) -> None:
-        self._rig, self._motions = rig, dict(state.motions)
-        self._noise = pixel_noise(sigma_px, loss)
-        self._now = rig.at(state)
+    def __init__(self, cost: Cost) -> None:
+        self._cost, self._rig, self._motions = cost, cost.rig, dict(cost.state.motions)
+        self._now = cost.rig.at(cost.state)
         self._models = [camera.gtsam_calibration() for camera in self._now.cameras]
 
     def add(self, graph: gtsam.NonlinearFactorGraph, obs: Observations) -> None:
@@ -155,21 +149,25 @@ class _Projections:
             single = obs.rows(np.array([row]))
             model = self._models[int(single.camera[0])]
             own = model is None or bool(self._rig.calibration_keys)
-            graph.push_back(self._python(single) if own else self._native(single, model))
+            noise = pixel_noise(float(self._cost.sigmas(single)[0]), self._cost.robust)
+            make = self._python(single, noise) if own else self._native(single, noise, model)
+            graph.push_back(make)
 
-    def _native(self, single: Observations, model: object) -> gtsam.NonlinearFactor:
+    def _native(
+        self, single: Observations, noise: gtsam.noiseModel.Base, model: object
+    ) -> gtsam.NonlinearFactor:
         kind = getattr(gtsam, f"GenericProjectionFactor{type(model).__name__}")
         pose, point = _keys(single)
         mount = self._now.mount_poses(single)[0]  # of a rolling shutter that of the observed row
         factor: gtsam.NonlinearFactor = kind(
-            single.pixels[0], self._noise, pose, point, model, False, False, mount
+            single.pixels[0], noise, pose, point, model, False, False, mount
         )
         return factor
 
-    def _python(self, single: Observations) -> gtsam.CustomFactor:
+    def _python(self, single: Observations, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
         keys = [*_keys(single), *self._rig.calibration_keys]
         error = _projection_error(single, self._rig, keys, self._motions)
-        return gtsam.CustomFactor(self._noise, keys, error)
+        return gtsam.CustomFactor(noise, keys, error)
 
 
 def _keys(single: Observations) -> tuple[int, int]:

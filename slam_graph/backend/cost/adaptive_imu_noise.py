@@ -121,15 +121,23 @@ class DynamicsNoise:
         self._accel_walk = DensityScale(_SLOW_FALL_TIME_S)
         self.vibrates = False
 
-    def params(self, scale: float = 1.0) -> gtsam.PreintegrationCombinedParams:
-        """Current parameters, with all densities multiplied by `scale`."""
+    def params(
+        self, scale: float = 1.0, least_factor: float = 1.0
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Current parameters.
+
+        Args:
+            scale: on all densities.
+            least_factor: least factor on white noise.
+        """
         scale *= self._config.imu_scale
         imu = replace(
             self._imu,
             gyro_random_walk=self._imu.gyro_random_walk * self._gyro_walk.factor,
             accel_random_walk=self._imu.accel_random_walk * self._accel_walk.factor,
         )
-        return imu.preintegration_params(self._config.gravity, scale, *self.factors)
+        gyro, accel = (max(factor, least_factor) for factor in self.factors)
+        return imu.preintegration_params(self._config.gravity, scale, gyro, accel)
 
     @property
     def factors(self) -> tuple[float, float]:

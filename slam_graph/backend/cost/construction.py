@@ -28,6 +28,7 @@ from slam_graph.backend.cost.feature_tracks import (
     is_in,
 )
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
+from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.selection_policies import (
@@ -63,6 +64,7 @@ class ConstructedCost:
         removals: observations that go without being used.
         predicted: what was known of the variables before the images; None if these are left out.
         innovations: distances of the images from that.
+        offered: the new features before the gate, without those that will come again.
     """
 
     cost: Cost
@@ -76,6 +78,7 @@ class ConstructedCost:
     removals: Removals = field(default_factory=Removals)
     predicted: SquareRootInformation | None = None
     innovations: Innovations = field(default_factory=Innovations)
+    offered: TrackFeatures | None = None
 
     def innovations_under(self, posterior: SquareRootInformation) -> Innovations:
         """The innovations with the joint distance of all measurements that entered.
@@ -105,14 +108,16 @@ class CostConstruction:
         rig: RigProjection,
         config: BackendConfig,
         diagnostics: Diagnostics,
+        pixels: PixelNoise,
     ) -> None:
         self.policy = policy
         self.rig = rig
         self.config = config
         self.diagnostics = diagnostics
+        self.pixels = pixels
         self.rejected = np.zeros(0, np.int64)
         self._features = FEATURE_POLICIES[policy.features]
-        self._selection = FeatureSelection(policy, rig, config, diagnostics)
+        self._selection = FeatureSelection(policy, rig, config, diagnostics, pixels)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.robust_loss)
         self._failures: dict[int, int] = {}
@@ -139,6 +144,7 @@ class CostConstruction:
         cost.tracks = self._selection.new_features(
             window, poses, len(in_state), self._dynamic, removals
         )
+        offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
         if not self._features.relinearized:
             # a pose that no waiting observation refers to has nothing more to give
@@ -156,6 +162,9 @@ class CostConstruction:
             constructed.loses_pose = is_in(cost.tracks.obs.ids, seen)
             constructed.absorbed = self._absorbed(cost.tracks, constructed.loses_pose)
         constructed.linear, constructed.predicted = linear, predicted
+        if offered is not None:  # those that go on waiting come again
+            waiting = cost.ids_of(~constructed.absorbed)
+            constructed.offered = offered.subset(~is_in(offered.obs.ids, waiting))
         constructed.innovations = gate.innovations
         return constructed
 
@@ -169,7 +178,9 @@ class CostConstruction:
     def _prior_and_dynamics(self, window: Window) -> Cost:
         """The cost without images."""
         state, factors = window.state.copy(), list(window.factors)
-        return Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
+        cost = Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
+        cost.sigma_px = self.pixels.sigma_px
+        return cost
 
     def _selected_poses(self, window: Window) -> PoseSelection:
         poses = self._select_poses(window, self.policy, self.rig)

@@ -89,6 +89,8 @@ class Cost:
         landmarks: observations of features that are variables of the state.
         tracks: features outside the state, with whole tracks.
         loss: on reprojection residuals; None for that of the settings.
+        sigma_px: (C,) standard deviation of the observations of each camera; None for that of the
+            settings.
     """
 
     state: State
@@ -99,11 +101,18 @@ class Cost:
     landmarks: Observations | None = None
     tracks: TrackFeatures | None = None
     loss: RobustLoss | None = None
+    sigma_px: FloatArray | None = None
 
     @property
     def robust(self) -> RobustLoss:
         """The loss on reprojection residuals."""
         return self.loss or RobustLoss(self.config.gating.robust_loss)
+
+    def sigmas(self, obs: Observations) -> FloatArray:
+        """Standard deviations (N,) of observations, in pixels."""
+        if self.sigma_px is None:
+            return np.full(len(obs), self.config.noise.pixel_sigma)
+        return self.sigma_px[obs.camera]
 
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
@@ -166,7 +175,7 @@ class Cost:
         rig = self.rig.at(self.state)
         residuals, _ = rig.residuals(obs, self._geometry(rig, self.state.estimate, obs, points))
         squares = np.einsum("ni,ni->n", residuals, residuals)
-        return np.asarray(squares / self.config.noise.pixel_sigma**2, dtype=np.float64)
+        return np.asarray(squares / self.sigmas(obs) ** 2, dtype=np.float64)
 
     # --- linearisation -------------------------------------------------------------------------
 
@@ -193,7 +202,7 @@ class Cost:
             self._geometry(rig, values, obs, points)
             for values in (self.state.first, self.state.estimate)
         )
-        return whiten(obs, rig, first, estimate, self.config.noise.pixel_sigma, self.robust)
+        return whiten(obs, rig, first, estimate, self.sigmas(obs), self.robust)
 
     def _geometry(
         self,

@@ -79,7 +79,7 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
         linear: their linearisation.
     """
     by_point, by_view = _tables(obs, linear)
-    Q, R_f = _orthonormal(by_point)
+    Q, R_f = orthonormal_columns(by_point)
     T = _along(Q, by_view)
     stacked = T.reshape(-1, T.shape[2])
     information = _view_information(by_view) - stacked.T @ stacked
@@ -124,8 +124,8 @@ def _tables(obs: Observations, linear: WhitenedObservations) -> tuple[FloatArray
     return by_point.reshape(J, -1, 3), by_view.reshape(J, F, 2 * C, -1)
 
 
-def _orthonormal(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q (J, F m, 3) with orthonormal columns for each feature, and R_f (J, 3, 3)."""
+def orthonormal_columns(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Q (J, m, 3) with orthonormal columns and R_f (J, 3, 3) of the m rows of each feature."""
     Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(by_point), 3, 3))
     for _ in range(2):
         squares = Q.transpose(0, 2, 1) @ Q
@@ -241,13 +241,16 @@ def whiten(
     rig: RigProjection,
     first: Geometry,
     estimate: Geometry,
-    sigma_px: float,
+    sigma_px: float | FloatArray,
     loss: RobustLoss,
 ) -> WhitenedObservations:
-    """Linearise observations: Jacobians at the first estimates, residuals at the current ones."""
+    """Linearise observations: Jacobians at the first estimates, residuals at the current ones.
+
+    Their standard deviation is one number or one for each (N,).
+    """
     residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
-    r = residuals / sigma_px
+    r = residuals / np.broadcast_to(sigma_px, len(obs))[:, None]
     weight = np.sqrt(loss.weights(np.linalg.norm(r, axis=1))) / sigma_px
     return WhitenedObservations(
         residuals * weight[:, None],

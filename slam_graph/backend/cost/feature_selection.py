@@ -24,6 +24,7 @@ from slam_graph.backend.cost.feature_tracks import (
     Removals,
     is_in,
 )
+from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.selection_policies import (
     FEATURE_POLICIES,
@@ -71,6 +72,7 @@ class FeatureSelection:
     rig: RigProjection
     config: BackendConfig
     diagnostics: Diagnostics
+    pixels: PixelNoise
 
     def new_features(
         self,
@@ -151,7 +153,7 @@ class FeatureSelection:
             poses = rig.poses(window.state.estimate, obs.frames)
             observed = rig.renormalized(obs.subset(new))
             result = triangulate(observed, rig, *poses, self.config.triangulation)
-            noise = self.config.noise.pixel_sigma / rig.cameras[0].fx
+            noise = float(np.max(self.pixels.sigma_px)) / rig.cameras[0].fx
             known = noise * result.depth_error < self.policy.state_feature_depth_error
             points[new], good[new] = result.points, result.good & (known | ~lasting[new])
         return points, good

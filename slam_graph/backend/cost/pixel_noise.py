@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The noise of the pixels, estimated on the way from the residuals of tracks.
+
+Errors of tracked features are correlated from frame to frame: a patch slides slowly off its point.
+Averaged over n frames they shrink by less than √n, so that an estimator that takes them for white
+with the standard deviation of single residuals is too sure. What counts is the white noise that
+leaves the same error after averaging. It is read from the means of blocks of consecutive
+observations.
+
+With the whitened residuals e = P ε of a track, P = I - Q Qᵀ the projection off the three directions
+H_f = Q R_f of its point, and the rows B that average over its blocks in one camera,
+
+    E ‖B e‖² = σ² tr(B P Bᵀ),
+
+where σ is in units of the value that whitened. The sum has a distribution close to that of χ² with
+k = tr(S)² / tr(S²) degrees of freedom, S = B P Bᵀ (Satterthwaite 1946). To be robust, the sum of
+each track is cut off at a quantile of that distribution, and its mean is divided by what the cut
+leaves of a normal one (winsorised mean; Huber's "proposal 2" of 1964, one step a frame). Errors of
+the poses are neglected: after the step they are small beside the noise of a track.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammainc, gammaincinv
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import NoiseConfig
+from slam_graph.backend.cost.cost import Cost, TrackFeatures
+from slam_graph.backend.cost.feature_factors import orthonormal_columns
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry
+
+BLOCK = 8
+"""Consecutive observations of a camera that are averaged. Shorter blocks miss what lasts longer."""
+_MIN_OBSERVATIONS = 11
+"""Observations that a track needs: of shorter ones the point explains nearly all block means."""
+_LEAST_MOTION_PX = 50.0
+"""Motion that a track needs: a patch that has hardly moved has not slid off its point yet."""
+_MEMORY_S = 20.0
+"""Time constant with which tracks are forgotten."""
+_PRIOR_DOF = 50.0
+"""Degrees of freedom that the setting counts for at the start."""
+_QUANTILE = 0.95
+"""Of the distribution of a track's sum, where the sum is cut off."""
+_MAX_RATIO = 4.0
+"""Largest ratio of the estimate to the setting, and of the setting to the estimate."""
+_CLEARLY_LARGER = 1.25
+"""Ratio of the estimate to the setting from which `larger` takes the estimate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockMeans:
+    """Squared block means of J tracks in one camera.
+
+    Attributes:
+        squares: (J,) in units of what is expected, σ² tr(B P Bᵀ).
+        dof: (J,) degrees of freedom of the χ² distribution that is close to theirs.
+    """
+
+    squares: FloatArray
+    dof: FloatArray
+
+    def winsorised(self) -> FloatArray:
+        """(J,) squares, cut off where normal noise seldom is, with mean one under such noise."""
+        half = 0.5 * self.dof
+        largest = gammaincinv(half, _QUANTILE)
+        expected = gammainc(half + 1.0, largest) + largest / half * (1.0 - _QUANTILE)
+        return np.asarray(np.minimum(self.squares, largest / half) / expected, dtype=np.float64)
+
+
+class PixelNoise:
+    """Standard deviation of the observations of each camera, as the tracks show it.
+
+    Attributes:
+        sigma_px: (C,) that the cost takes; that of the settings at the start.
+        estimate_px: (C,) that the tracks show.
+    """
+
+    def __init__(self, config: NoiseConfig, cameras: int) -> None:
+        self._config = config
+        self.sigma_px = self.estimate_px = np.full(cameras, config.pixel_sigma)
+        self._dof = np.full(cameras, _PRIOR_DOF)
+        self._squares = self._dof * self.sigma_px**2
+        self._stamp_ns: int | None = None
+
+    def learn(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
+        """Learn from the tracks of a step.
+
+        Args:
+            cost: after the steps.
+            tracks: the new features, each of them once; also those that the gate has rejected, or
+                noise that is larger than assumed would not be seen.
+            stamp_ns: time of the step.
+        """
+        if self._config.adaptive_pixels == "never":
+            return
+        if self._stamp_ns is not None:
+            memory = np.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / _MEMORY_S)
+            self._dof, self._squares = memory * self._dof, memory * self._squares
+        self._stamp_ns = stamp_ns
+        if tracks is None:
+            return
+        moved = _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
+        known = tracks.subset(moved & (tracks.obs.counts >= _MIN_OBSERVATIONS))
+        if len(known.obs) == 0:
+            return
+        residuals, by_point = _whitened(cost, known, self.sigma_px)
+        for camera in range(len(self.sigma_px)):
+            try:
+                means = block_means(known.obs, residuals, by_point, camera)
+            except np.linalg.LinAlgError:  # a point that its observations do not determine
+                return
+            self._dof[camera] += np.sum(means.dof)
+            share = float(means.dof @ means.winsorised())
+            self._squares[camera] += share * self.sigma_px[camera] ** 2
+        setting = self._config.pixel_sigma
+        sigma_px = np.sqrt(self._squares / self._dof)
+        self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
+        self._squares = self._dof * self.estimate_px**2  # what is beyond does not pile up
+        if self._config.adaptive_pixels == "any":
+            self.sigma_px = self.estimate_px
+        else:
+            larger = self.estimate_px > _CLEARLY_LARGER * setting
+            self.sigma_px = np.where(larger, self.estimate_px, setting)
+
+
+def _extents_px(obs: Observations, cameras: int) -> FloatArray:
+    """Diagonals (J,) of the smallest boxes around the tracks, in the camera where it is largest."""
+    least = np.full((len(obs.ids), cameras, 2), np.inf)
+    largest = -least
+    np.minimum.at(least, (obs.feature, obs.camera), obs.pixels)
+    np.maximum.at(largest, (obs.feature, obs.camera), obs.pixels)
+    return np.asarray(np.linalg.norm(np.maximum(largest - least, 0.0), axis=2).max(axis=1))
+
+
+def _whitened(
+    cost: Cost, tracks: TrackFeatures, sigma_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, 2) and derivatives by the points (N, 2, 3), in standard deviations."""
+    obs, rig = tracks.obs, cost.rig.at(cost.state)
+    at = Geometry(*rig.poses(cost.state.estimate, obs.frames), tracks.points)
+    sigma = sigma_px[obs.camera]
+    residuals, _ = rig.residuals(obs, at)
+    _, by_point = rig.jacobians(obs, at)
+    return residuals / sigma[:, None], by_point / sigma[:, None, None]
+
+
+def block_means(
+    obs: Observations, residuals: FloatArray, by_point: FloatArray, camera: int
+) -> BlockMeans:
+    """The squared block means of tracks in one camera.
+
+    Args:
+        obs: N observations of J features, sorted by feature and frame.
+        residuals: (N, 2) in standard deviations.
+        by_point: (N, 2, 3) derivatives by the position of the feature.
+        camera: whose observations are averaged; those of others only say where the point is.
+    """
+    J, M = len(obs.ids), int(obs.counts.max(initial=2))
+    e, H = np.zeros((J, M, 2)), np.zeros((J, M, 2, 3))
+    e[obs.feature, obs.slots], H[obs.feature, obs.slots] = residuals, by_point
+    Q, _ = orthonormal_columns(H.reshape(J, 2 * M, 3))
+    e -= (Q @ (Q.transpose(0, 2, 1) @ e.reshape(J, 2 * M, 1))).reshape(e.shape)
+    B = _averages(obs, camera, M)
+    means = B @ e
+    BQ = np.einsum("jbm,jmxq->jbxq", B, Q.reshape(J, M, 2, 3)).reshape(J, -1, 3)
+    S = -BQ @ BQ.transpose(0, 2, 1)
+    each = np.repeat(np.sum(B**2, axis=2), 2, axis=1)
+    S[:, range(S.shape[1]), range(S.shape[1])] += each
+    trace, square = np.trace(S, axis1=1, axis2=2), np.sum(S**2, axis=(1, 2))
+    some = each.any(axis=1) & (trace > 0.0)
+    squares = np.sum(means**2, axis=(1, 2))[some] / trace[some]
+    return BlockMeans(squares, trace[some] ** 2 / square[some])
+
+
+def _averages(obs: Observations, camera: int, slots: int) -> FloatArray:
+    """Rows (J, K, M) that average over the blocks of one camera; unused ones are zero."""
+    J = len(obs.ids)
+    seen = np.zeros((J, slots), np.bool_)
+    seen[obs.feature, obs.slots] = obs.camera == camera
+    block: IntArray = (np.cumsum(seen, axis=1) - 1) // BLOCK
+    complete = seen & (block < (np.sum(seen, axis=1) // BLOCK)[:, None])
+    averages = np.zeros((J, max(1, slots // BLOCK), slots))
+    feature, slot = np.nonzero(complete)
+    averages[feature, block[feature, slot], slot] = 1.0 / BLOCK
+    return averages
