@@ -278,10 +278,23 @@ def drivers() -> Iterator[Path]:
         yield from Path(folder).glob("*.json")
 
 
+def viewers_of(name: str) -> list[Path]:
+    """Processes of viewers that show a recording of this name."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = process.read_bytes()
+        except OSError:
+            continue  # it has just ended
+        if b"--headless" in words and f"/{name}.rrd".encode() in words:
+            found.append(process)
+    return found
+
+
 @pytest.fixture
 def graph_file(tmp_path: Path) -> Path:
     graph, _ = laps(2, noise=0.01)
-    file = tmp_path / "laps.g2o"
+    file = tmp_path / f"{tmp_path.parent.name}_pictured.g2o"
     file.write_text("".join(optimize_pose_graph(graph).g2o_lines()))
     return file
 
@@ -298,6 +311,7 @@ def test_a_picture_is_made_without_a_display(graph_file: Path, tmp_path: Path) -
     assert image is not None
     assert image.shape == (400, 640, 3)
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100, "something is drawn"
+    assert not viewers_of(graph_file.stem), "the viewer has ended"
 
 
 def test_without_a_driver_the_error_says_so(

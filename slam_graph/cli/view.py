@@ -128,12 +128,9 @@ def _show_existing(
         RerunRecording.screenshot(path, screenshot, pixels)
         typer.echo(str(screenshot))
     elif mode == "serve":
-        server, url = RerunRecording.serve(path)
-        typer.echo(f"open {url} in a browser", err=True)
-        try:
+        with RerunRecording.serve(path) as url:
+            typer.echo(f"open {url} in a browser", err=True)
             keep_serving("serve")
-        finally:
-            server.terminate()
     elif mode == "connect":
         raise ConfigError(f"{path}: open it in the viewer that is there, or use --rerun spawn")
     else:

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,6 +24,7 @@ from slam_graph.visualization.rerun_screenshot import (
     open_recording,
     save_screenshot,
     serve_recording,
+    stop,
 )
 from slam_graph.visualization.rerun_stream import RerunMode, RerunStream
 from slam_graph.visualization.rerun_viewer import DetailMode, RerunViewer
@@ -159,6 +160,11 @@ class RerunRecording:
         open_recording(recording)
 
     @staticmethod
-    def serve(recording: Path) -> tuple[subprocess.Popen[bytes], str]:
-        """Serve a saved recording to browsers: the server, and the address to open."""
-        return serve_recording(recording)
+    @contextmanager
+    def serve(recording: Path) -> Iterator[str]:
+        """Serve a saved recording to browsers while the block runs; gives the address to open."""
+        server, url = serve_recording(recording)
+        try:
+            yield url
+        finally:
+            stop(server)

@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -53,12 +55,12 @@ def save_screenshot(recording: Path, picture: Path, size: tuple[int, int] = (160
             stdout=output,
             stderr=subprocess.STDOUT,
             env={**os.environ, "RUST_LOG": "error"},  # warnings would lie over the views
+            start_new_session=True,
         )
         try:
             drawn = _settled_picture(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
         finally:
-            viewer.kill()
-            viewer.wait()
+            stop(viewer)
         output.seek(0)
         said = output.read().decode(errors="replace")
     if drawn is None:
@@ -103,9 +105,17 @@ def serve_recording(recording: Path) -> tuple[subprocess.Popen[bytes], str]:
     port, web_port = free_port(), free_port()
     command = [*_viewer_command(), "--serve-web", "--port", str(port), "--bind", "127.0.0.1"]
     command += ["--web-viewer-port", str(web_port), str(recording)]
-    server = subprocess.Popen(command, env={**os.environ, "RUST_LOG": "error"})
+    environment = {**os.environ, "RUST_LOG": "error"}
+    server = subprocess.Popen(command, env=environment, start_new_session=True)
     source = f"rerun%2Bhttp://localhost:{port}/proxy"
     return server, f"http://localhost:{web_port}/?url={source}"
+
+
+def stop(viewer: subprocess.Popen[bytes]) -> None:
+    """End a viewer that leads a session of its own, with the program that it has started."""
+    with suppress(ProcessLookupError):
+        os.killpg(viewer.pid, signal.SIGKILL)
+    viewer.wait()
 
 
 def _viewer_command() -> list[str]:
