@@ -16,7 +16,13 @@ from slam_graph.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [README, *((ROOT / "docs" / page).read_text() for page in ("results.md", "datasets.md"))]
+PAGES = [
+    README,
+    *(
+        (ROOT / "docs" / page).read_text(encoding="utf-8")
+        for page in ("results.md", "datasets.md", "visualization.md")
+    ),
+]
 
 GROUPS = ("data", "config", "frontend")
 """Commands of `slam-graph` that have commands of their own."""

@@ -14,7 +14,8 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
 from slam_graph.bundle_adjustment.bal_file import bal_lines
-from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
+from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem, usable
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 
 
@@ -54,6 +55,17 @@ class BalSolution(Displayed):
     part: BalPart
     minimum: BalMinimum
     estimates: BalEstimates
+
+    @staticmethod
+    def unsolved(problem: BalProblem) -> BalSolution:
+        """A problem as it is: what could be adjusted of it, with its own estimates.
+
+        Raises:
+            DataError: if nothing of it can be estimated.
+        """
+        part = usable(problem, Diagnostics())
+        minimum = BalMinimum(part.problem.estimates, np.nan, np.nan, 0, 0, False)
+        return BalSolution(problem, part, minimum, problem.estimates)
 
     def __repr__(self) -> str:
         part, minimum = self.part.problem, self.minimum

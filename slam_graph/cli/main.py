@@ -26,6 +26,7 @@ from slam_graph.cli import (
     optimize,
     run,
     simulate,
+    view,
 )
 from slam_graph.cli.console import echo_json
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
@@ -89,6 +90,7 @@ app.command("export")(export.export)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)
+app.command("view")(view.view)
 app.add_typer(frontend.app, name="frontend")
 app.add_typer(data_commands.app, name="data")
 app.add_typer(config_app, name="config")

@@ -61,6 +61,19 @@ class PoseGraphSolution(Displayed):
     minimum: Minimum
     weights: FloatArray
 
+    @staticmethod
+    def of(graph: PoseGraph, poses: Poses, weights: FloatArray | None = None) -> PoseGraphSolution:
+        """Poses that come from elsewhere, e.g. from a file, as a solution.
+
+        Args:
+            graph: the problem.
+            poses: of all its keys.
+            weights: (M,) of the edges; 1 if not given.
+        """
+        if weights is None:
+            weights = np.ones(len(graph.edges))
+        return PoseGraphSolution(graph, poses, Minimum(poses, np.nan, 0, True), weights)
+
     def __repr__(self) -> str:
         minimum = self.minimum
         return (

@@ -11,12 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from slam_graph.arrays import FloatArray
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import FinalBa, WindowGraph
 from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, kalibr_text
-from slam_graph.errors import EstimationError
-from slam_graph.evaluation import innovation_report
+from slam_graph.errors import DataError, EstimationError
+from slam_graph.evaluation import innovation_report, nees_of_run
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
@@ -193,6 +195,29 @@ class RunResult(RunSummary):
         return None if self.loops is None else self.loops.correct(self.best_trajectory)
 
     @property
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
+        if self.loops is None:
+            return np.zeros((0, 2), np.int64)
+        stamps = [keyframe.stamp_ns for keyframe in self.loops.keyframes]
+        kept = (self.loops.loops[k] for k in np.flatnonzero(self.loops.accepted))
+        ends = [(stamps[loop.first], stamps[loop.second]) for loop in kept]
+        return np.array(ends, np.int64).reshape(-1, 2)
+
+    @property
+    def nees_series(self) -> tuple[IntArray, FloatArray] | None:
+        """Times (K,) and NEES (K, 2) of position and orientation; None without a truth."""
+        if self.groundtruth is None or not len(self.history):
+            return None
+        try:
+            found, _ = nees_of_run(
+                self.groundtruth, self.history, self.start_was_given, self.final_ba
+            )
+        except DataError:
+            return None
+        return found.stamps_ns, np.column_stack([found.position, found.orientation])
+
+    @property
     def in_map(self) -> Trajectory | None:
         """Poses in the world of a known map, of the frames where they are known."""
         return None if self.localization is None else self.localization.trajectory()
@@ -291,7 +316,7 @@ class RunResult(RunSummary):
             files.text(names.SMOOTHED_STATES, names.state_lines(self.final_ba.history))
         if self.loops is not None and self.loop_closed is not None:
             files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
-            files.text("loops.csv", self.loops.csv_lines())
+            files.text(names.LOOPS, self.loops.csv_lines())
             write_ply(files.path("map_loop.ply"), self.loops.points())
         if self.localization is not None:
             files.text(names.IN_MAP, self.localization.trajectory().tum_lines())

@@ -163,6 +163,28 @@ class SavedRun(RunSummary):
         return _trajectory(self.folder, names.LOOP_CLOSED)
 
     @cached_property
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
+        path = self.folder / names.LOOPS
+        if not path.is_file():
+            return np.zeros((0, 2), np.int64)
+        try:
+            rows = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, ndmin=2).reshape(-1, 5)
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: not a table of loop closures ({error})") from error
+        return np.asarray(rows[rows[:, 4] == 1, :2])
+
+    @property
+    def start_was_given(self) -> bool:
+        """Whether the first state came with the data, in the world of the truth."""
+        return bool(self.metrics["extent"].get("start_was_given", False))
+
+    @property
+    def nees_series(self) -> None:
+        """None: there are no covariances in the files."""
+        return None
+
+    @cached_property
     def in_map(self) -> Trajectory | None:
         """Poses in the world of a known map, of the frames where they are known."""
         return _trajectory(self.folder, names.IN_MAP)

@@ -9,14 +9,14 @@ from slam_graph.lazy import lazy_exports
 __all__ = [
     "Panel",
     "Picture",
-    "RerunViewer",
+    "RerunRecording",
     "TrackPictures",
     "panel_figure",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.visualization.panels import Panel, panel_figure
-    from slam_graph.visualization.rerun_viewer import RerunViewer
+    from slam_graph.visualization.rerun_recording import RerunRecording
     from slam_graph.visualization.style import Picture
     from slam_graph.visualization.track_picture import TrackPictures
 else:
@@ -24,7 +24,7 @@ else:
         __name__,
         {
             "panels": ("Panel", "panel_figure"),
-            "rerun_viewer": ("RerunViewer",),
+            "rerun_recording": ("RerunRecording",),
             "style": ("Picture",),
             "track_picture": ("TrackPictures",),
         },
