@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
 from slam_graph.pipeline.run_recording import run
+from slam_graph.results.run_result import Status
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -145,6 +146,15 @@ def test_every_kind_of_warning_is_explained() -> None:
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"^\| `([a-z_]+)` \|", page, re.MULTILINE))
     assert not kinds - explained
+
+
+def test_every_status_and_its_exit_code_is_in_the_documents() -> None:
+    page = (ROOT / "docs" / "exit_codes.md").read_text(encoding="utf-8")
+    codes, statuses = page.split("## Statuses")
+    assert re.findall(r"^\| `([a-z_]+)` \|", statuses, re.MULTILINE)
+    for status in get_args(Status):
+        assert f"\n| `{status}` |" in statuses
+        assert codes.count(f"`{status}`") == 1
 
 
 def test_every_format_is_in_the_documents() -> None:
