@@ -34,6 +34,46 @@ def echo_table(rows: Iterable[Sequence[str]], indent: str = "") -> None:
         typer.echo((indent + "  ".join(cells)).rstrip())
 
 
+_WIDTH = 100
+"""Tables are no wider, also where the output is no terminal."""
+
+_TEXT_COLUMNS = ("recording", "algorithm", "status")
+
+
+def echo_rich_table(
+    titles: Sequence[str], rows: Iterable[Sequence[str]], heading: str, caption: str = ""
+) -> None:
+    """Print a table of numbers on stdout, at most 100 columns wide.
+
+    Args:
+        titles: of the columns.
+        rows: cells, as many as titles.
+        heading: above the table.
+        caption: below the table.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=Text(heading, style="bold"),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for title in titles:
+        text = title in _TEXT_COLUMNS
+        table.add_column(Text(title), justify="left" if text else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    terminal = Console()
+    console = Console(width=min(terminal.width, _WIDTH) if terminal.is_terminal else _WIDTH)
+    console.print(table)
+    if caption:
+        console.print(Text(caption))
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """A number with so many decimals, or a dash for none."""
     return "-" if value is None else f"{value:.{digits}f}"

@@ -17,6 +17,7 @@ from typing import Annotated
 import typer
 
 from slam_graph.cli import (
+    batch,
     compare,
     data_commands,
     evaluate,
@@ -80,6 +81,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run.run)
+app.command("batch")(batch.batch)
 app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)

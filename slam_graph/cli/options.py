@@ -83,7 +83,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
 
-def _sources_from(texts: list[str] | None) -> dict[str, str]:
+def sources_from(texts: list[str] | None) -> dict[str, str]:
     """Where each sensor is, from texts ``sensor=where``."""
     pairs = [text.partition("=") for text in texts or []]
     for text, (sensor, _, where) in zip(texts or [], pairs, strict=True):
@@ -109,7 +109,7 @@ def open_recording(
         cameras=cameras,
         calibration=calibration,
         groundtruth=groundtruth,
-        sources=_sources_from(sources),
+        sources=sources_from(sources),
     )
 
 
