@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.console import echo_json, echo_rich_table, number
+from slam_graph.cli.console import echo_json, echo_rich_table, notice, number
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -105,7 +105,8 @@ def batch(
 
     Given the same OUTPUT again, only what is left is done. A recording that fails stops no other.
     """
-    from slam_graph.experiment import batch as run_batch
+    with notice("loading"):
+        from slam_graph.experiment import batch as run_batch
 
     options: dict[str, Any] = {
         "algorithm": algorithm,
@@ -161,7 +162,16 @@ def _progress(wanted: bool) -> AbstractContextManager[BatchProgress | None]:
 
 def _echo(rows: list[_Row]) -> None:
     """Print the table, and why recordings did not end well."""
-    titles = ("recording", "status", "coverage", "ATE [m]", "rot. [°]", "smoothed", "speed", "warnings")
+    titles = (
+        "recording",
+        "status",
+        "coverage",
+        "ATE [m]",
+        "rot. [°]",
+        "smoothed",
+        "speed",
+        "warnings",
+    )
     columns = list(zip(titles, *map(_cells, rows), strict=True))
     chosen = [column for column in columns if set(column[1:]) != {"-"}]
     table = list(zip(*chosen, strict=True))

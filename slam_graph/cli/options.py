@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import typer
 from pydantic import BaseModel
 
+from slam_graph.cli.console import notice
+
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
     from slam_graph.datasets import RecordedSequence
@@ -101,16 +103,17 @@ def open_recording(
     cameras: int | None = None,
 ) -> RecordedSequence:
     """Open the recording that the options name, with its first `cameras` cameras or all."""
-    from slam_graph.datasets import open_dataset
+    with notice(f"opening {data}"):
+        from slam_graph.datasets import open_dataset
 
-    return open_dataset(
-        data,
-        format=format_,
-        cameras=cameras,
-        calibration=calibration,
-        groundtruth=groundtruth,
-        sources=sources_from(sources),
-    )
+        return open_dataset(
+            data,
+            format=format_,
+            cameras=cameras,
+            calibration=calibration,
+            groundtruth=groundtruth,
+            sources=sources_from(sources),
+        )
 
 
 def run_settings(
@@ -127,10 +130,11 @@ def run_settings(
         parts: whether each part of a run is enabled, by its table; None changes nothing.
         options: top-level settings; None changes nothing.
     """
-    from slam_graph.config import load_config
-
     tables = {name: {"enabled": on} for name, on in parts.items() if on is not None}
-    return load_config(config, overrides or (), **options, **tables)
+    with notice("loading"):
+        from slam_graph.config import load_config
+
+        return load_config(config, overrides or (), **options, **tables)
 
 
 _Policy = TypeVar("_Policy", bound=BaseModel)
