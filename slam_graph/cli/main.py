@@ -28,6 +28,7 @@ from slam_graph.cli import (
     simulate,
 )
 from slam_graph.cli.console import echo_json
+from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
@@ -37,7 +38,7 @@ from slam_graph.version import __version__
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 config_app = typer.Typer(
-    help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode=None
+    help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode="rich"
 )
 
 
@@ -76,8 +77,9 @@ def check(
 app = typer.Typer(
     help="Factor-graph SLAM: a recorded sequence in, a trajectory out.",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
+    epilog=example_text(""),
+    cls=SuggestingGroup,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
 app.command("run")(run.run)
@@ -92,6 +94,7 @@ app.command("simulate")(simulate.simulate)
 app.add_typer(frontend.app, name="frontend")
 app.add_typer(data_commands.app, name="data")
 app.add_typer(config_app, name="config")
+add_examples(app)
 
 
 def _print_version(wanted: bool) -> None:

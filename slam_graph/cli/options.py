@@ -20,16 +20,33 @@ if TYPE_CHECKING:
     from slam_graph.datasets import RecordedSequence
 
 
+_SETTINGS, _RECORDING = "Settings", "Recording"
+"""Panels of the help."""
+
 ConfigFile = Annotated[
     Path | None,
-    typer.Option("--config", help="YAML file of settings, which replace the defaults."),
+    typer.Option(
+        "--config",
+        help="YAML file of settings, which replace the defaults.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change one setting; may be repeated.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Algorithm = Annotated[
-    str | None, typer.Option("--algorithm", help="Name of an algorithm, or its YAML file.")
+    str | None,
+    typer.Option(
+        "--algorithm",
+        help="Name of an algorithm, or its YAML file.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Data = Annotated[
     str,
@@ -39,13 +56,26 @@ Data = Annotated[
     ),
 ]
 Format = Annotated[
-    str | None, typer.Option("--format", help="Format of the data; detected by default.")
+    str | None,
+    typer.Option(
+        "--format", help="Format of the data; detected by default.", rich_help_panel=_RECORDING
+    ),
 ]
 Calibration = Annotated[
-    Path | None, typer.Option("--calibration", help="Kalibr YAML to use instead of the data's.")
+    Path | None,
+    typer.Option(
+        "--calibration",
+        help="Kalibr YAML to use instead of the data's.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Groundtruth = Annotated[
-    Path | None, typer.Option("--groundtruth", help="True trajectory to use instead of the data's.")
+    Path | None,
+    typer.Option(
+        "--groundtruth",
+        help="True trajectory to use instead of the data's.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Sources = Annotated[
     list[str] | None,
@@ -56,17 +86,29 @@ Sources = Annotated[
         help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
         "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
         "rate=30 instead of stamps.",
+        rich_help_panel=_RECORDING,
     ),
 ]
 Cameras = Annotated[
     str | None,
-    typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use; all by default."),
+    typer.Option(
+        "--cameras",
+        metavar="mono|stereo|N",
+        help="Cameras to use; all by default.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Start = Annotated[
-    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+    float | None,
+    typer.Option(
+        "--start", help="Seconds after the first frame to start at.", rich_help_panel=_RECORDING
+    ),
 ]
 Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds to run; to the end by default.")
+    float | None,
+    typer.Option(
+        "--duration", help="Seconds to run; to the end by default.", rich_help_panel=_RECORDING
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 RerunMode = Literal["off", "save", "spawn", "connect"]
