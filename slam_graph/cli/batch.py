@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.console import echo_json, echo_rich_table, notice, number
+from slam_graph.cli.console import collected_log, echo_json, echo_rich_table, notice, number
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -119,7 +119,7 @@ def batch(
         if on is not None:
             options[name] = {"enabled": on}
     try:
-        with _progress(progress) as shown:
+        with _progress(progress) as shown, collected_log():
             done = run_batch(
                 what,
                 output=output,

@@ -82,6 +82,7 @@ _NUMBERS: tuple[tuple[str, str, Callable[[float], str], str], ...] = (
 _EXPLANATION = (
     "ATE and rotation: root mean square errors against the ground truth, where there is one, after "
     "alignment of yaw and position. Speed: recorded time over the time of the causal estimate. "
+    "A dot is the start. "
     "A click on a title sorts, one on a path shows more of the run."
 )
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import glob
+import logging
 import os
 import re
 from collections import Counter
@@ -19,13 +20,15 @@ from slam_graph.config import load_config
 from slam_graph.datasets import DATASETS
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.batch_task import BatchTask
+from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.settings import ConfigTree, Settings
+
+logger = logging.getLogger(__name__)
 
 _DEMO = "demo"
 _LISTS = (".yaml", ".yml")
 _IMAGES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp"}
-"""Files that are counted and not looked at, as there are many: when one changes, so does a table
-beside them."""
+"""Files of which the names only are looked at, as there are many."""
 
 
 class Entry(Settings):
@@ -54,7 +57,13 @@ class BatchList(Settings):
 
 @dataclass(frozen=True)
 class _Found:
-    """A recording that is to be run; `origin` is where it is named, `paths` are absolute."""
+    """A recording that is to be run.
+
+    Attributes:
+        entry: with absolute paths.
+        origin: where a list names it; empty if it was searched.
+        settings: of the whole list.
+    """
 
     entry: Entry
     origin: str
@@ -83,13 +92,16 @@ def plan(
         ConfigError: if a setting is wrong, or two recordings of lists have one name.
         DataError: if no recording is found.
     """
-    found: dict[str, _Found] = {}
+    recordings: list[_Found] = []
     for text in what:
-        for one in _read(text, common) if _is_list(text) else _searched(text, output, common):
-            entry = one.entry
-            key = one.origin + (entry.name or "") if one.settings or entry.name else entry.data
-            found.setdefault(key, one)
-    recordings = list(found.values())
+        more = list(_read(text, common) if _is_list(text) else _searched(text, output, common))
+        known = {one.entry.data for one in recordings if not one.origin}
+        recordings += [one for one in more if one.origin or one.entry.data not in known]
+        if not more:
+            logger.warning("%s: no recording of a known format here", text)
+    if not recordings:
+        formats = ", ".join(name for name, _ in DATASETS.working())
+        raise DataError(f"{', '.join(what)}: no recording found; known formats: {formats}")
     given = {name: value for name, value in options.items() if value is not None}
     tasks = []
     for one, name in zip(recordings, _names([one.entry for one in recordings]), strict=True):
@@ -162,27 +174,22 @@ def _searched(text: str, output: Path, common: Mapping[str, Any]) -> Iterator[_F
     """The recordings at a path, below a folder, or at or below what a pattern matches.
 
     Raises:
-        DataError: if there are none.
+        DataError: if nothing is there.
     """
     if text == _DEMO and not Path(text).exists():
         yield _Found(Entry(data=text), "", {})
         return
-    exact = Path(text).exists()
-    paths = [text] if exact else sorted(glob.glob(text, recursive=True))
+    paths = [text] if Path(text).exists() else sorted(glob.glob(text, recursive=True))
     own = {name: value for name, value in common.items() if value}
-    count = 0
+    if not paths:
+        raise DataError(f"{text}: no such file or folder")
     for path in paths:
-        if exact and own.get("format") is not None and Path(path).is_file():
+        if own.get("format") is not None and Path(path).is_file():
             places: Iterable[Path] = [Path(path)]
         else:
             places = _recordings(Path(path), output.resolve(), own.get("format"), set())
         for place in places:
-            count += 1
             yield _Found(Entry(data=str(place.resolve()), **own), "", {})
-    if not count:
-        known = ", ".join(name for name, _ in DATASETS.working())
-        reason = "no recording of a known format here" if paths else "no such file or folder"
-        raise DataError(f"{text}: {reason}; known formats: {known}")
 
 
 def _recordings(path: Path, output: Path, format: str | None, seen: set[Path]) -> Iterator[Path]:
@@ -252,26 +259,22 @@ def _name(data: str, depth: int) -> str:
     return re.sub(r"[^\w.-]+", "_", "_".join(part.strip("/") for part in parts)).lstrip(".")
 
 
-def _state(paths: Iterable[str]) -> tuple[int, int, int]:
-    """Number, total size and newest time in ns of the files at some paths, images only counted."""
-    count = size = newest = 0
-    for path in paths:
-        for file in _files(path):
-            count += 1
-            if os.path.splitext(file.name)[1].lower() in _IMAGES:
-                continue
-            status = file.stat()
-            size, newest = size + status.st_size, max(newest, status.st_mtime_ns)
-    return count, size, newest
+def _state(paths: Iterable[str]) -> str:
+    """A hash of the names, sizes and times of the files at some paths; of images the names only."""
+    files = sorted(str(file) for path in paths for file in _files(Path(path)))
+    return settings_hash([(file, *_size_and_time(file)) for file in files])
 
 
-def _files(path: str) -> Iterator[os.DirEntry[str] | Path]:
+def _files(path: Path) -> Iterator[Path]:
     """The files at a path or below it."""
-    if os.path.isfile(path):
-        yield Path(path)
-        return
+    if path.is_file():
+        yield path
     for folder, _, names in os.walk(path):
-        for name in names:
-            file = Path(folder, name)
-            if file.exists():
-                yield file
+        yield from (Path(folder, name) for name in names)
+
+
+def _size_and_time(file: str) -> tuple[int, ...]:
+    if os.path.splitext(file)[1].lower() in _IMAGES or not os.path.exists(file):
+        return ()
+    status = os.stat(file)
+    return status.st_size, status.st_mtime_ns

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import shutil
 import socket
 import time
@@ -35,6 +36,8 @@ MARK = "batch.json"
 """The file that says which settings a folder of results is of; it is written last."""
 
 _PROGRESS = "progress"
+_PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]+)\.(?P<pid>\d+)\.partial$")
+"""Names of hidden folders of runs that are going on."""
 _PERIOD_S = 0.3
 _CAUSAL_PART = 0.85
 """Part of a run that the causal estimate usually takes; the rest is the final adjustment."""
@@ -56,8 +59,8 @@ class BatchTask(Settings):
     """True trajectory to use instead of that of the recording."""
     sources: dict[str, str] = Field(default_factory=dict)
     """Where each sensor is, in formats that leave it open."""
-    state: tuple[int, int, int] = (0, 0, 0)
-    """Number, size and time of the files of the recording; they reveal that it has changed."""
+    state: str = ""
+    """Hash of names, sizes and times of the files of the recording: it reveals a change."""
     config: RunConfig
     """All settings of the run."""
     output: Path
@@ -120,22 +123,19 @@ def running(output: Path) -> dict[str, float]:
     """What part of each recording that is being run now is done, from 0 to 1, by its name."""
     parts: dict[str, float] = {}
     for folder in sorted(output.glob(".*.partial")):
+        found = _PARTIAL.match(folder.name)
         with suppress(OSError, ValueError):
-            parts[_name_of(folder)] = float((folder / _PROGRESS).read_text(encoding="ascii"))
+            if found:
+                parts[found["name"]] = float((folder / _PROGRESS).read_text(encoding="ascii"))
     return parts
 
 
 def remove_remains(output: Path) -> None:
     """Remove what processes of this machine left that were killed."""
     for folder in output.glob(".*.partial"):
-        _, host, pid, _ = folder.name.rsplit(".", 3)
-        if host == _host() and not _lives(int(pid)):
+        found = _PARTIAL.match(folder.name)
+        if found and found["host"] == _host() and not _lives(int(found["pid"])):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _name_of(partial: Path) -> str:
-    """The name of the recording that a hidden folder is of."""
-    return partial.name[1:].rsplit(".", 3)[0]
 
 
 def _host() -> str:
