@@ -32,7 +32,8 @@ class BatchProgress:
     def __init__(self, live: bool) -> None:
         self._began = time.monotonic()
         self._count = self._total = self._failed = 0
-        self._parts: Mapping[str, float] = {}
+        self._parts: dict[str, float] = {}
+        self._over: set[str] = set()
         self._live = None
         if live:
             console = Console(stderr=True)
@@ -61,6 +62,8 @@ class BatchProgress:
         """A run has ended; see `batch`."""
         self._count, self._total = count, total
         self._failed += failure is not None
+        self._over.add(name)
+        self._parts.pop(name, None)
         line = f"{count}/{total} {name}" + ("" if failure is None else f": failed: {failure}")
         if self._live is None:
             typer.echo(line, err=True)
@@ -69,7 +72,10 @@ class BatchProgress:
 
     def running(self, parts: Mapping[str, float], total: int) -> None:
         """Which recordings are being run, and what part of each is done; see `batch`."""
-        self._parts, self._total = parts, total
+        self._total = total
+        # results are complete a moment before their process has ended, which counts
+        known = dict.fromkeys(self._parts, 1.0) | dict(parts)
+        self._parts = {name: part for name, part in known.items() if name not in self._over}
 
     def _shown(self) -> Group | Text:
         """What is shown now."""

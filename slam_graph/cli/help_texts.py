@@ -43,8 +43,8 @@ EXAMPLES = {
         "slam-graph map info results/MH_01_easy",
         "slam-graph map merge monday.slam tuesday.slam --output both.slam",
     ),
-    "ape": ("slam-graph ape groundtruth.tum results/demo/latest/trajectory.tum --align",),
-    "rpe": ("slam-graph rpe groundtruth.tum trajectory.tum --delta 1 --delta-unit m",),
+    "ape": ("slam-graph ape groundtruth.tum results/demo/latest/trajectory.tum --align yaw",),
+    "rpe": ("slam-graph rpe groundtruth.tum trajectory.tum --delta 1 --delta_unit m",),
     "compare": (
         "slam-graph compare sim:figure8 --algorithms msckf,swf --seeds 5",
         "slam-graph compare path/to/MH_01_easy --algorithms msckf,okvis,own.yaml",
