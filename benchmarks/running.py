@@ -20,7 +20,7 @@ from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.pipeline.observers import NullViewer
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.pipeline.stage import EstimatedFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +131,9 @@ class _StateCounter(NullViewer):
         self.waited = 0
         self._started = False
 
-    def show(
-        self,
-        frame: CameraFrame | FeatureFrame,
-        features: FeatureFrame,
-        state: object,
-        points: object,
-    ) -> None:
+    def show(self, frame: EstimatedFrame, estimator: object) -> None:
         """Look whether there is a state."""
-        self._started |= state is not None
+        self._started |= frame.state is not None
         self.waited += not self._started
 
 

@@ -28,7 +28,7 @@ from slam_graph.datasets.formats.euroc import EurocSequence
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions
 from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame
+from slam_graph.pipeline.stage import EstimatedFrame
 
 CAMERAS = 2
 
@@ -147,19 +147,10 @@ class Reference(NullViewer, NullProgress):
         """The first frame begins."""
         self.frames.start()
 
-    def advance(self, stamp_ns: int, initialized: bool) -> None:
-        """A frame is done."""
+    def show(self, frame: EstimatedFrame, estimator: object) -> None:
+        """A frame is done: time the reference; then the next frame begins."""
         self.frames.stop()
-
-    def show(
-        self,
-        frame: CameraFrame | FeatureFrame,
-        features: FeatureFrame,
-        state: object,
-        points: object,
-    ) -> None:
-        """Time the reference; then the next frame begins."""
-        image = frame.images[0] if isinstance(frame, CameraFrame) else None
+        image = frame.image
         if image is not None:
             if self._last is not None:
                 time_flow(self._last, image, self.flows)

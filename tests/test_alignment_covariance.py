@@ -19,7 +19,8 @@ from slam_graph.backend.smoothing.final_adjustment import FinalBa, FinalBaSummar
 from slam_graph.backend.smoothing.state_covariances import gauge_motion
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.evaluation.evaluation_report import nees_of_run
-from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
+from slam_graph.geometry.state_history import StateHistory
+from slam_graph.geometry.trajectory import NavState, Trajectory
 
 POSES, FAR, DRAWS = 20, 6, 300
 SPACING_NS, BEGIN_NS = 50_000_000, 1_000_000_000

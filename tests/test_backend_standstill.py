@@ -22,7 +22,8 @@ from slam_graph.backend.cost.zero_velocity import (
 from slam_graph.backend.estimator import Estimator
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
-from slam_graph.geometry.trajectory import StateHistory, Trajectory
+from slam_graph.geometry.state_history import StateHistory
+from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 
 from slam_graph.evaluation.consistency import average_nees, mean_bounds, nees
 from slam_graph.evaluation.evaluation_report import consistency_report, innovation_report
-from slam_graph.geometry.trajectory import NavState, StateHistory, Trajectory
+from slam_graph.geometry.state_history import StateHistory
+from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.geometry.trajectory_alignment import Similarity
 
 COUNT = 2000

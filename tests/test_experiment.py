@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from limits import HANG_S
 
+from slam_graph.cli.console import echo_rich_table
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -71,9 +72,24 @@ def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path
         assert f"| {name} |" in markdown
         assert f"<td>{name}</td>" in html
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", markdown)
-    assert len(pictures) == len(ALIGNMENTS) + 2
+    kinds = ("paths", "summary", "errors", "nees", "steps")
+    assert pictures == [f"figures/sim_figure8_{kind}.png" for kind in kinds]
     assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
     assert html.count("data:image/png;base64,") == len(pictures)
+
+
+def test_the_printed_table_fits_a_hundred_columns(
+    simulated: tuple[Path, dict], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = simulated
+    done = compare("sim:figure8", *SHORT_SIM, "--algorithms", "msckf,swf", "--output", folder)
+    lines = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 100
+    assert any(line.split()[:2] == ["algorithm", "ATE"] for line in lines)
+    assert any(line.split()[:1] == ["swf"] and line.rstrip().endswith("1 ok") for line in lines)
+    rows = [["a_long_name_of_an_algorithm" * 3, *(["123456.789"] * 8)]]
+    echo_rich_table(["algorithm", *(f"quantity {k} [m]" for k in range(8))], rows, "data", "note")
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
 
 
 def test_a_job_is_what_the_pipeline_does_on_the_recorded_tracks(

@@ -113,6 +113,10 @@ def test_points_that_move_on_their_own_are_rejected(texture: Spline) -> None:
     in_a, in_b = common(a.cameras[0], b.cameras[0])
     motion = b.cameras[0].pixels[in_b] - a.cameras[0].pixels[in_a]
     assert frontend.frame_stats["rejected_ransac"] >= 3
+    (outliers,) = b.outliers  # for those who watch
+    assert len(outliers) == frontend.frame_stats["rejected_ransac"]
+    assert np.isin(outliers.ids, a.cameras[0].ids).all()
+    assert not np.isin(outliers.ids, b.cameras[0].ids).any()
     assert np.max(np.abs(motion[:, 1])) < 1.5
 
 

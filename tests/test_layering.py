@@ -13,15 +13,15 @@ PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
     {"errors", "diagnostics", "version", "arrays", "lazy"},
-    {"plugins"},
+    {"plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},
     {"datasets", "frontend"},
     {"backend"},
     {"pose_graph", "bundle_adjustment", "simulation"},
     {"loop_closure"},
-    {"maps"},
-    {"evaluation", "visualization", "config"},
+    {"maps", "evaluation"},
+    {"visualization", "config"},
     {"results"},
     {"pipeline"},
     {"experiment"},

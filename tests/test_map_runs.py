@@ -145,7 +145,43 @@ def test_tracks_without_descriptors_make_no_map(known: Path) -> None:
     tracks = TrackConfig(features=30)
     sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
     result = run(sequence, load_config(None, ["map.enabled=true"]), known_map=load_map(known))
-    assert result.status == "ok"
+    assert result.status == "no_map"
+    with pytest.raises(EstimationError, match="no map was made: nothing to recognise places by"):
+        result.check()
     assert result.slam_map is None
+    assert result.metrics["extent"]["coverage"] == 1.0
     assert result.warnings["map_impossible"] == 1
     assert result.warnings["localization_impossible"] == 1
+
+
+def test_two_flights_through_one_place_by_the_recipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands of docs/maps.md, with shorter flights of fewer frames and features."""
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parent.parent / "docs" / "maps.md").read_text(encoding="utf-8")
+    start = page.index("slam-graph simulate monday")
+    recipe = page[start : page.index("```", start)].splitlines()
+    assert [line.split()[1] for line in recipe] == ["simulate", "simulate", "run", "localize"]
+    shorter = {"60": "24", "30": "12"}
+    sparse = ("--features", 80, "--set", "landmarks.density=4")
+    options = ("--rate", 5, *sparse, "--no-progress")
+    for line in recipe:
+        words = [shorter.get(word, word) for word in line.split()[1:]]
+        done = call(*words, *(options if words[0] == "simulate" else ()))
+        assert done.exit_code == 0, done.output
+    table = json.loads(done.stdout)
+    assert table["dataset"]["name"] == "tuesday"
+    assert Path(table["folder"]).parent == Path("results") / "tuesday"
+    assert table["localization"]["located_share"] > 0.9
+    assert table["localization"]["accuracy"]["none"]["ate"]["translation_m"]["rmse"] < 0.1
+
+
+def test_a_run_that_makes_no_map_is_an_error(tmp_path: Path) -> None:
+    simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0)).save(tmp_path / "plain")
+    done = call("run", tmp_path / "plain", "--save-map", "--output", tmp_path / "out")
+    assert isinstance(done.exception, EstimationError)
+    assert done.exception.exit_code == 3
+    table = json.loads(done.stdout)
+    assert table["status"] == "no_map"
+    assert (Path(table["folder"]) / "trajectory_smoothed.tum").is_file()

@@ -54,6 +54,9 @@ class Watcher:
     def show(self, *_: object) -> None:
         self.calls.append("show")
 
+    def finish(self, *_: object) -> None:
+        self.calls.append("finish")
+
     def close(self) -> None:
         self.calls.append("close")
 
@@ -74,7 +77,7 @@ def test_the_same_seed_gives_the_same_trajectory_and_all_are_told() -> None:
     np.testing.assert_array_equal(first.trajectory.positions, second.trajectory.positions)
     assert first.status == "ok"
     first.check()
-    assert watcher.calls == ["open", *["write", "show"] * first.logs.frames, "close"]
+    assert watcher.calls == ["open", *["write", "show"] * first.logs.frames, "finish", "close"]
     assert watcher.stamps == sorted(watcher.stamps)
     assert len(watcher.stamps) == first.logs.frames
     assert watcher.adjusted == sorted(watcher.adjusted), "the final bundle adjustment went back"

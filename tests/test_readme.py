@@ -16,8 +16,13 @@ from slam_graph.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGE_NAMES = ("results.md", "datasets.md", "batch.md")
-PAGES = [README, *((ROOT / "docs" / page).read_text() for page in PAGE_NAMES)]
+PAGES = [
+    README,
+    *(
+        (ROOT / "docs" / page).read_text(encoding="utf-8")
+        for page in ("results.md", "datasets.md", "visualization.md", "batch.md")
+    ),
+]
 
 GROUPS = ("data", "config", "frontend")
 """Commands of `slam-graph` that have commands of their own."""

@@ -266,3 +266,27 @@ def plain(settings: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield from plain(info.annotation, f"{prefix}{name}.")
         elif not (isinstance(info.json_schema_extra, dict) and info.json_schema_extra["expert"]):
             yield prefix + name
+
+
+@pytest.mark.parametrize("trajectory", ["figure8", "random", "rooms"])
+def test_flights_of_one_world_seed_go_through_one_place(trajectory: str) -> None:
+    def flight(seed: int, world_seed: int | None) -> SimulatedTracks:
+        made = simulate(
+            trajectory=trajectory,
+            duration_s=3.0,
+            rate_hz=5.0,
+            seed=seed,
+            world_seed=world_seed,
+            tracks={"descriptors": True, "keep_ids": True},
+        )
+        assert isinstance(made, SimulatedTracks)
+        return made
+
+    one, other, elsewhere = flight(1, 7), flight(2, 7), flight(2, None)
+    np.testing.assert_array_equal(one.landmarks.points, other.landmarks.points)
+    assert not np.array_equal(one.groundtruth().positions, other.groundtruth().positions)
+    np.testing.assert_array_equal(other.groundtruth().positions, elsewhere.groundtruth().positions)
+    assert not np.array_equal(other.landmarks.points[:50], elsewhere.landmarks.points[:50])
+    itself, same = flight(3, 3), flight(3, None)
+    if trajectory == "rooms":
+        np.testing.assert_array_equal(itself.landmarks.points, same.landmarks.points)

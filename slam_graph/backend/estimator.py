@@ -37,13 +37,7 @@ from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
-from slam_graph.sensors import (
-    CalibrationEstimate,
-    FeatureFrame,
-    ImuBuffer,
-    ImuData,
-    Rig,
-)
+from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, ImuData, Rig
 
 _IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
@@ -278,8 +272,7 @@ class Estimator:
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
             scale_sigma = self._initializer.scale_sigma
-            if scale_sigma is not None:
-                self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            self._review = StartReview(self._context, stamp_ns, scale_sigma)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
@@ -346,6 +339,11 @@ class Estimator:
     def rejected(self) -> IntArray:
         """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
         return self._report.rejected
+
+    @property
+    def dynamic(self) -> IntArray:
+        """Ids (N,) of the tracked features that move by themselves, ascending."""
+        return self._standstill.dynamic
 
     @property
     def imu_noise(self) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -23,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.display import Displayed
 from slam_graph.errors import DataError
 
 POSE_DIM = 6
@@ -80,8 +82,8 @@ class BalEstimates:
         return merged
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BalProblem:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class BalProblem(Displayed):
     """Cameras, points and observations.
 
     Attributes:
@@ -97,6 +99,32 @@ class BalProblem:
     point: IntArray
     pixels: FloatArray
     name: str = "problem"
+
+    def __repr__(self) -> str:
+        return (
+            f"BalProblem({self.name}: {self.cameras} cameras, {self.points} points, "
+            f"{len(self.camera)} observations)"
+        )
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "name": self.name,
+            "cameras": self.cameras,
+            "points": self.points,
+            "observations": f"{len(self.camera)}, "
+            f"{len(self.camera) / max(self.points, 1):.1f} a point",
+        }
+
+    def plot(self) -> Any:
+        """The estimates of the file from three sides, as a figure."""
+        title = f"{self.name}  ·  {self.cameras} cameras, {self.points} points"
+        estimates = self.estimates
+        return self._drawn(
+            "bundle_picture.bundle_figure", title, estimates.points, estimates.centres(), {}
+        )
+
+    def _sketch(self) -> Any:
+        return self.plot() if self.points and self.cameras else None
 
     @property
     def cameras(self) -> int:

@@ -7,11 +7,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
+
+import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_cost import reprojection_errors
 from slam_graph.bundle_adjustment.bal_file import bal_lines
-from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem
+from slam_graph.bundle_adjustment.bal_problem import BalEstimates, BalPart, BalProblem, usable
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.display import Displayed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +40,8 @@ class BalMinimum:
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class BalSolution:
+@dataclass(frozen=True, eq=False, repr=False)
+class BalSolution(Displayed):
     """The result of a bundle adjustment.
 
     Attributes:
@@ -50,6 +55,48 @@ class BalSolution:
     part: BalPart
     minimum: BalMinimum
     estimates: BalEstimates
+
+    @staticmethod
+    def unsolved(problem: BalProblem) -> BalSolution:
+        """A problem as it is: what could be adjusted of it, with its own estimates.
+
+        Raises:
+            DataError: if nothing of it can be estimated.
+        """
+        part = usable(problem, Diagnostics())
+        minimum = BalMinimum(part.problem.estimates, np.nan, np.nan, 0, 0, False)
+        return BalSolution(problem, part, minimum, problem.estimates)
+
+    def __repr__(self) -> str:
+        part, minimum = self.part.problem, self.minimum
+        return (
+            f"BalSolution({self.problem.name}: {part.cameras} cameras, {part.points} points, "
+            f"cost {minimum.cost:.6g}, {'' if minimum.converged else 'not '}converged)"
+        )
+
+    def _facts(self) -> dict[str, object]:
+        minimum, rms = self.minimum, {k: np.sqrt(np.mean(e**2)) for k, e in self.errors_px.items()}
+        return {
+            "problem": self.problem,
+            "cost": f"{minimum.start_cost:.6g} to {minimum.cost:.6g}",
+            "reprojection RMS": f"{rms['before']:.4g} to {rms['after']:.4g} px",
+            "steps": f"{minimum.steps}, {'' if minimum.converged else 'not '}converged",
+        }
+
+    def plot(self) -> Any:
+        """The scene from three sides, and a histogram of the reprojection errors, as a figure."""
+        part, adjusted = self.part.problem, self.adjusted
+        return self._drawn(
+            "bundle_picture.bundle_figure",
+            f"{self.problem.name}  ·  {part.cameras} cameras, {part.points} points, "
+            f"{len(part.camera)} observations",
+            adjusted.points,
+            adjusted.centres(),
+            self.errors_px,
+        )
+
+    def _sketch(self) -> Any:
+        return self.plot()
 
     @cached_property
     def adjusted(self) -> BalEstimates:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slam_graph.cli.console import echo_json, echo_table
+from slam_graph.cli.console import echo_json, echo_rich_table
 from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
 
 if TYPE_CHECKING:
@@ -126,9 +126,32 @@ def _print_task(task: str, failure: str | None, count: int, total: int) -> None:
     typer.echo(f"{count}/{total} {task}{ending}", err=True)
 
 
+_SHOWN = {
+    "algorithm": "algorithm",
+    "ATE yaw [m]": "ATE [m]",
+    "orientation [deg]": "rot. [°]",
+    "NEES pose": "NEES",
+    "NIS / expected": "NIS",
+    "steps": "steps",
+    "ms a frame": "ms/frame",
+    "peak MB": "MB",
+    "status": "status",
+}
+"""Columns of the table that are printed, and their titles there; the report has all."""
+
+_MEANING = (
+    "ATE, rot.: root mean square errors, aligned in yaw and position. NEES of the pose (ideal 6). "
+    "NIS over its expected value (ideal 1). The report has all columns."
+)
+
+
 def _echo(comparison: Comparison) -> None:
-    """Print the table and the names of the files."""
-    echo_table(_informative(comparison.table))
+    """Print a table for each data set, and the names of the files."""
+    titles, *rows = comparison.table
+    names = list(dict.fromkeys(row[0] for row in rows))
+    for name in names:
+        shown = _informative([titles, *(row for row in rows if row[0] == name)])
+        echo_rich_table(shown[0], shown[1:], name, caption=_MEANING if name == names[-1] else "")
     if comparison.skipped:
         typer.echo(f"\n{comparison.skipped} tasks had been done before")
     typer.echo(f"\n{comparison.folder}/")
@@ -136,11 +159,11 @@ def _echo(comparison: Comparison) -> None:
 
 
 def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """A table without empty columns, and without the column `data` if there is only one."""
+    """The columns that are printed and have any number."""
     columns = [
-        values
+        (_SHOWN[values[0]], *values[1:])
         for values in zip(*table, strict=True)
-        if set(values[1:]) != {"-"} and (values[0] != "data" or len(set(values[1:])) > 1)
+        if values[0] in _SHOWN and set(values[1:]) != {"-"}
     ]
     return list(zip(*columns, strict=True))
 

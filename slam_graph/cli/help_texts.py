@@ -45,6 +45,14 @@ EXAMPLES = {
     ),
     "ape": ("slam-graph ape groundtruth.tum results/demo/latest/trajectory.tum --align yaw",),
     "rpe": ("slam-graph rpe groundtruth.tum trajectory.tum --delta 1 --delta_unit m",),
+    "view": (
+        "slam-graph view results/demo",
+        "slam-graph view results/demo --screenshot demo.png",
+    ),
+    "export": (
+        "slam-graph export results/demo --tum poses.tum --euroc states.csv",
+        "slam-graph export results/MH_01_easy --recording path/to/MH_01_easy --colmap scene",
+    ),
     "compare": (
         "slam-graph compare sim:figure8 --algorithms msckf,swf --seeds 5",
         "slam-graph compare path/to/MH_01_easy --algorithms msckf,okvis,own.yaml",

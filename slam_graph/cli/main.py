@@ -3,8 +3,8 @@
 """The command `slam-graph`: launches a command and turns errors into exit codes.
 
 Exit codes: 0 success; 1 expected failure, with one line on stderr; 2 usage or configuration error;
-3 ran, but never initialised, diverged or covered less than asked; 130 interrupted. Modules that are
-slow to import are imported inside the commands.
+3 ran, but never initialised, diverged, covered less than asked or made no map; 130 interrupted.
+Modules that are slow to import are imported inside the commands.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from slam_graph.cli import (
     compare,
     data_commands,
     evaluate,
+    export,
     frontend,
     map,
     optimize,
     run,
     simulate,
+    view,
 )
 from slam_graph.cli.console import echo_json
 from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
@@ -88,9 +90,11 @@ app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
 app.command("rpe")(evaluate.rpe)
+app.command("export")(export.export)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
 app.command("simulate")(simulate.simulate)
+app.command("view")(view.view)
 app.add_typer(frontend.app, name="frontend")
 app.add_typer(data_commands.app, name="data")
 app.add_typer(config_app, name="config")

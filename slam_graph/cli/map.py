@@ -24,6 +24,9 @@ from slam_graph.cli.options import (
     Overrides,
     Progress,
     Rerun,
+    RerunAddress,
+    RerunDetail,
+    RerunImages,
     Seed,
     Sources,
     Start,
@@ -31,6 +34,7 @@ from slam_graph.cli.options import (
     run_settings,
 )
 from slam_graph.cli.run import execute, report
+from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.maps import MapRecording, SlamMap
@@ -51,6 +55,9 @@ def localize(
     seed: Seed = None,
     output: Output = Path("results"),
     rerun: Rerun = "off",
+    rerun_images: RerunImages = "all",
+    rerun_detail: RerunDetail = "normal",
+    rerun_address: RerunAddress = None,
     progress: Progress = True,
     final_ba: Annotated[
         bool | None,
@@ -90,8 +97,10 @@ def localize(
         sequence = open_recording(
             data, format_, calibration, groundtruth, sources, settings.cameras
         )
-        result, folder, files = execute(sequence, settings, output, rerun, progress, log, known)
+        watching = Watching(rerun, rerun_images, rerun_detail, rerun_address)
+        result, folder, files = execute(sequence, settings, output, watching, progress, log, known)
     report(result, folder, files, as_json)
+    keep_serving(rerun)
     if result.localization is None or result.localization.located.any():
         return
     if result.localization.counts["queries"] == 0:

@@ -17,8 +17,11 @@ from slam_graph.cli.options import (
     ConfigFile,
     Json,
     Overrides,
+    Rerun,
+    RerunAddress,
     read_policy,
 )
+from slam_graph.cli.watching import Watching
 from slam_graph.errors import ConfigError, DataError
 
 _Method = Literal["gauss_newton", "levenberg_marquardt", "dogleg", "isam2"]
@@ -77,6 +80,8 @@ def optimize(
     output: Annotated[
         Path, typer.Option("--output", help="Folder of results: OUTPUT/<name>/<UTC time>/.")
     ] = Path("results"),
+    rerun: Rerun = "off",
+    rerun_address: RerunAddress = None,
     as_json: Json = False,
 ) -> None:
     """Optimise a pose graph or a bundle-adjustment problem, and write the results.
@@ -87,6 +92,7 @@ def optimize(
     from slam_graph.pose_graph import PoseGraphPolicy
     from slam_graph.results import refuse_to_replace
 
+    watching = Watching(rerun, address=rerun_address)
     if save is not None:
         refuse_to_replace(save, force)
         if not save.parent.is_dir():
@@ -101,13 +107,15 @@ def optimize(
         graph_policy = read_policy(PoseGraphPolicy, config, set_ or [], {**loss, **of_graphs})
         wanted = Wanted(certify, covariances)
         meaning = information or "angle"
-        optimize_pose_graph_file(file, meaning, graph_policy, wanted, save, output, as_json)
+        optimize_pose_graph_file(
+            file, meaning, graph_policy, wanted, save, output, as_json, watching
+        )
         return
     flags = {"--certify": certify or None, "--covariances": covariances or None}
     others = {"--method": method, "--init": initialization, "--information": information}
     _refuse({**others, **flags}, "pose graphs", file)
     bundle_policy = read_policy(BalPolicy, config, set_ or [], {**loss, **of_bundles})
-    optimize_bal(file, bundle_policy, save, output, as_json)
+    optimize_bal(file, bundle_policy, save, output, as_json, watching)
 
 
 def _seen_format(file: Path) -> _Format:

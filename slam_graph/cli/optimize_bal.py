@@ -12,6 +12,7 @@ import typer
 
 from slam_graph.cli.console import collected_log, echo_json, echo_table
 from slam_graph.cli.options import timed, write_result
+from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.bundle_adjustment import BalPolicy
@@ -19,7 +20,12 @@ if TYPE_CHECKING:
 
 
 def optimize_bal(
-    file: Path, policy: BalPolicy, save: Path | None, output: Path, as_json: bool
+    file: Path,
+    policy: BalPolicy,
+    save: Path | None,
+    output: Path,
+    as_json: bool,
+    watching: Watching,
 ) -> None:
     """Estimate all cameras and points, write the results and print what was reached."""
     from slam_graph.bundle_adjustment import adjust_bundle, read_bal
@@ -35,7 +41,9 @@ def optimize_bal(
             solution = adjust_bundle(problem, policy, diagnostics)
         result = BalResult(policy, solution, seconds, diagnostics.counts)
         folder, files = _write(result, save, output, log)
+        files += watching.show(folder, result.name, lambda r: r.show_bundle(solution))
     _show(result, folder, files, as_json)
+    keep_serving(watching.mode)
 
 
 def _write(

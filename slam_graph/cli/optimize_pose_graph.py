@@ -13,6 +13,7 @@ import typer
 
 from slam_graph.cli.console import collected_log, echo_json, echo_table
 from slam_graph.cli.options import timed, write_result
+from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
@@ -41,6 +42,7 @@ def optimize_pose_graph_file(
     save: Path | None,
     output: Path,
     as_json: bool,
+    watching: Watching,
 ) -> None:
     """Estimate all poses, write the results and print what was reached."""
     from slam_graph.diagnostics import Diagnostics
@@ -55,10 +57,12 @@ def optimize_pose_graph_file(
         folder, files = write_result(result, graph.name, output, log)
         if save is not None:
             result.save_problem(save)
+        files += watching.show(folder, graph.name, lambda r: r.show_pose_graph(result.solution))
     if as_json:
         echo_json({**result.metrics, "folder": str(folder), "files": [str(path) for path in files]})
     else:
         _report(result, folder, files)
+    keep_serving(watching.mode)
 
 
 def _solve(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets import RecordedSequence
 
 
-_SETTINGS, _RECORDING = "Settings", "Recording"
+_SETTINGS, _RECORDING, _VIEWER = "Settings", "Recording", "Rerun"
 """Panels of the help."""
 
 ConfigFile = Annotated[
@@ -111,13 +111,44 @@ Duration = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-RerunMode = Literal["off", "save", "spawn", "connect"]
+RerunMode = Literal["off", "save", "spawn", "connect", "serve"]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")]
 Output = Annotated[
     Path, typer.Option("--output", help="Folder of results: OUTPUT/<dataset>/<UTC time>/.")
 ]
 Rerun = Annotated[
-    RerunMode, typer.Option("--rerun", help="Show the run in Rerun, or save it for Rerun.")
+    RerunMode,
+    typer.Option(
+        "--rerun",
+        help="Watch the run in Rerun: save a recording, spawn a window, connect to a viewer that "
+        "is open, or serve to a browser.",
+        rich_help_panel=_VIEWER,
+    ),
+]
+RerunImages = Annotated[
+    Literal["none", "keyframes", "all"],
+    typer.Option(
+        "--rerun-images", help="Of which frames Rerun is given images.", rich_help_panel=_VIEWER
+    ),
+]
+RerunDetail = Annotated[
+    Literal["normal", "graph"],
+    typer.Option(
+        "--rerun-detail",
+        help="graph adds the factor graph of every window, and its information matrix before and "
+        "after marginalization.",
+        rich_help_panel=_VIEWER,
+    ),
+]
+RerunAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--rerun-address",
+        metavar="URL",
+        help="Viewer to connect to; rerun+http://127.0.0.1:9876/proxy by default.",
+        show_default=False,
+        rich_help_panel=_VIEWER,
+    ),
 ]
 Progress = Annotated[
     bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")

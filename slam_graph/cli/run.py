@@ -35,13 +35,16 @@ from slam_graph.cli.options import (
     Overrides,
     Progress,
     Rerun,
-    RerunMode,
+    RerunAddress,
+    RerunDetail,
+    RerunImages,
     Seed,
     Sources,
     Start,
     open_recording,
     run_settings,
 )
+from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -199,6 +202,9 @@ def run(
     seed: Seed = None,
     output: Output = Path("results"),
     rerun: Rerun = "off",
+    rerun_images: RerunImages = "all",
+    rerun_detail: RerunDetail = "normal",
+    rerun_address: RerunAddress = None,
     progress: Progress = True,
     final_ba: Annotated[
         bool | None,
@@ -262,12 +268,13 @@ def run(
             sequence,
             settings,
             output,
-            rerun,
+            Watching(rerun, rerun_images, rerun_detail, rerun_address),
             progress,
             log,
             graph_times=[_time(text) for text in save_graph or ()],
         )
     report(result, folder, files, as_json)
+    keep_serving(rerun)
 
 
 def _time(text: str) -> int | float:
@@ -297,7 +304,7 @@ def execute(
     sequence: Sequence,
     settings: RunConfig,
     output: Path,
-    rerun: RerunMode,
+    watching: Watching,
     progress: bool,
     log: list[str],
     known_map: SlamMap | None = None,
@@ -309,7 +316,7 @@ def execute(
         from slam_graph.results import ResultFolder
 
     with ResultFolder.of_run(output, sequence.info().name) as made:
-        viewer = _viewer(rerun, made.folder, sequence.info().name)
+        viewer = watching.viewer(made.folder / "recording.rrd", sequence.info().name, known_map)
         with _progress(sequence, settings, progress) as bar:
             result = run_pipeline(
                 sequence,
@@ -320,19 +327,10 @@ def execute(
                 graph_times=graph_times,
             )
         made.files += result.save(made.folder)
-        if rerun == "save":
+        if watching.mode == "save":
             made.path("recording.rrd")
         made.text("run.log", log)
     return result, made.folder, made.files
-
-
-def _viewer(mode: RerunMode, folder: Path, name: str) -> Any:
-    """The viewer that was asked for, or None."""
-    if mode == "off":
-        return None
-    from slam_graph.visualization import RerunViewer
-
-    return RerunViewer(mode, folder / "recording.rrd" if mode == "save" else None, name)
 
 
 def _progress(

@@ -64,6 +64,12 @@ def simulate(
         float | None, typer.Option("--loss", help="Probability that a track ends at a frame.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of random numbers.")] = None,
+    world_seed: Annotated[
+        int | None,
+        typer.Option(
+            "--world-seed", help="Seed of the place, for several flights through one; see --seed."
+        ),
+    ] = None,
     config: ConfigFile = None,
     set_: Overrides = None,
     progress: Annotated[
@@ -95,6 +101,7 @@ def simulate(
         "duration_s": duration,
         "rate_hz": rate,
         "seed": seed,
+        "world_seed": world_seed,
         "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
     }
     EurocWriter.refuse_existing(output)

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,89 +23,17 @@ from slam_graph.datasets.groundtruth import (
     read_groundtruth,
     resolve_groundtruth,
 )
+from slam_graph.datasets.packets import packetize, packetize_alone
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 _HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""
 
+
 FrameStream = Generator[CameraFrame | FeatureFrame, None, None]
-
-
-class _ImuFeed:
-    """Hands out a stream of IMU blocks in pieces that end at given times.
-
-    Attributes:
-        latest_ns: stamp of the last sample handed out, None before the first.
-    """
-
-    def __init__(self, blocks: Iterator[ImuData]) -> None:
-        self.latest_ns: int | None = None
-        self._blocks = blocks
-        self._buffer = ImuData.empty()
-
-    def up_to(self, stamp_ns: int) -> ImuData:
-        """All samples not yet handed out, up to and including the first at or after `stamp_ns`."""
-        if self.latest_ns is not None and self.latest_ns >= stamp_ns:
-            return ImuData.empty()
-        pending = [self._buffer]
-        while not len(pending[-1]) or pending[-1].stamps_ns[-1] < stamp_ns:
-            block = next(self._blocks, None)
-            if block is None:
-                break
-            pending.append(block)
-        data = ImuData.concatenate(pending) if len(pending) > 1 else self._buffer
-        end = int(np.searchsorted(data.stamps_ns, stamp_ns, side="left")) + 1
-        self._buffer = data[end:]
-        if len(data):
-            self.latest_ns = int(data.stamps_ns[min(end, len(data)) - 1])
-        return data[:end]
-
-
-def _packetize(
-    frames: FrameStream,
-    blocks: Iterator[ImuData],
-    diagnostics: Diagnostics,
-    history_ns: int | None = None,
-    ahead_ns: int = 0,
-) -> Iterator[Packet]:
-    """Join frames with the IMU samples that lead up to them.
-
-    A frame without any IMU sample since the frame before it (or, for the first one, at or before
-    its time) is delivered all the same and counted as `frame_without_imu`.
-
-    Args:
-        frames: with strictly increasing stamps; closed at the end.
-        blocks: of the IMU stream, with strictly increasing stamps.
-        diagnostics: where faults are counted.
-        history_ns: how much of the IMU before the first frame its packet carries; None for all.
-        ahead_ns: how far the clock of the IMU is ahead of that of the frames.
-    """
-    feed = _ImuFeed(blocks)
-    previous_ns: int | None = None
-    with closing(frames):
-        for frame in frames:
-            held_ns, now_ns = feed.latest_ns, frame.stamp_ns + ahead_ns
-            imu = feed.up_to(now_ns)
-            if previous_ns is None and history_ns is not None:
-                imu = imu[int(np.searchsorted(imu.stamps_ns, now_ns - history_ns)) :]
-            held = (
-                held_ns is not None and previous_ns is not None and previous_ns < held_ns <= now_ns
-            )
-            if not held and not (len(imu) and imu.stamps_ns[0] <= now_ns):
-                diagnostics.warn(
-                    "frame_without_imu", f"frame at {frame.stamp_ns} has no IMU samples"
-                )
-            previous_ns = now_ns
-            yield Packet(imu, frame)
-
-
-def _packetize_alone(frames: FrameStream) -> Iterator[Packet]:
-    """Packets of a recording without an IMU; `frames` is closed at the end."""
-    with closing(frames):
-        for frame in frames:
-            yield Packet(ImuData.empty(), frame)
 
 
 @dataclass(frozen=True)
@@ -199,7 +126,7 @@ class ReaderOptions:
         return rig if self.cameras is None else rig.select(self.cameras)
 
 
-class RecordedSequence(ABC):
+class RecordedSequence(Displayed, ABC):
     """Base class of readers: the part of the `Sequence` protocol that is the same in all formats.
 
     A reader is a subclass whose constructor takes a path and `ReaderOptions`.
@@ -249,6 +176,42 @@ class RecordedSequence(ABC):
         if isinstance(source, Path):
             self.groundtruth_path = resolve_groundtruth(source)
             check_groundtruth(self.groundtruth_path)
+
+    def __repr__(self) -> str:
+        info = self.info()
+        return (
+            f"{type(self).__name__}({info.name}: {info.frames} frames of {info.content}, "
+            f"{info.cameras} camera{'' if info.cameras == 1 else 's'}, "
+            f"{(info.end_ns - info.start_ns) * 1e-9:.1f} s)"
+        )
+
+    def _facts(self) -> dict[str, object]:
+        info = self.info()
+        seconds = (info.end_ns - info.start_ns) * 1e-9
+        lenses = ", ".join(
+            f"{c.name or 'camera'} {c.camera.width} x {c.camera.height} {c.camera.distortion}"
+            for c in self.rig.cameras
+        )
+        return {
+            "name": info.name,
+            "format": f"{info.format}, {info.content}",
+            "frames": f"{info.frames} in {seconds:.2f} s"
+            + (f" ({(info.frames - 1) / seconds:.1f} Hz)" if seconds > 0 else ""),
+            "cameras": lenses or None,
+            "IMU": f"{info.imu_samples} samples" if self.has_imu else "none",
+            "ground truth": "yes" if info.has_groundtruth else "none",
+        }
+
+    def plot(self) -> Any:
+        """IMU and true path (if there is one) of the whole recording, as a figure."""
+        imu = self.imu() if self.has_imu else None
+        truth = self.groundtruth() if self.has_groundtruth else None
+        return self._drawn("notebook_figures.recording_figure", self.name, imu, truth)
+
+    def _sketch(self) -> Any:
+        if not self.has_groundtruth:
+            return None
+        return self._drawn("notebook_figures.path_figure", {"ground truth": self.groundtruth()})
 
     @abstractmethod
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
@@ -321,9 +284,9 @@ class RecordedSequence(ABC):
             end_ns: last frame time to deliver.
         """
         if not self.has_imu:
-            return _packetize_alone(self.frames(start_ns, end_ns))
+            return packetize_alone(self.frames(start_ns, end_ns))
         after_ns = None if start_ns is None else start_ns - _HISTORY_NS
-        return _packetize(
+        return packetize(
             self.frames(start_ns, end_ns),
             self.imu_blocks(after_ns),
             self.diagnostics,

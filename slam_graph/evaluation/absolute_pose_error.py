@@ -19,13 +19,14 @@ the numbers are evo's.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.display import Displayed
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
@@ -68,8 +69,8 @@ class Statistics:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorSeries:
+@dataclass(frozen=True, eq=False, repr=False)
+class ErrorSeries(Displayed):
     """Errors over time.
 
     Attributes:
@@ -89,6 +90,33 @@ class ErrorSeries:
     poses: int
     unit: str = ""
     step_unit: str = ""
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __repr__(self) -> str:
+        parts = ", ".join(
+            f"{name} {getattr(self.statistics, name):.4g}" for name in ("rmse", "mean", "max")
+        )
+        return f"ErrorSeries({len(self)} errors{f' [{self.unit}]' * bool(self.unit)}: {parts})"
+
+    def _facts(self) -> dict[str, object]:
+        unit = f" {self.unit}" if self.unit else ""
+        table: dict[str, object] = {"errors": f"{len(self)}, of {self.poses} poses"}
+        for name in ("rmse", "mean", "median", "std", "min", "max"):
+            table[name] = f"{getattr(self.statistics, name):.4g}{unit}"
+        return table
+
+    def plot(self) -> Any:
+        """The errors over time, and the share of them below each value, as a figure."""
+        label = f"error [{self.unit}]" if self.unit else "error"
+        rmse = self.statistics.rmse
+        return self._drawn(
+            "notebook_figures.error_figure", self.stamps_ns, self.values, label, rmse
+        )
+
+    def _sketch(self) -> Any:
+        return self.plot()
 
 
 def ape(

@@ -39,12 +39,16 @@ class Nees:
         orientation: (N,) with 3 degrees of freedom.
         position: (N,) with 3.
         pose: (N,) with 6.
+        covariances: (N, 6, 6) of these poses, rotation before position, body frame.
+        similarity: the map from the world of the estimate to that of the truth that was applied.
     """
 
     stamps_ns: NDArray[np.int64]
     orientation: FloatArray
     position: FloatArray
     pose: FloatArray
+    covariances: FloatArray
+    similarity: Similarity
 
     def series(self) -> dict[str, tuple[FloatArray, int]]:
         """Each series by its name, with its degrees of freedom."""
@@ -74,7 +78,8 @@ def nees(
         truth: interpolated at the times of the estimate; states outside it are left out.
         similarity: rigid map from the estimate's world to that of the truth.
     """
-    estimate = (similarity or Similarity.identity()).apply(estimate)
+    similarity = similarity or Similarity.identity()
+    estimate = similarity.apply(estimate)
     known = np.flatnonzero(np.isfinite(pose_covariances).all(axis=(1, 2)))
     true, rows = paired(truth, estimate.select(known))
     own, P = estimate.select(known[rows]), pose_covariances[known[rows]]
@@ -90,6 +95,8 @@ def nees(
         orientation=_normalized_square(e_rotation, P[:, :3, :3]),
         position=_normalized_square(e_position, P[:, 3:, 3:]),
         pose=_normalized_square(np.reshape(e_pose, (-1, 6)), P),
+        covariances=P,
+        similarity=similarity,
     )
 
 

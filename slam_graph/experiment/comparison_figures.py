@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a comparison: errors, NEES and work of all algorithms, over time and distance."""
+"""The figures of a comparison: paths, errors and times at a glance, and over time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,22 +15,26 @@ from slam_graph.arrays import FloatArray
 from slam_graph.evaluation import mean_bounds
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
-    ALIGNMENTS,
+    SHOWN_ALIGNMENT,
     STAGE,
     Series,
+    Table,
+    numbers,
     read_result,
     read_series,
 )
 from slam_graph.experiment.tasks import RunTask
 from slam_graph.results import ResultFolder
-from slam_graph.visualization import Panel, plot_panels
+from slam_graph.visualization import Panel, panel_figure
 
 _BINS = 200
-"""Number of equal bins of time or distance in which series are averaged, also over the seeds."""
+"""Number of equal bins of time in which series are averaged, also over the seeds."""
 
-_TIME = ("time_s", "time [s]")
-_DISTANCE = ("distance_m", "distance [m]")
-PARTS = (("translation_m", "translation error [m]"), ("rotation_deg", "rotation error [deg]"))
+_TIME = "time [s]"
+
+_ERRORS = (("translation_m", "position error [m]"), ("rotation_deg", "orientation error [deg]"))
+
+_NEES_LABEL = "NEES of the pose"
 
 NEES_DOF = {"orientation": 3, "position": 3, "pose": 6}
 
@@ -53,42 +58,85 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     runs = {task.algorithm: _series(tasks, task.algorithm) for task in tasks}
     seeds = max((len(series) for series in runs.values()), default=0)
     mean = f", mean over {seeds} seeds" if seeds > 1 else ""
+    over = f", {seeds} seeds" if seeds > 1 else ""
     folder = ResultFolder(comparison.folder / "figures")
-    for mode in ALIGNMENTS:
-        panels = [
-            Panel(xlabel, ylabel, _curves(runs, x, f"{part}_{mode}"))
-            for part, ylabel in PARTS
-            for x, xlabel in (_TIME, _DISTANCE)
-        ]
-        title = f"{data}: errors, alignment {mode}{mean}"
-        yield from _draw_panels(folder, f"{data}_errors_{mode}.png", title, panels)
+    yield from _draw_panels(folder, f"{data}_paths.png", f"{data}: causal paths", _paths(runs))
+    title = f"{data}: errors (root mean square of a run) and cost{over}"
+    yield from _draw_panels(folder, f"{data}_summary.png", title, _summary_panels(tasks))
+    panels = [
+        Panel(_TIME, label, _curves(runs, "time_s", f"{part}_{SHOWN_ALIGNMENT}"))
+        for part, label in _ERRORS
+    ]
+    title = f"{data}: errors over time, aligned in yaw and position{mean}"
+    yield from _draw_panels(folder, f"{data}_errors.png", title, panels)
     panels = _consistency_panels(runs, max(seeds, 1))
     yield from _draw_panels(folder, f"{data}_nees.png", f"{data}: consistency{mean}", panels)
     panels = [
-        Panel(_TIME[1], "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
-        Panel(_TIME[1], "columns of the state", _curves(runs, "step_time_s", "columns")),
-        Panel(_TIME[1], "steps per frame", _curves(runs, "step_time_s", "steps")),
-        Panel(_TIME[1], "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
-        Panel(_TIME[1], "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
+        Panel(_TIME, "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
+        Panel(_TIME, "columns of the state", _curves(runs, "step_time_s", "columns")),
+        Panel(_TIME, "steps per frame", _curves(runs, "step_time_s", "steps")),
+        Panel(_TIME, "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
+        Panel(_TIME, "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
     ]
     title = f"{data}: work of the back end{mean}"
     yield from _draw_panels(folder, f"{data}_steps.png", title, panels)
+
+
+def _paths(runs: dict[str, list[Series]]) -> list[Panel]:
+    """The paths of the first seed over one another, from above and from the side."""
+    first = {name: series[0] for name, series in runs.items() if series and "path" in series[0]}
+    paths = {name: series["path"] for name, series in first.items()}
+    truths = [series["true_path"] for series in first.values() if "true_path" in series]
+    if truths:
+        paths = {"ground truth": max(truths, key=len)} | paths
+    return [
+        Panel(
+            "x [m]",
+            f"{'xyz'[axis]} [m]",
+            {name: (path[:, 0], path[:, axis]) for name, path in paths.items() if len(path)},
+            "path",
+            title=title,
+        )
+        for axis, title in ((1, "from above"), (2, "from the side"))
+    ]
+
+
+def _summary_panels(tasks: list[RunTask]) -> list[Panel]:
+    """Errors, consistency and cost of each run that ended well, by algorithm."""
+    runs: dict[str, list[Table]] = {task.algorithm: [] for task in tasks}
+    for task in tasks:
+        result = read_result(task.result)
+        if result is not None and result["metrics"]["status"] == "ok":
+            runs[task.algorithm].append(result["metrics"])
+    quantities: dict[str, Callable[[Table], Any]] = {
+        label: lambda m, part=part: m["accuracy"][SHOWN_ALIGNMENT]["ate"][part]["rmse"]  # type: ignore[misc]
+        for part, label in _ERRORS
+    }
+    quantities[_NEES_LABEL] = lambda m: m["nees"]["pose"]["mean"]
+    quantities["back end, ms per frame"] = lambda m: m["timing"]["stages"][STAGE]["mean_ms"]
+    panels = []
+    for label, get in quantities.items():
+        samples = {name: np.array(list(numbers(metrics, get))) for name, metrics in runs.items()}
+        if any(len(values) for values in samples.values()):
+            ideal = float(NEES_DOF["pose"]) if label == _NEES_LABEL else None
+            panels.append(Panel(label, "", samples=samples, ideal=ideal))
+    return panels
 
 
 def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel]:
     """NEES with the χ² bounds of a mean over the seeds, and NIS."""
     panels = [
         Panel(
-            _TIME[1],
+            _TIME,
             f"NEES of the {part}",
             _curves(runs, "nees_time_s", f"nees_{part}"),
-            mean_bounds(dof, seeds),
-            "95 % of χ²",
+            band=mean_bounds(dof, seeds),
+            band_label="95 % of χ²",
         )
         for part, dof in NEES_DOF.items()
     ]
     label = "NIS / expected"
-    return [*panels, Panel(_TIME[1], label, _curves(runs, "nis_time_s", "nis_ratio"))]
+    return [*panels, Panel(_TIME, label, _curves(runs, "nis_time_s", "nis_ratio"))]
 
 
 def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:
@@ -148,9 +196,9 @@ def _curves(
 def _draw_panels(
     folder: ResultFolder, name: str, title: str, panels: Iterable[Panel]
 ) -> Iterator[Figure]:
-    """Draw the panels that have curves, if any."""
-    shown = [panel for panel in panels if panel.curves]
+    """Draw the panels that have something to show, if any."""
+    shown = [panel for panel in panels if panel.curves or panel.samples]
     if shown:
         with folder.appearing(name) as partial:
-            plot_panels(partial, title, shown)
+            panel_figure(title, shown).write(partial)
         yield Figure(folder.files[-1], title)

@@ -12,6 +12,7 @@ from typing import Any
 
 from slam_graph.backend import FinalBaConfig
 from slam_graph.config import RunConfig
+from slam_graph.display import Displayed
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.tasks import RecordTask, RunTask, Source, Task
@@ -23,8 +24,8 @@ Progress = Callable[[str, str | None, int, int], None]
 """Called after each task: its name, why it failed or None, tasks done, tasks to do."""
 
 
-@dataclass
-class Comparison:
+@dataclass(repr=False)
+class Comparison(Displayed):
     """The tasks of a comparison and their outcome.
 
     Attributes:
@@ -44,6 +45,27 @@ class Comparison:
     rows: list[dict[str, Any]] = field(default_factory=list)
     table: list[tuple[str, ...]] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        names = dict.fromkeys(task.algorithm for task in self.runs)
+        data = dict.fromkeys(task.data for task in self.runs)
+        failed = f", {len(self.failures)} tasks failed" if self.failures else ""
+        return f"Comparison({', '.join(names)} on {', '.join(data)}{failed}: {self.folder})"
+
+    def _facts(self) -> dict[str, object]:
+        errors = {f"{row['algorithm']} on {row['data']}": _short(row) for row in self.rows}
+        return {**errors, "failed": len(self.failures) or None, "report": self.folder}
+
+
+def _short(row: dict[str, Any]) -> str:
+    """Errors, consistency and cost of one algorithm, as far as they are known."""
+    values = (
+        ("ATE {:.4f} m", row["ate_m"]["yaw"]),
+        ("{:.3f}°", row["orientation_deg"]["yaw"]),
+        ("NEES {:.2f}", row["nees"]["pose"]),
+        ("{:.1f} ms a frame", row["ms_per_frame"]),
+    )
+    return ", ".join(text.format(value) for text, value in values if value is not None)
 
 
 def load_configs(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from html import escape
 from typing import Any
 
@@ -21,6 +21,7 @@ from slam_graph.experiment.comparison_results import (
     ALIGNMENTS,
     STAGE,
     Table,
+    numbers,
     read_result,
     read_series,
 )
@@ -167,17 +168,7 @@ def _ate(mode: str, part: str) -> Callable[[Table], Any]:
 
 def _mean(metrics: list[Table], get: Callable[[Table], Any]) -> float | None:
     """Mean over the runs that have the number."""
-    return _average(_numbers(metrics, get))
-
-
-def _numbers(metrics: list[Table], get: Callable[[Table], Any]) -> Iterator[float]:
-    for table in metrics:
-        try:
-            value = get(table)
-        except (KeyError, TypeError):
-            continue  # no ground truth, no covariance, or nothing to align
-        if value is not None:
-            yield value
+    return _average(numbers(metrics, get))
 
 
 def _average(values: Iterable[float]) -> float | None:

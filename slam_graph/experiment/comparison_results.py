@@ -5,10 +5,12 @@
 Series of the NPZ file, over the N frames that have a true pose, the K of them that also have a
 covariance, or all F frames:
 
+- `path`, `true_path` (N, 3): positions, aligned with the truth in yaw and position, and the true
+  ones; without a truth only `path` (S, 3) of all states, in the world of the run;
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
 - `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
 - `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
-- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (S,): for the S frames with
+- `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (G,): for the G frames with
   Gauss-Newton steps, their number, the dimension of the state and the cost;
 - `nis_time_s`, `nis_ratio`, and `nis_COLUMN` (I,): for the I frames with innovations, these
   (`slam_graph.backend.cost.gating.Innovations`), and NIS over its expected value;
@@ -18,6 +20,7 @@ covariance, or all F frames:
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,9 @@ from slam_graph.results import ResultFolder, RunResult
 SCHEMA_VERSION = 2
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3")
+
+SHOWN_ALIGNMENT: AlignmentMode = "yaw"
+"""The alignment of the figures: what nothing tells a visual-inertial estimate is taken away."""
 
 STAGE = "backend"
 """The stage of the pipeline in which algorithms differ."""
@@ -96,6 +102,8 @@ def _series_of(result: RunResult) -> Series:
     if truth is not None and len(result.history) > 0:
         series |= _error_series(truth, result)
         series |= _nees_series(truth, result)
+    else:
+        series["path"] = result.trajectory.positions
     return series
 
 
@@ -108,6 +116,7 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
     series: Series = {
         "time_s": (estimate.stamps_ns - result.input.start_ns) * 1e-9,
         "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
+        "true_path": true.positions,
     }
     for mode in ALIGNMENTS:
         try:
@@ -116,6 +125,8 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
             continue  # without motion the alignment is undetermined
         series[f"translation_m_{mode}"] = translation.values
         series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
+        if mode == SHOWN_ALIGNMENT:
+            series["path"] = translation.similarity.apply(estimate).positions
     return series
 
 
@@ -142,3 +153,14 @@ def _innovation_series(result: RunResult) -> Series:
         "nis_ratio": ratio,
         **{f"nis_{name}": values for name, values in columns.items()},
     }
+
+
+def numbers(metrics: list[Table], get: Callable[[Table], Any]) -> Iterator[float]:
+    """A number of each run that has it."""
+    for table in metrics:
+        try:
+            value = get(table)
+        except (KeyError, TypeError):
+            continue  # no ground truth, no covariance, or nothing to align
+        if value is not None:
+            yield value

@@ -32,6 +32,9 @@ class CameraTracker:
         config: settings.
         stats: receives counts and times.
         rng: draws the samples of RANSAC.
+
+    Attributes:
+        outliers: the features that RANSAC, or the map of the back end, rejected in the last image.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class CameraTracker:
         self._stats = stats
         self._epipolar = EpipolarTest(mounted.camera, config, rng)
         self._motion_ids: list[IntArray] = []  # of the features of each rigid motion
+        self.outliers = Tracks.empty()
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
         """The features of the image before in the next one.
@@ -80,6 +84,7 @@ class CameraTracker:
             in_map = np.ones(len(after), np.bool_)
             in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
             self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
+            self.outliers = after.select(~(inlier & in_map))
             after = after.select(inlier & in_map)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)

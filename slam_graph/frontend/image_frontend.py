@@ -130,6 +130,8 @@ class ImageFrontend:
         with self._stats.timed("prepare_ms"):
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id
+        for tracker in self._trackers:
+            tracker.outliers = Tracks.empty()
         for i, image in enumerate(images):
             if image is not None and (
                 self._references[i] == i or images[self._references[i]] is None
@@ -146,6 +148,7 @@ class ImageFrontend:
                 FeatureObservations.empty() if image is None else tracks.observations()
                 for image, tracks in zip(images, self._tracks, strict=True)
             ),
+            tuple(tracker.outliers.observations() for tracker in self._trackers),
         )
 
     def drop(self, ids: IntArray) -> None:

@@ -10,16 +10,21 @@ Interpolation of trajectories: positions linearly, orientations by slerp.
 
 from __future__ import annotations
 
-from array import array
+import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Literal, overload
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.display import Displayed
+from slam_graph.errors import ConfigError, DataError, closest
+
+TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +83,11 @@ class NavState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
+class Trajectory(Displayed):
     """Poses over time, as arrays.
+
+    `trajectory[5]` is a pose, `trajectory[100:200]` (or rows, or a mask) a part of it, and a loop
+    goes over the poses; `trajectory.stamps_ns` has their times.
 
     Attributes:
         MAX_GAP_S: inside a longer gap between poses `interpolate` gives nothing by default: four
@@ -104,12 +112,44 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def __iter__(self) -> Iterator[gtsam.Pose3]:
+        return (self.pose(row) for row in range(len(self)))
+
+    @overload
+    def __getitem__(self, rows: int) -> gtsam.Pose3: ...
+    @overload
+    def __getitem__(self, rows: slice | IntArray | BoolArray) -> Trajectory: ...
+    def __getitem__(self, rows: int | slice | IntArray | BoolArray) -> gtsam.Pose3 | Trajectory:
+        if isinstance(rows, int | np.integer):
+            return self.pose(int(rows))
+        return self.select(rows)
+
     def pose(self, index: int) -> gtsam.Pose3:
         """`world_T_body` of one row."""
         x, y, z, w = self.quaternions[index]
         return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), self.positions[index])
 
-    def select(self, rows: IntArray | BoolArray) -> Trajectory:
+    def at(self, stamp_ns: int, max_gap_s: float = MAX_GAP_S) -> gtsam.Pose3:
+        """`world_T_body` at any time: positions are interpolated linearly, orientations by slerp.
+
+        Args:
+            stamp_ns: time.
+            max_gap_s: inside a longer gap between poses nothing is interpolated.
+
+        Raises:
+            DataError: if there is no pose before and after, near enough.
+        """
+        if len(self):
+            found, _ = interpolate(self, np.array([stamp_ns], np.int64), max_gap_s)
+            if len(found):
+                return found.pose(0)
+        span = f"from {_time_text(self, 0)} to {_time_text(self, -1)} s" if len(self) else "empty"
+        raise DataError(
+            f"no pose at {seconds_text(stamp_ns)} s: the trajectory is {span}, and gaps of more "
+            f"than {max_gap_s:g} s are not bridged"
+        )
+
+    def select(self, rows: slice | IntArray | BoolArray) -> Trajectory:
         """Some of the poses, with all that belongs to them."""
         optional = {
             name: None if values is None else values[rows]
@@ -124,6 +164,57 @@ class Trajectory:
         rows = np.hstack([self.positions, self.quaternions])
         for stamp, row in zip(self.stamps_ns, rows, strict=True):
             yield f"{seconds_text(int(stamp))} {' '.join(f'{v:.9f}' for v in row.tolist())}\n"
+
+    def kitti_lines(self) -> Iterator[str]:
+        """The lines of a KITTI odometry file: the rows of world_T_body (3 x 4); it has no times."""
+        for quaternion, t in zip(self.quaternions, self.positions, strict=True):
+            R = Rotation.from_quat(quaternion).as_matrix()
+            yield " ".join(f"{v:.9e}" for v in np.column_stack([R, t]).ravel().tolist()) + "\n"
+
+    def euroc_lines(self) -> Iterator[str]:
+        """The lines of EuRoC's ground truth: t[ns] p q(w x y z), and velocity and biases if known.
+
+        Velocity, gyroscope bias and accelerometer bias come together; where one is not known none
+        is written but a velocity alone.
+        """
+        columns = [self.positions, self.quaternions[:, [3, 0, 1, 2]]]
+        names = [*(f"p_{axis} [m]" for axis in "xyz"), *(f"q_{axis} []" for axis in "wxyz")]
+        extra = (
+            (self.velocities, "v_{} [m s^-1]"),
+            (self.gyro_biases, "b_w_{} [rad s^-1]"),
+            (self.accel_biases, "b_a_{} [m s^-2]"),
+        )
+        whole = all(values is not None for values, _ in extra)
+        for values, name in extra if whole else extra[:1]:
+            if values is not None:
+                columns.append(values)
+                names += [name.format(axis) for axis in "xyz"]
+        yield ",".join(["#timestamp [ns]", *names]) + "\n"
+        for stamp, row in zip(self.stamps_ns.tolist(), np.hstack(columns), strict=True):
+            yield f"{stamp},{','.join(f'{v:.9f}' for v in row.tolist())}\n"
+
+    def save(self, path: Path | str, format: TrajectoryFormat | None = None) -> Path:
+        """Write the trajectory as a file.
+
+        Args:
+            path: of the file, which is replaced.
+            format: `tum`, `kitti` (without times) or `euroc` (CSV); by default `euroc` for a name
+                that ends with `.csv`, else `tum`.
+
+        Raises:
+            DataError: if the format is unknown, or the file cannot be written.
+        """
+        path = Path(path)
+        writers = {"tum": self.tum_lines, "kitti": self.kitti_lines, "euroc": self.euroc_lines}
+        format = format or ("euroc" if path.suffix == ".csv" else "tum")
+        if format not in writers:
+            raise DataError(f"no trajectory format '{format}'; {closest(format, writers)}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("".join(writers[format]()), encoding="utf-8")
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        return path
 
     def as_dict(self) -> dict[str, FloatArray | IntArray]:
         """All columns (N,) by name with unit, as for `pandas.DataFrame(trajectory.as_dict())`."""
@@ -142,85 +233,64 @@ class Trajectory:
                 }
         return columns
 
+    def to_dataframe(self) -> Any:
+        """All columns as a pandas table, by the time since the first pose in seconds.
+
+        Raises:
+            ConfigError: if pandas is not installed.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigError("to_dataframe needs pandas: pip install pandas") from error
+        first = self.stamps_ns[0] if len(self) else 0
+        seconds = (self.stamps_ns - first) * 1e-9
+        return pandas.DataFrame(self.as_dict(), index=pandas.Index(seconds, name="time_s"))
+
+    def plot(self, **others: Trajectory) -> Any:
+        """The path from above and from the side, and x, y, z and yaw over time, as a figure.
+
+        Args:
+            others: further trajectories in the same world, by their names, such as `smoothed` or
+                `ground_truth`.
+        """
+        return self._drawn("notebook_figures.trajectory_figure", self, others)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last pose, s."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) else 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path, m."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
     def __repr__(self) -> str:
         if len(self) == 0:
             return "Trajectory(0 poses)"
-        length_s = (self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9
-        path_m = np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()
-        return f"Trajectory({len(self)} poses, {length_s:.2f} s, {path_m:.2f} m)"
+        return f"Trajectory({len(self)} poses, {self.duration_s:.2f} s, {self.length_m:.2f} m)"
+
+    def _facts(self) -> dict[str, object]:
+        columns = {"velocities": self.velocities, "gyro_biases": self.gyro_biases}
+        known = [name for name, values in columns.items() if values is not None]
+        if not len(self):
+            return {"poses": 0}
+        extent = " x ".join(f"{length:.2f}" for length in np.ptp(self.positions, axis=0))
+        return {
+            "poses": len(self),
+            "time": f"{_time_text(self, 0)} to {_time_text(self, -1)} s ({self.duration_s:.2f} s)",
+            "path": f"{self.length_m:.2f} m, within {extent} m",
+            "also has": ", ".join(known) or None,
+        }
+
+    def _sketch(self) -> Any:
+        return self._drawn("notebook_figures.path_figure", {"path": self}) if len(self) else None
 
 
-_STATE_WIDTH = 16
-"""Position, quaternion (x y z w), velocity, accelerometer bias, gyroscope bias."""
-
-_ERROR_WIDTH = len(NavState.COMPONENTS)
-_POSE_WIDTH = 6
-
-
-class StateHistory:
-    """All states of a run, as compact rows: about 0.6 kB a state.
-
-    It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
-    NaN.
-    """
-
-    def __init__(self) -> None:
-        self._stamps_ns = array("q")
-        self._states = array("d")
-        self._sigmas = array("d")
-        self._pose_covariances = array("d")
-
-    def __len__(self) -> int:
-        return len(self._stamps_ns)
-
-    def append(self, state: NavState) -> None:
-        """Add the state of the next frame."""
-        pose = state.world_T_body
-        quaternion: Any = pose.rotation().toQuaternion()  # an Eigen type that the stubs do not know
-        row = np.concatenate(
-            [
-                pose.translation(),
-                quaternion.coeffs(),
-                state.velocity,
-                state.accel_bias,
-                state.gyro_bias,
-            ]
-        )
-        covariance = state.covariance
-        if covariance is None:
-            covariance = np.full((_ERROR_WIDTH, _ERROR_WIDTH), np.nan)
-        variances = np.maximum(np.diag(covariance), 0.0)
-        self._stamps_ns.append(state.stamp_ns)
-        self._states.extend(row.tolist())
-        self._sigmas.extend(np.sqrt(variances).tolist())
-        self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
-
-    def trajectory(self) -> Trajectory:
-        """The states as a trajectory with velocities and biases."""
-        rows = _table(self._states, _STATE_WIDTH)
-        return Trajectory(
-            np.array(self._stamps_ns, dtype=np.int64),
-            rows[:, 0:3],
-            rows[:, 3:7],
-            velocities=rows[:, 7:10],
-            accel_biases=rows[:, 10:13],
-            gyro_biases=rows[:, 13:16],
-        )
-
-    def sigmas(self) -> FloatArray:
-        """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
-        return _table(self._sigmas, _ERROR_WIDTH)
-
-    def pose_covariances(self) -> FloatArray:
-        """(N, 6, 6) covariances of rotation and position, in the body frame."""
-        return _table(self._pose_covariances, _POSE_WIDTH * _POSE_WIDTH).reshape(
-            -1, _POSE_WIDTH, _POSE_WIDTH
-        )
-
-
-def _table(values: array[float], width: int) -> FloatArray:
-    """A copy of flat values as rows of `width`."""
-    return np.array(values, dtype=np.float64).reshape(-1, width)
+def _time_text(trajectory: Trajectory, row: int) -> str:
+    """The time of a pose in seconds, with milliseconds."""
+    return f"{trajectory.stamps_ns[row] * 1e-9:.3f}"
 
 
 def seconds_text(stamp_ns: int) -> str:

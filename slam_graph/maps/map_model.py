@@ -20,6 +20,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.display import Displayed
 from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure import Keyframe, Vocabulary
 from slam_graph.pose_graph import Poses
@@ -118,8 +119,8 @@ class Links:
         return Links(np.zeros((0, 2), np.int64), Poses.identity(0, 3), np.zeros((0, 6, 6)))
 
 
-@dataclass(frozen=True, eq=False)
-class SlamMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class SlamMap(Displayed):
     """K keyframes with N observations of P features.
 
     Attributes:
@@ -158,6 +159,35 @@ class SlamMap:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __repr__(self) -> str:
+        names = ", ".join(recording.name for recording in self.recordings)
+        return f"SlamMap({names}: {len(self)} keyframes, {len(self.points)} features)"
+
+    def _facts(self) -> dict[str, object]:
+        table = self.summary()
+        return {
+            "recordings": ", ".join(f"{r.name} ({r.poses})" for r in self.recordings),
+            "keyframes": table["keyframes"],
+            "features": f"{table['features']}, {table['observations']} observations",
+            "links": table["links"] or None,
+            "path": f"{table['path_m']:.1f} m",
+            "extent": " x ".join(f"{length:.1f}" for length in table["extent_m"]) + " m",
+            "created": table["created"],
+        }
+
+    def plot(self) -> Any:
+        """Features, and the keyframes of each recording, from above and from the side."""
+        names = [recording.name for recording in self.recordings]
+        alike = len(set(names)) < len(names)
+        paths = {
+            f"{name} ({k})" if alike else name: trajectory
+            for k, (name, trajectory) in enumerate(zip(names, self.trajectories(), strict=True))
+        }
+        return self._drawn("notebook_figures.map_figure", self.points, paths)
+
+    def _sketch(self) -> Any:
+        return self.plot() if len(self) else None
 
     @cached_property
     def seen_by(self) -> csr_matrix:

@@ -158,6 +158,8 @@ class Estimation:
             estimator.corrected_rig,
             estimator.replayed is not None,
             estimator.solved_ns != features.stamp_ns,
+            tracked.clock.milliseconds,
+            tracked.frame_stats,
         )
         self._note(frame, tracked)
         return frame

@@ -120,15 +120,20 @@ class MapBuilding(Stage):
         self._result, self._keyframes, self._diagnostics = result, keyframes, diagnostics
 
     def finish(self) -> None:
-        """Build the map, unless there is nothing to recognise places by."""
+        """Build the map. A run that was to leave one and could not has failed, and says why."""
         if self._result.status not in COMPLETED:
             return
+        reason = "what went wrong is counted as `map_failed`"
         if not self._keyframes.found:
             self._diagnostics.warn("map_impossible", NOT_RECOGNISABLE)
-            return
-        with warn_on_failure(self._diagnostics, "map_failed", "no map is built"):
-            self._result.slam_map = made = _build(self._result, self._keyframes)
-            logger.info("map: %d keyframes, %d features", len(made), len(made.points))
+            reason = NOT_RECOGNISABLE
+        else:
+            with warn_on_failure(self._diagnostics, "map_failed", "no map is built"):
+                self._result.slam_map = made = _build(self._result, self._keyframes)
+                logger.info("map: %d keyframes, %d features", len(made), len(made.points))
+        ending = self._result.ending
+        if self._result.slam_map is None and ending.status == "ok":
+            ending.status, ending.message = "no_map", f"no map was made: {reason}"
 
 
 def _build(result: RunResult, keyframes: Keyframes) -> SlamMap:

@@ -7,17 +7,16 @@ Factor graphs of single frames: a stage that keeps those that are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from typing import Protocol, TypeGuard
 
-from slam_graph.arrays import FloatArray
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.geometry import NavState, Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
 _FIRST_STAMP = 1_000_000_000
 """Whole numbers from here on are stamps in nanoseconds."""
@@ -73,25 +72,21 @@ class Viewer(Protocol):
         """Called once, before the first frame."""
         ...
 
-    def show(
-        self,
-        frame: CameraFrame | FeatureFrame,
-        features: FeatureFrame,
-        state: NavState | None,
-        points: FloatArray,
-    ) -> None:
+    def show(self, frame: EstimatedFrame, estimator: Estimator) -> None:
         """Called after each frame.
 
         Args:
-            frame: images, or recorded features.
-            features: what the front end found in the frame.
-            state: the causal estimate, or None before initialisation.
-            points: (N, 3) positions of the features that are estimated now, in the world, m.
+            frame: with what the front end and the estimator made of it.
+            estimator: after this frame.
         """
         ...
 
+    def finish(self, result: RunResult) -> None:
+        """Called once, when all stages are done, if there is an estimate."""
+        ...
+
     def close(self) -> None:
-        """Called once, after the last frame, however the run ended."""
+        """Called once, at the end, however the run ended."""
         ...
 
 
@@ -132,13 +127,10 @@ class NullViewer:
     def open(self, rig: Rig, truth: Trajectory | None) -> None:
         """Show nothing."""
 
-    def show(
-        self,
-        frame: CameraFrame | FeatureFrame,
-        features: FeatureFrame,
-        state: NavState | None,
-        points: FloatArray,
-    ) -> None:
+    def show(self, frame: EstimatedFrame, estimator: Estimator) -> None:
+        """Show nothing."""
+
+    def finish(self, result: RunResult) -> None:
         """Show nothing."""
 
     def close(self) -> None:
@@ -163,40 +155,66 @@ class NullRecorder:
 
 
 class Observers(Stage):
-    """Hands each frame to recorder, progress report and viewer.
+    """Hands each frame to the recorder and the progress report.
+
+    Args:
+        progress, recorder: null objects where there is none.
+    """
+
+    def __init__(self, progress: Progress, recorder: Recorder) -> None:
+        self._progress, self._recorder = progress, recorder
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Record and report a frame."""
+        self._recorder.write(frame.packet.imu, frame.features)
+        self._progress.advance(frame.features.stamp_ns, frame.initialized)
+
+
+class Viewing(Stage):
+    """Hands each frame, and at last what came of the run, to the viewer.
+
+    A viewer that fails is left alone from then on: the run goes on without it.
 
     Args:
         result: of the run.
-        viewer, progress, recorder: null objects where there is none.
+        estimator: the back end.
+        viewer: a null object where there is none.
         diagnostics: counts what goes wrong.
     """
 
     def __init__(
-        self,
-        result: RunResult,
-        viewer: Viewer,
-        progress: Progress,
-        recorder: Recorder,
-        diagnostics: Diagnostics,
+        self, result: RunResult, estimator: Estimator, viewer: Viewer, diagnostics: Diagnostics
     ) -> None:
-        self._result, self._diagnostics = result, diagnostics
-        self._viewer, self._progress, self._recorder = viewer, progress, recorder
+        self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
+        self._viewer = viewer
         self._closing = ExitStack()
 
     def begin(self, resources: ExitStack) -> None:
         """Open the viewer; it is closed however the run ends."""
         resources.enter_context(self._closing)
         self._closing.callback(self._viewer.close)
-        self._viewer.open(self._result.input.rig, self._result.groundtruth)
+        self._try(lambda: self._viewer.open(self._result.input.rig, self._result.groundtruth))
 
     def frame(self, frame: EstimatedFrame) -> None:
-        """Record, report and show a frame."""
-        stamp_ns = frame.features.stamp_ns
-        self._recorder.write(frame.packet.imu, frame.features)
-        self._progress.advance(stamp_ns, frame.initialized)
-        self._viewer.show(frame.packet.frame, frame.features, frame.state, frame.landmarks)
+        """Show a frame."""
+        self._try(lambda: self._viewer.show(frame, self._estimator))
+
+    def _try(self, show: Callable[[], None]) -> None:
+        """Show something; a viewer that cannot is not asked again."""
+        failed = True
+        with self._warning("not all of the run is shown"):
+            show()
+            failed = False
+        if failed:
+            self._viewer = NullViewer()
 
     def finish(self) -> None:
-        """Close the viewer, which completes a recording for it."""
-        with warn_on_failure(self._diagnostics, "viewer_failed", "viewer not closed properly"):
+        """Show what came of the run, and close the viewer, which completes a recording for it."""
+        if len(self._result.history):
+            with self._warning("the end of the run is not shown"):
+                self._viewer.finish(self._result)
+        with self._warning("viewer not closed properly"):
             self._closing.close()
+
+    def _warning(self, consequence: str) -> AbstractContextManager[None]:
+        return warn_on_failure(self._diagnostics, "viewer_failed", consequence)

@@ -26,6 +26,7 @@ from slam_graph.pipeline.observers import (
     Progress,
     Recorder,
     Viewer,
+    Viewing,
 )
 from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
@@ -75,13 +76,17 @@ def run(
     result = RunResult(_part_of(sequence, settings))
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
-    watchers = (viewer or NullViewer(), progress or NullProgress(), recorder or NullRecorder())
+    watchers = (progress or NullProgress(), recorder or NullRecorder())
     stages = _stages(sequence, result, watchers, known_map)
-    stages += [GraphKeeping(result, estimation.estimator, graph_times, sequence.diagnostics)]
+    estimator, diagnostics = estimation.estimator, sequence.diagnostics
+    stages += [
+        GraphKeeping(result, estimator, graph_times, diagnostics),
+        Viewing(result, estimator, viewer or NullViewer(), diagnostics),
+    ]
 
     with ExitStack() as resources:
         with (
-            outcome(result, estimation.estimator),
+            outcome(result, estimator),
             interrupts_between_frames() as frame_done,
             closing(tracking.run()) as packets,
         ):
@@ -103,7 +108,7 @@ def run(
 def _stages(
     sequence: Sequence,
     result: RunResult,
-    watchers: tuple[Viewer, Progress, Recorder],
+    watchers: tuple[Progress, Recorder],
     known_map: SlamMap | None,
 ) -> list[Stage]:
     """The stages after estimation, in the order in which they finish; `off` does nothing."""
@@ -111,8 +116,8 @@ def _stages(
     keyframes = Keyframes(result)
     loops, mapping = config.loop_closure.enabled, config.map.enabled
     return [
-        Observers(result, *watchers, diagnostics),
-        Smoothing(result, watchers[1], diagnostics) if config.final_ba.enabled else off,
+        Observers(*watchers),
+        Smoothing(result, watchers[0], diagnostics) if config.final_ba.enabled else off,
         off if known_map is None else Localization(result, known_map, diagnostics),
         keyframes if loops or mapping else off,
         LoopClosing(result, keyframes, diagnostics) if loops else off,

@@ -10,9 +10,9 @@ results of the earlier ones in the `RunResult`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -49,6 +49,8 @@ class EstimatedFrame:
         corrected_rig: the calibration, where the estimator has corrected it; None otherwise.
         restarted: whether the estimator began anew at this frame, in another world.
         waits: whether this frame waits for IMU samples, and the state is that of an earlier one.
+        milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
+        counts: what the front end counts, by name.
     """
 
     packet: Packet
@@ -62,6 +64,8 @@ class EstimatedFrame:
     corrected_rig: Rig | None = None
     restarted: bool = False
     waits: bool = False
+    milliseconds: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def image(self) -> np.ndarray | None:

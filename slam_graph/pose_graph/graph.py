@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -22,6 +22,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.display import Displayed
+from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 
 RotationInformation = Literal["angle", "quaternion"]
@@ -102,8 +104,8 @@ class Poses:
         return Poses(rotations, np.pad(self.translations, ((0, 0), (0, 1))))
 
 
-@dataclass(frozen=True, eq=False)
-class PoseGraph:
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseGraph(Displayed):
     """A pose graph of N poses and M edges.
 
     Attributes:
@@ -124,6 +126,42 @@ class PoseGraph:
     information: FloatArray
     rotation_information: RotationInformation = "angle"
     name: str = "pose graph"
+
+    def __repr__(self) -> str:
+        loops = int(np.count_nonzero(~self.is_odometry))
+        return (
+            f"PoseGraph({self.name}: {len(self.keys)} poses in {self.dimension}D, "
+            f"{len(self.edges)} edges, {loops} loop closures)"
+        )
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "name": self.name,
+            "poses": f"{len(self.keys)}, in {self.dimension}D",
+            "edges": len(self.edges),
+            "loop closures": int(np.count_nonzero(~self.is_odometry)),
+            "connected parts": len(self.anchors),
+            "initial estimates": "none" if self.estimates is None else "of the file",
+        }
+
+    def plot(self) -> Any:
+        """The initial estimates, joined by the edges, as a figure.
+
+        Raises:
+            DataError: if the graph has none; `optimize_pose_graph` finds some.
+        """
+        if self.estimates is None:
+            raise DataError(f"{self.name}: no initial estimates to draw; optimise it first")
+        return self._drawn(
+            "pose_graph_picture.pose_graph_figure",
+            f"{self.name}  ·  {len(self.keys)} poses, {len(self.edges)} edges",
+            {"": self.estimates.translations},
+            self.edges,
+            self.is_odometry,
+        )
+
+    def _sketch(self) -> Any:
+        return None if self.estimates is None else self.plot()
 
     @property
     def dimension(self) -> int:

@@ -7,11 +7,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.display import Displayed
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_cost import chi2_of_edges, chi2_table
@@ -43,8 +45,8 @@ class Minimum:
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class PoseGraphSolution:
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseGraphSolution(Displayed):
     """The result of an optimisation.
 
     Attributes:
@@ -58,6 +60,51 @@ class PoseGraphSolution:
     start: Poses
     minimum: Minimum
     weights: FloatArray
+
+    @staticmethod
+    def of(graph: PoseGraph, poses: Poses, weights: FloatArray | None = None) -> PoseGraphSolution:
+        """Poses that come from elsewhere, e.g. from a file, as a solution.
+
+        Args:
+            graph: the problem.
+            poses: of all its keys.
+            weights: (M,) of the edges; 1 if not given.
+        """
+        if weights is None:
+            weights = np.ones(len(graph.edges))
+        return PoseGraphSolution(graph, poses, Minimum(poses, np.nan, 0, True), weights)
+
+    def __repr__(self) -> str:
+        minimum = self.minimum
+        return (
+            f"PoseGraphSolution({self.graph.name}: {len(self.graph.keys)} poses, "
+            f"cost {minimum.cost:.6g}, {'' if minimum.converged else 'not '}converged)"
+        )
+
+    def _facts(self) -> dict[str, object]:
+        minimum, rejected = self.minimum, int(np.count_nonzero(self.weights < 0.5))
+        return {
+            "graph": self.graph,
+            "cost": f"{minimum.cost:.6g}",
+            "steps": f"{minimum.steps}, {'' if minimum.converged else 'not '}converged",
+            "rejected edges": rejected or None,
+        }
+
+    def plot(self) -> Any:
+        """The graph before and after, with its edges, as a figure."""
+        graph = self.graph
+        return self._drawn(
+            "pose_graph_picture.pose_graph_figure",
+            f"{graph.name}  ·  {len(graph.keys)} poses, {len(graph.edges)} edges, "
+            f"cost {self.minimum.cost:.6g}",
+            {"before": self.before.translations, "after": self.poses.translations},
+            graph.edges,
+            graph.is_odometry,
+            self.weights < 0.5,
+        )
+
+    def _sketch(self) -> Any:
+        return self.plot()
 
     @property
     def poses(self) -> Poses:

@@ -6,15 +6,17 @@ from __future__ import annotations
 
 import bz2
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalPolicy, BalSolution
+from slam_graph.display import Displayed
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
@@ -22,7 +24,7 @@ from slam_graph.results.result_files import ResultFolder, appearing, write_text
 
 
 @dataclass(eq=False, repr=False)
-class BalResult:
+class BalResult(Displayed):
     """What a bundle adjustment found out.
 
     Attributes:
@@ -102,7 +104,8 @@ class BalResult:
         files.json("metrics.json", self.metrics)
         adjusted = self.solution.adjusted
         write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
-        self._draw(files)
+        with files.appearing("bundle_adjustment.png") as partial:
+            self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -114,19 +117,19 @@ class BalResult:
         with appearing(path) as partial:
             partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
-    def _draw(self, files: ResultFolder) -> None:
-        from slam_graph.visualization import plot_bundle
+    def _facts(self) -> dict[str, object]:
+        return {"solution": self.solution, "seconds": _seconds_text(self.seconds)}
 
-        part, adjusted = self.solution.part.problem, self.solution.adjusted
-        title = f"{self.name}: {part.cameras} cameras, {part.points} points"
-        with files.appearing("bundle_adjustment.png") as partial:
-            plot_bundle(
-                partial, title, adjusted.points, adjusted.centres(), self.solution.errors_px
-            )
+    def _sketch(self) -> Any:
+        return self.plot()
+
+    def plot(self) -> Any:
+        """The scene from three sides, and a histogram of the reprojection errors, as a figure."""
+        return self.solution.plot()
 
 
 @dataclass(eq=False, repr=False)
-class PoseGraphResult:
+class PoseGraphResult(Displayed):
     """What an optimisation found out.
 
     Attributes:
@@ -209,7 +212,8 @@ class PoseGraphResult:
             files.text("covariances.csv", self._covariance_lines(self.covariances))
         if self.certificate is not None:
             files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
-        self._draw(files)
+        with files.appearing("pose_graph.png") as partial:
+            self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -244,17 +248,21 @@ class PoseGraphResult:
         for key, row in zip(self.solution.graph.keys.tolist(), entries, strict=True):
             yield ",".join([str(key), *(f"{value:.9g}" for value in row)]) + "\n"
 
-    def _draw(self, files: ResultFolder) -> None:
-        from slam_graph.visualization import plot_pose_graph
+    def _facts(self) -> dict[str, object]:
+        return {
+            "solution": self.solution,
+            "certificate": self._certificate(),
+            "seconds": _seconds_text(self.seconds),
+        }
 
-        graph, weights = self.solution.graph, self.solution.weights
-        title = f"{graph.name}: {len(graph.keys)} poses, {len(graph.edges)} edges"
-        with files.appearing("pose_graph.png") as partial:
-            plot_pose_graph(
-                partial,
-                title,
-                self.solution.before.translations,
-                self.solution.poses.translations,
-                graph.edges,
-                weights < 0.5,
-            )
+    def _sketch(self) -> Any:
+        return self.plot()
+
+    def plot(self) -> Any:
+        """The graph before and after, with its edges, as a figure."""
+        return self.solution.plot()
+
+
+def _seconds_text(seconds: Mapping[str, float]) -> str | None:
+    """Wall time of each part."""
+    return ", ".join(f"{part} {value:.2f}" for part, value in seconds.items()) or None

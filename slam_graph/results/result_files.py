@@ -162,6 +162,7 @@ def _link_latest(folder: Path) -> Path:
 TRAJECTORY = "trajectory.tum"
 SMOOTHED = "trajectory_smoothed.tum"
 LOOP_CLOSED = "trajectory_loop.tum"
+LOOPS = "loops.csv"
 IN_MAP = "trajectory_map.tum"
 GROUNDTRUTH = "groundtruth.tum"
 STATES = "states.csv"

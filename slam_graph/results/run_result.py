@@ -11,13 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from slam_graph.arrays import FloatArray
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import FinalBa, WindowGraph
 from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.evaluation import ape, innovation_report
-from slam_graph.geometry import AlignmentMode, NavState, StateHistory, Trajectory
+from slam_graph.evaluation import innovation_report, nees_of_run
+from slam_graph.geometry import NavState, StateHistory, Trajectory
 from slam_graph.loop_closure import LoopClosures
 from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
@@ -26,9 +28,20 @@ from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import RunLogs
+from slam_graph.results.run_picture import (
+    CAUSAL,
+    LOOPS_CLOSED,
+    SMOOTHED,
+    PoseEstimate,
+    RunView,
+    with_covariances_after_alignment,
+)
+from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
 
-Status = Literal["ok", "interrupted", "not_initialized", "diverged", "low_coverage", "failed"]
+Status = Literal[
+    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
+]
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
@@ -77,7 +90,7 @@ class Ending:
 
 
 @dataclass(eq=False, repr=False)
-class RunResult:
+class RunResult(RunSummary):
     """What a run found out.
 
     The accessors that `SavedRun` has too (`trajectory`, `metrics`, …) say the same of a result
@@ -182,6 +195,29 @@ class RunResult:
         return None if self.loops is None else self.loops.correct(self.best_trajectory)
 
     @property
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
+        if self.loops is None:
+            return np.zeros((0, 2), np.int64)
+        stamps = [keyframe.stamp_ns for keyframe in self.loops.keyframes]
+        kept = (self.loops.loops[k] for k in np.flatnonzero(self.loops.accepted))
+        ends = [(stamps[loop.first], stamps[loop.second]) for loop in kept]
+        return np.array(ends, np.int64).reshape(-1, 2)
+
+    @property
+    def nees_series(self) -> tuple[IntArray, FloatArray] | None:
+        """Times (K,) and NEES (K, 2) of position and orientation; None without a truth."""
+        if self.groundtruth is None or not len(self.history):
+            return None
+        try:
+            found, _ = nees_of_run(
+                self.groundtruth, self.history, self.start_was_given, self.final_ba
+            )
+        except DataError:
+            return None
+        return found.stamps_ns, np.column_stack([found.position, found.orientation])
+
+    @property
     def in_map(self) -> Trajectory | None:
         """Poses in the world of a known map, of the frames where they are known."""
         return None if self.localization is None else self.localization.trajectory()
@@ -253,7 +289,8 @@ class RunResult:
         """Raise what kept the run from ending well, if anything did.
 
         Raises:
-            EstimationError: if it never initialised, diverged, or covered less than was asked.
+            EstimationError: if it never initialised, diverged, covered less than was asked, or
+                left no map although it was to.
             KeyboardInterrupt: if it was interrupted.
             BaseException: whatever else ended it.
         """
@@ -279,7 +316,7 @@ class RunResult:
             files.text(names.SMOOTHED_STATES, names.state_lines(self.final_ba.history))
         if self.loops is not None and self.loop_closed is not None:
             files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
-            files.text("loops.csv", self.loops.csv_lines())
+            files.text(names.LOOPS, self.loops.csv_lines())
             write_ply(files.path("map_loop.ply"), self.loops.points())
         if self.localization is not None:
             files.text(names.IN_MAP, self.localization.trajectory().tum_lines())
@@ -298,27 +335,26 @@ class RunResult:
         for stamp_ns, graph in self.graphs.items():
             for name, text in graph.texts().items():
                 files.text(f"graph_{stamp_ns}_{name}", [text])
-        self._draw(files)
+        with files.appearing("trajectory.png") as partial:
+            self.plot().write(partial)
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for
             save_map(self.slam_map, files.path(MAP_NAME), force=True)
         return files.files
 
-    def _draw(self, files: ResultFolder) -> None:
-        """Draw the trajectory beside the truth, where the two can be compared."""
-        from slam_graph.visualization import plot_errors
+    def _known_map(self) -> SlamMap | None:
+        return self.slam_map
 
-        truth, estimate = self.groundtruth, self.trajectory
-        if truth is None:
-            return
-        alignment: AlignmentMode = "none" if self.start_was_given else "se3"
-        try:
-            position = ape(truth, estimate, "trans_part", alignment)
-            rotation = ape(truth, estimate, "angle_deg", alignment)
-        except DataError:
-            return
-        title = f"{self.input.info.name}, {self.config.algorithm.name}, alignment: {alignment}"
-        aligned = position.similarity.apply(estimate)
-        with files.appearing("trajectory.png") as partial:
-            plot_errors(
-                partial, title, truth, aligned, position.values, rotation.values, position.stamps_ns
-            )
+    def _view(self) -> RunView:
+        histories = {CAUSAL: self.history}
+        if self.final_ba is not None:
+            histories[SMOOTHED] = self.final_ba.history
+        view = RunView(
+            {name: PoseEstimate.of_history(history) for name, history in histories.items()},
+            {} if self.loop_closed is None else {LOOPS_CLOSED: self.loop_closed},
+            self.groundtruth,
+            self.points,
+            self.input.start_ns,
+        )
+        return with_covariances_after_alignment(
+            view, histories, self.start_was_given, self.final_ba
+        )

@@ -21,6 +21,14 @@ from slam_graph.maps import SlamMap
 from slam_graph.results import result_files as names
 from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
 from slam_graph.results.result_files import LATEST
+from slam_graph.results.run_picture import (
+    CAUSAL,
+    LOOPS_CLOSED,
+    SMOOTHED,
+    PoseEstimate,
+    RunView,
+)
+from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
 
 
@@ -43,7 +51,7 @@ def load_result(folder: Path | str) -> SavedRun:
     )
 
 
-class SavedRun:
+class SavedRun(RunSummary):
     """A result that was saved; each file is read when it is first asked for.
 
     It has the accessors of `RunResult` as far as the files allow; there are no full covariances.
@@ -107,10 +115,17 @@ class SavedRun:
     @cached_property
     def trajectory(self) -> Trajectory:
         """The causal estimate, with velocities and biases."""
-        poses = _trajectory(self.folder, names.TRAJECTORY)
-        stamps, states = self._states
-        if poses is None or not np.array_equal(stamps, poses.stamps_ns):
-            raise DataError(f"{self.folder}: {names.STATES} and {names.TRAJECTORY} differ in time")
+        return self._with_states(names.read_tum(self.folder / names.TRAJECTORY), names.STATES)
+
+    def _with_states(self, poses: Trajectory, file: str) -> Trajectory:
+        """Poses with the velocities and biases of a file of states.
+
+        Raises:
+            DataError: if the two are not of the same times.
+        """
+        stamps, states = names.read_states(self.folder / file)
+        if not np.array_equal(stamps, poses.stamps_ns):
+            raise DataError(f"{self.folder}: {file} and the trajectory differ in time")
         return replace(
             poses,
             velocities=_columns(states, names.VELOCITY),
@@ -126,7 +141,10 @@ class SavedRun:
     @cached_property
     def smoothed(self) -> Trajectory | None:
         """The trajectory of the final bundle adjustment, if there is one."""
-        return _trajectory(self.folder, names.SMOOTHED)
+        poses = _trajectory(self.folder, names.SMOOTHED)
+        if poses is None or not (self.folder / names.SMOOTHED_STATES).is_file():
+            return poses
+        return self._with_states(poses, names.SMOOTHED_STATES)
 
     @cached_property
     def smoothed_sigmas(self) -> FloatArray | None:
@@ -143,6 +161,28 @@ class SavedRun:
     def loop_closed(self) -> Trajectory | None:
         """The best trajectory after loop closure, if loops were to be closed."""
         return _trajectory(self.folder, names.LOOP_CLOSED)
+
+    @cached_property
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
+        path = self.folder / names.LOOPS
+        if not path.is_file():
+            return np.zeros((0, 2), np.int64)
+        try:
+            rows = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, ndmin=2).reshape(-1, 5)
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: not a table of loop closures ({error})") from error
+        return np.asarray(rows[rows[:, 4] == 1, :2])
+
+    @property
+    def start_was_given(self) -> bool:
+        """Whether the first state came with the data, in the world of the truth."""
+        return bool(self.metrics["extent"].get("start_was_given", False))
+
+    @property
+    def nees_series(self) -> None:
+        """None: there are no covariances in the files."""
+        return None
 
     @cached_property
     def in_map(self) -> Trajectory | None:
@@ -169,6 +209,25 @@ class SavedRun:
     def coverage(self) -> float:
         """Estimated time over the time asked for, from 0 to 1."""
         return float(self.metrics["extent"]["coverage"])
+
+    def _known_map(self) -> SlamMap | None:
+        return self.slam_map
+
+    def _view(self) -> RunView:
+        estimates = {CAUSAL: PoseEstimate.of_sigmas(self.trajectory, self.sigmas)}
+        if self.smoothed is not None:
+            sigmas = self.smoothed_sigmas
+            if sigmas is None:  # of an earlier version
+                sigmas = np.full((len(self.smoothed), len(names.SIGMAS)), np.nan)
+            estimates[SMOOTHED] = PoseEstimate.of_sigmas(self.smoothed, sigmas)
+        view = RunView(
+            estimates,
+            {} if self.loop_closed is None else {LOOPS_CLOSED: self.loop_closed},
+            self.groundtruth,
+            self.points,
+            self.metrics["extent"]["start_ns"],
+        )
+        return view if self.metrics["extent"]["start_was_given"] else view.aligned()
 
     @cached_property
     def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:

@@ -149,10 +149,13 @@ class FeatureFrame:
         stamp_ns: time of the frame.
         cameras: the observations of each camera of the rig, in the rig's order; empty where a
             camera has no image.
+        outliers: for those who watch, where each camera saw the features that the front end has
+            just rejected; empty where it does not say. They are no observations.
     """
 
     stamp_ns: int
     cameras: tuple[FeatureObservations, ...]
+    outliers: tuple[FeatureObservations, ...] = ()
 
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""

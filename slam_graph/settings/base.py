@@ -17,11 +17,13 @@ from typing import Any, ClassVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from slam_graph.display import Displayed
+
 expert = partial(Field, json_schema_extra={"expert": True})
 """A pydantic field of the second tier; it works like any other."""
 
 
-class Settings(BaseModel):
+class Settings(Displayed, BaseModel):
     """Base of all settings.
 
     Attributes:
@@ -32,6 +34,45 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     moved: ClassVar[Mapping[str, str]] = {}
+
+    def __repr__(self) -> str:
+        changed = ", ".join(f"{name}={value}" for name, value in self._changed().items())
+        return f"{type(self).__name__}({changed or 'defaults'})"
+
+    __str__ = __repr__
+
+    def _facts(self) -> dict[str, object]:
+        changed = self._changed()
+        return changed or {"": "all settings have their defaults"}
+
+    def _changed(self) -> dict[str, object]:
+        """The settings that differ from their defaults, by their dotted names.
+
+        Of a table with a name, such as an algorithm, the name is there in any case.
+        """
+        found: dict[str, object] = {}
+        for name, info in type(self).model_fields.items():
+            value = getattr(self, name)
+            default = info.get_default(call_default_factory=True, validated_data={})
+            if isinstance(value, Settings) and type(value) is type(default):
+                found |= value._unlike(default, name)
+            elif value != default:
+                found[name] = value
+        return found
+
+    def _unlike(self, other: Settings, prefix: str) -> dict[str, object]:
+        """Where these settings differ from others of the same type; see `_changed`."""
+        known = getattr(self, "name", None)
+        found: dict[str, object] = {} if known is None else {prefix: known}
+        if known is not None and known != getattr(other, "name", None):
+            return found
+        for name in type(self).model_fields:
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if isinstance(mine, Settings) and type(mine) is type(theirs):
+                found |= mine._unlike(theirs, f"{prefix}.{name}")
+            elif mine != theirs:
+                found[f"{prefix}.{name}"] = mine
+        return found
 
     def as_yaml(self) -> str:
         """YAML that gives the same settings when it is read, each with its meaning as a comment."""

@@ -187,7 +187,12 @@ class SimulatedTracks(SimulatedSequence):
         """Frames of features; those before `start_ns` are simulated too, but left out."""
         flight, config = self.flight, self.config
         simulator = TrackSimulator(
-            flight.rig, flight.world, self.landmarks, config.tracks, config.seed
+            flight.rig,
+            flight.world,
+            self.landmarks,
+            config.tracks,
+            config.seed,
+            config.place_seed,
         )
         stamps = flight.exposures_ns - self._offset_ns
         until = flight.exposures_ns[self.within(stamps, None, end_ns)]
@@ -219,7 +224,7 @@ class SimulatedImages(SimulatedSequence):
         if board is not None:
             sizes.append(board.size)
             texels_m.append(board.config.texel_m)
-        atlas = paint(sizes, texels_m, config.seed)
+        atlas = paint(sizes, texels_m, config.place_seed)
         return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board)
 
     @cached_property

@@ -194,6 +194,10 @@ class SimulationConfig(Settings):
     """Frames per second."""
     seed: int = Field(0, ge=0)
     """Seed of all random numbers. The same settings and seed give the same bytes."""
+    world_seed: int | None = Field(None, ge=0)
+    """Seed of the place: landmarks, their descriptors, textures, and the room; that of the flight
+    if not given. Give several flights one world seed and different seeds for flights through one
+    place."""
     flight: FlightConfig = FlightConfig()
     """How a generated trajectory is flown."""
     imu: SimulatedImuConfig = SimulatedImuConfig()
@@ -215,6 +219,11 @@ class SimulationConfig(Settings):
         if self.start is not None:
             return self.start
         return _REAL_START if self.real_imu else StartConfig()
+
+    @property
+    def place_seed(self) -> int:
+        """Seed of what belongs to the place and not to the flight."""
+        return self.seed if self.world_seed is None else self.world_seed
 
     @property
     def recorded(self) -> Path | None:

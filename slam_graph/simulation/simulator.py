@@ -23,7 +23,7 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
-from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.motion import Motion, SplineMotion
 from slam_graph.simulation.recorded_flight import LEAD_NS, RecordedFlight
 from slam_graph.simulation.simulated_sequence import (
     Flight,
@@ -38,7 +38,7 @@ from slam_graph.simulation.simulation_config import (
 )
 from slam_graph.simulation.trajectories import fit, fly, stamps_between
 from slam_graph.simulation.views import View, camera_groups
-from slam_graph.simulation.world import room_around, three_rooms
+from slam_graph.simulation.world import World, room_around, three_rooms
 
 _DEFAULT_DURATION_S = 60.0
 
@@ -148,18 +148,33 @@ def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
 def _generated(config: SimulationConfig) -> Flight:
     rig = _rig(config, None)
     duration_s = config.duration_s if config.duration_s is not None else _DEFAULT_DURATION_S
-    rng = np.random.default_rng(random_stream(config.seed, "trajectory"))
-    total_s = duration_s + 2e-9 * LEAD_NS
-    motion = fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flight, rng)
+    motion = _fly(config, rig, config.seed, duration_s)
     imu = SimulatedImu(motion, rig.imu, config.imu, config.seed)
-    world = three_rooms()
-    if config.trajectory != "rooms":
-        world = room_around(_positions(motion), config.landmarks.margin_m)
-    return Flight(rig, motion, imu, world, _exposures(motion, config))
+    return Flight(rig, motion, imu, _world(config, rig, motion), _exposures(motion, config))
+
+
+def _fly(config: SimulationConfig, rig: Rig, seed: int, duration_s: float) -> SplineMotion:
+    """A flight along a generated path."""
+    rng = np.random.default_rng(random_stream(seed, "trajectory"))
+    total_s = duration_s + 2e-9 * LEAD_NS
+    return fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flight, rng)
+
+
+def _world(config: SimulationConfig, rig: Rig, motion: SplineMotion) -> World:
+    """The place of a generated flight.
+
+    With a seed of its own it is the room around the flight of that seed, so that it is the same
+    for every flight through it.
+    """
+    if config.trajectory == "rooms":
+        return three_rooms()
+    if config.world_seed is not None:
+        motion = _fly(config, rig, config.world_seed, _DEFAULT_DURATION_S)
+    return room_around(_positions(motion), config.landmarks.margin_m)
 
 
 def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:
-    rng = np.random.default_rng(random_stream(config.seed, "landmarks"))
+    rng = np.random.default_rng(random_stream(config.place_seed, "landmarks"))
     settings = config.landmarks
     if settings.kind == "ahead":
         views = [View.of(mounted) for mounted in flight.rig.cameras]

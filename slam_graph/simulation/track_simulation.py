@@ -89,10 +89,17 @@ class TrackSimulator:
         landmarks: all landmarks.
         config: number of features, noise, losses, outliers.
         seed: of the simulation.
+        place_seed: of what landmarks look like; the same as `seed` if None.
     """
 
     def __init__(
-        self, rig: Rig, world: World, landmarks: Landmarks, config: TrackConfig, seed: int
+        self,
+        rig: Rig,
+        world: World,
+        landmarks: Landmarks,
+        config: TrackConfig,
+        seed: int,
+        place_seed: int | None = None,
     ) -> None:
         self.views = [View.of(mounted) for mounted in rig.cameras]
         self.groups = camera_groups(rig, self.views)
@@ -101,8 +108,9 @@ class TrackSimulator:
         self._landmarks = landmarks
         self._config = config
         self._rng = np.random.default_rng(random_stream(seed, "tracks"))
+        looks = seed if place_seed is None else place_seed
         self._descriptors = (
-            _Descriptors(len(landmarks), config, seed) if config.descriptors else None
+            _Descriptors(len(landmarks), config, looks, seed) if config.descriptors else None
         )
         self._tracks = [_Tracks() for _ in self.groups]
         self._next_id = 0
@@ -240,11 +248,14 @@ class _Descriptors:
     Args:
         landmarks: their number.
         config: number of distinct descriptors.
-        seed: of the simulation.
+        place_seed: of the descriptors.
+        seed: of their wrong bits.
     """
 
-    def __init__(self, landmarks: int, config: TrackConfig, seed: int) -> None:
-        rng = np.random.default_rng(random_stream(seed, "looks"))  # the name is part of the seed
+    def __init__(self, landmarks: int, config: TrackConfig, place_seed: int, seed: int) -> None:
+        rng = np.random.default_rng(
+            random_stream(place_seed, "looks")
+        )  # the name is part of the seed
         shape = (config.distinct_descriptors, _DESCRIPTOR_BYTES)
         self._distinct = rng.integers(0, 256, shape, dtype=np.uint8)
         self._of_landmark = rng.integers(0, config.distinct_descriptors, landmarks)

@@ -8,36 +8,24 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "Panel",
-    "RerunViewer",
+    "Picture",
+    "RerunRecording",
     "TrackPictures",
-    "plot_bundle",
-    "plot_errors",
-    "plot_panels",
-    "plot_pose_graph",
+    "panel_figure",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.visualization.plots import (
-        Panel,
-        plot_bundle,
-        plot_errors,
-        plot_panels,
-        plot_pose_graph,
-    )
-    from slam_graph.visualization.rerun_viewer import RerunViewer
+    from slam_graph.visualization.panels import Panel, panel_figure
+    from slam_graph.visualization.rerun_recording import RerunRecording
+    from slam_graph.visualization.style import Picture
     from slam_graph.visualization.track_picture import TrackPictures
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "plots": (
-                "Panel",
-                "plot_bundle",
-                "plot_errors",
-                "plot_panels",
-                "plot_pose_graph",
-            ),
-            "rerun_viewer": ("RerunViewer",),
+            "panels": ("Panel", "panel_figure"),
+            "rerun_recording": ("RerunRecording",),
+            "style": ("Picture",),
             "track_picture": ("TrackPictures",),
         },
     )

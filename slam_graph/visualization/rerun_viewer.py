@@ -1,161 +1,248 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A run in Rerun: poses, map, images with features, and series, over the time of the recording."""
+"""A run that is watched in Rerun while it goes on."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import Any, Literal
+import logging
+from typing import Literal
 
 import numpy as np
+from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import FloatArray
-from slam_graph.errors import DataError
-from slam_graph.geometry import NavState, Similarity, Trajectory, interpolate
-from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend import Estimator
+from slam_graph.geometry import StateHistory, Trajectory
+from slam_graph.maps import SlamMap
+from slam_graph.sensors import CameraFrame, Rig
+from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
+from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
+from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
+from slam_graph.visualization.rerun_palette import (
+    CAUSAL,
+    GREEN,
+    PURPLE,
+    VERMILLION,
+    YELLOW,
+    robust_range,
+    scaled,
+)
+from slam_graph.visualization.rerun_progress import ShownFrame, StepSeries
+from slam_graph.visualization.rerun_series import SeriesLog
+from slam_graph.visualization.rerun_states import StateRows
+from slam_graph.visualization.rerun_stream import RerunStream
+from slam_graph.visualization.rerun_window import show_window
 
-ViewerMode = Literal["save", "spawn", "connect"]
+DetailMode = Literal["normal", "graph"]
 
-_TIMELINE = "time"
-_STRIP_LENGTH = 50
-"""Poses in one strip of the path; finished strips are not sent again."""
+_KEYFRAME_NS = 500_000_000
+"""An image is sent so often where the algorithm has no keyframes."""
 
-_JPEG_QUALITY = 75
-_FRUSTUM_M = 0.2
-ESTIMATE_COLOR, TRUTH_COLOR = (0, 122, 255), (150, 150, 150)
-FEATURE_COLOR, MAP_COLOR = (0, 220, 0), (255, 160, 0)
+_ALIGN_FRAMES = 40
+"""The truth is aligned with what there is of the run after so many frames."""
 
 
 class RerunViewer:
-    """Sends a run to a Rerun file or window, in a recording stream of its own.
+    """Sends a run to Rerun; a `Viewer` of the pipeline.
 
     Args:
-        mode: `save` to a file, `spawn` a window, or `connect` to one that is open.
-        path: of the file to save; it appears when the viewer is closed.
-        name: of the recording.
+        stream: where it goes.
+        images: of which frames images are sent.
+        detail: `graph` adds the factor graph of every window and its information.
+        known_map: the map that the run is located in, if there is one.
     """
 
-    def __init__(self, mode: ViewerMode, path: Path | None = None, name: str = "run") -> None:
-        import rerun
-
-        self._rr: Any = rerun
-        self._stream: Any = rerun.RecordingStream("slam_graph")
-        self._stream.send_recording_name(name)
-        self._path = path
-        if mode == "save":
-            if path is None:
-                raise ValueError("a recording to save needs a path")
-            self._partial = path.with_name(f".{path.name}.partial")
-            self._stream.save(self._partial)
-        elif mode == "spawn":
-            self._start_window()
-        else:
-            self._stream.connect_grpc()
-        self._strip: list[FloatArray] = []
-        self._strips = 0
+    def __init__(
+        self,
+        stream: RerunStream,
+        images: ImagesMode = "all",
+        detail: DetailMode = "normal",
+        known_map: SlamMap | None = None,
+    ) -> None:
+        self._stream, self._images, self._detail = stream, images, detail
+        self._known_map = known_map
+        self._series = SeriesLog(self._stream)
+        self._steps = StepSeries(self._series)
+        self._log_handler = _LogHandler(self._stream)
         self._truth: Trajectory | None = None
+        self._stamps_ns: list[int] = []
+        self._begin("world")
+
+    def _begin(self, world: str) -> None:
+        """Begin with an empty world; a run that starts anew is in another one than before."""
+        self._world = world
+        self._outcome = OutcomeLog(self._stream, world, self._series, self._stamps_ns)
+        self._history = StateHistory()
+        self._states = StateRows(self._stream, world)
+        self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
+        self._heights: list[FloatArray] = []
+        self._keyframes: set[int] = set()
+        self._image_ns: int | None = None
 
     def open(self, rig: Rig, truth: Trajectory | None) -> None:
-        """Send what does not change: the axes and the cameras."""
-        rr = self._rr
+        """Send what does not change, and the layout."""
+        logging.getLogger("slam_graph").addHandler(self._log_handler)
         self._truth = truth
-        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for index, mounted in enumerate(rig.cameras):
-            pose, camera = mounted.body_T_camera, mounted.camera
-            entity = f"world/body/cam{index}"
-            placed = rr.Transform3D(translation=pose.translation(), mat3x3=pose.rotation().matrix())
-            lens = rr.Pinhole(
-                image_from_camera=camera.K,
-                resolution=(camera.width, camera.height),
-                image_plane_distance=_FRUSTUM_M,
-            )
-            self._log(entity, placed, static=True)
-            self._log(entity, lens, static=True)
+        if self._known_map is not None:
+            log_map(self._stream, KNOWN_MAP, self._known_map)
+        self._set_world(rig)
 
-    def show(
+    def _set_world(self, rig: Rig) -> None:
+        rr = self._stream.rr
+        self._rig = rig
+        self._stream.log(self._world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        brief = self._images == "none"
+        self._cameras = CameraViews(self._stream, rig, f"{self._world}/body", brief)
+        self._cameras.mount(rig)
+        self._outcome.style(f"{self._world}/path/causal", CAUSAL)
+        for name, radius in {"features": -2.4, "map/points": POINT_RADIUS, "window": -3.0}.items():
+            style = rr.Points3D.from_fields(radii=[radius])
+            self._stream.log(f"{self._world}/{name}", style, static=True)
+        self._outcome.show_legend()
+        self._arrange()
+
+    def _arrange(
         self,
-        frame: CameraFrame | FeatureFrame,
-        features: FeatureFrame,
-        state: NavState | None,
-        points: FloatArray,
+        outcome_plots: frozenset[str] = frozenset(),
+        eye: Eye | None = None,
+        in_map: Trajectory | None = None,
     ) -> None:
-        """Send one frame."""
-        self._stream.set_time(_TIMELINE, timestamp=np.datetime64(features.stamp_ns, "ns"))
-        self._show_cameras(frame, features)
-        if state is None:
+        """Send the layout."""
+        plots = outcome_plots | StepSeries.PLOTS
+        shown = Shown(
+            self._world,
+            len(self._rig.cameras),
+            plots,
+            log=True,
+            window=self._detail == "graph",
+            in_map=self._known_map is not None,
+            map_path=None if in_map is None or not len(in_map) else in_map.positions,
+        )
+        self._stream.arrange(odometry(shown, eye))
+
+    def show(self, frame: ShownFrame, estimator: Estimator) -> None:
+        """Send one frame.
+
+        Args:
+            frame: what became of it.
+            estimator: after this frame.
+        """
+        features = frame.features
+        number, stamp_ns = len(self._stamps_ns), features.stamp_ns
+        self._stamps_ns.append(stamp_ns)
+        self._stream.at(number, stamp_ns)
+        if frame.restarted:
+            self._states.flush()
+            self._begin(f"world_from_{number}")
+            self._set_world(frame.corrected_rig or self._rig)
+        images = frame.packet.frame
+        if isinstance(images, CameraFrame) and self._wants_images(estimator, stamp_ns):
+            self._cameras.show_images(images)
+        self._cameras.show_tracks(features, frame.rejected, estimator.dynamic)
+        self._steps.add(number, stamp_ns, frame, estimator)
+        if frame.state is None:
             return
-        self._show_state(state)
-        self._log("world/features", self._rr.Points3D(points, colors=MAP_COLOR, radii=0.02))
-        if self._truth is not None:
-            self._show_truth(state)
+        if not frame.waits:
+            ids, points = frame.landmark_ids, frame.landmarks
+            self._cameras.show_residuals(features, frame.state, ids, points)
+        if not len(self._history):
+            self._outcome.show_gravity(np.asarray(frame.state.world_T_body.translation()))
+        self._history.append(frame.state)
+        self._states.add(number, stamp_ns, frame.state)
+        self._show_features(frame, estimator)
+        self._show_window(estimator)
+        if self._detail == "graph":
+            show_window(self._stream, estimator)
+        if self._truth is not None and number % _ALIGN_FRAMES == 0:
+            given = estimator.start_is_given
+            self._outcome.show_truth(self._truth, self._history.trajectory(), given)
+
+    def finish(self, result: FinishedRun) -> None:
+        """Send what is known at the end only, and show everything at once."""
+        self._series.flush()
+        self._states.flush()
+        self._stream.at(max(len(self._stamps_ns) - 1, 0), self._stamps_ns[-1])
+        self._show_map(np.ones(len(self._ids), np.bool_))
+        plots = self._outcome.show(result)
+        best = result.smoothed or result.trajectory
+        points = np.concatenate([*self._heights, np.zeros((0, 3))])
+        self._arrange(plots, Eye.on(best.positions, points), result.in_map)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
-        self._stream.flush()
-        self._stream.disconnect()
-        if self._path is not None:
-            os.replace(self._partial, self._path)
+        logging.getLogger("slam_graph").removeHandler(self._log_handler)
+        self._series.flush()
+        self._states.flush()
+        self._stream.close()
 
-    def _log(self, entity: str, *what: Any, static: bool = False) -> None:
-        self._stream.log(entity, *what, static=static)
+    def _wants_images(self, estimator: Estimator, stamp_ns: int) -> bool:
+        """Whether the images of this frame are sent."""
+        if self._images != "keyframes":
+            return self._images == "all"
+        window = estimator.window
+        keyframes = set() if window is None else set(window.keyframes)
+        if keyframes - self._keyframes:
+            self._image_ns = stamp_ns
+            return True
+        if self._image_ns is None or stamp_ns - self._image_ns >= _KEYFRAME_NS:
+            self._image_ns = stamp_ns
+            return True
+        return False
 
-    def _start_window(self) -> None:
-        """Open a window."""
-        try:
-            self._stream.spawn()
-        except (RuntimeError, OSError) as error:
-            first = str(error).splitlines()[0]
-            raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error
+    def _show_features(self, frame: ShownFrame, estimator: Estimator) -> None:
+        """The landmarks of this frame by what they are, and those that left to the map."""
+        window, ids, points = estimator.window, frame.landmark_ids, frame.landmarks
+        colours = np.tile(np.array(YELLOW, np.uint8), (len(ids), 1))
+        if window is not None:
+            colours[np.isin(ids, window.state_features)] = GREEN
+        colours[np.isin(ids, frame.rejected)] = VERMILLION
+        cloud = self._stream.rr.Points3D.from_fields(positions=points, colors=colours)
+        self._stream.log(f"{self._world}/features", cloud)
+        self._show_map(~np.isin(self._ids, ids))
+        self._ids, self._points = ids, points
 
-    def _show_cameras(self, frame: CameraFrame | FeatureFrame, features: FeatureFrame) -> None:
-        """The images, with their features."""
-        rr = self._rr
-        images = frame.images if isinstance(frame, CameraFrame) else ()
-        for index, image in enumerate(images):
-            if image is not None:
-                picture = rr.Image(image, color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
-                self._log(f"world/body/cam{index}/image", picture)
-        for index, seen in enumerate(features.cameras):
-            marks = rr.Points2D(seen.pixels, colors=FEATURE_COLOR, radii=2.0)
-            self._log(f"world/body/cam{index}/image/features", marks)
-
-    def _show_state(self, state: NavState) -> None:
-        """The pose, the path so far, and the time series."""
-        rr = self._rr
-        pose = state.world_T_body
-        position = pose.translation()
-        placed = rr.Transform3D(translation=position, mat3x3=pose.rotation().matrix())
-        self._log("world/body", placed)
-        self._strip.append(np.array(position))
-        path = rr.LineStrips3D([self._strip], colors=ESTIMATE_COLOR)
-        self._log(f"world/path/{self._strips:05d}", path)
-        if len(self._strip) >= _STRIP_LENGTH:
-            self._strip, self._strips = self._strip[-1:], self._strips + 1
-        series = {
-            "velocity": state.velocity,
-            "gyro_bias": state.gyro_bias,
-            "accel_bias": state.accel_bias,
-        }
-        if state.covariance is not None:
-            sigmas = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
-            series |= {"sigma/rotation": sigmas[:3], "sigma/position": sigmas[3:6]}
-        for name, values in series.items():
-            self._log(f"series/{name}", rr.Scalars(values))
-
-    def _show_truth(self, state: NavState) -> None:
-        """The true path, sent once, aligned with the estimate at the first pose."""
-        assert self._truth is not None
-        start, _ = interpolate(self._truth, np.array([state.stamp_ns]))
-        if len(start) == 0:
+    def _show_map(self, rows: BoolArray) -> None:
+        """Add landmarks to the map."""
+        left = self._points[rows]
+        if len(left) == 0:
             return
-        quaternion: Any = state.world_T_body.rotation().toQuaternion()
-        own = Trajectory(
-            start.stamps_ns,
-            np.array([state.world_T_body.translation()]),
-            np.array([quaternion.coeffs()]),
+        self._heights.append(left)
+        heights = np.concatenate([part[:, 2] for part in self._heights])
+        colours = scaled(left[:, 2], *robust_range(heights))
+        cloud = self._stream.rr.Points3D.from_fields(positions=left, colors=colours)
+        self._stream.log(f"{self._world}/map/points", cloud)
+
+    def _show_window(self, estimator: Estimator) -> None:
+        """The past poses in the state, and new keyframes."""
+        window = estimator.window
+        if window is None:
+            return
+        rr, values = self._stream.rr, window.state.estimate
+        past = [number for number in window.past if values.exists(X(number))]
+        poses = np.array([values.atPose3(X(number)).translation() for number in past])
+        held = np.array([number in window.keyframes for number in past], np.bool_)
+        colours = np.where(held[:, None], np.array(PURPLE), np.full(3, 255)).astype(np.uint8)
+        cloud = rr.Points3D.from_fields(
+            positions=poses.reshape(-1, 3), colors=colours.reshape(-1, 3)
         )
-        path = Similarity.of_first_pose(own, start).apply(self._truth).positions
-        line = self._rr.LineStrips3D([path], colors=TRUTH_COLOR)
-        self._log("world/groundtruth", line, static=True)
-        self._truth = None
+        self._stream.log(f"{self._world}/window", cloud)
+        new = [n for n in past if n in window.keyframes and n not in self._keyframes]
+        if new:
+            places = [values.atPose3(X(number)).translation() for number in new]
+            marks = rr.Points3D(places, colors=PURPLE, radii=-2.0)
+            self._stream.log(f"{self._world}/keyframes", marks)
+        self._keyframes |= set(window.keyframes)
+
+
+class _LogHandler(logging.Handler):
+    """Sends the log of the package."""
+
+    def __init__(self, stream: RerunStream) -> None:
+        super().__init__(logging.INFO)
+        self._stream = stream
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a line."""
+        text = self._stream.rr.TextLog(self.format(record), level=record.levelname)
+        self._stream.log("log", text)

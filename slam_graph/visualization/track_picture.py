@@ -21,13 +21,18 @@ Picture = NDArray[np.uint8]
 _TAIL_FRAMES = 15
 """Length of the path that is drawn behind a feature; also the age at which its colour is full."""
 
+_AGE_COLOURS = cv2.applyColorMap(
+    np.linspace(60, 205, _TAIL_FRAMES + 1).astype(np.uint8), cv2.COLORMAP_PLASMA
+)[:, 0].tolist()
+"""Colours (BGR) by age, from violet to orange: colour-blind people can order them."""
+
 _FRAMES_PER_S = 20.0
 
 
 class _TrackPainter:
     """Draws the tracks of each frame on its images, the cameras side by side.
 
-    Young features are blue and old ones red; one that is also seen by another camera has a ring.
+    Young features are violet, old ones orange; one that another camera sees too has a ring.
     """
 
     def __init__(self) -> None:
@@ -63,8 +68,7 @@ class _TrackPainter:
         self, picture: NDArray[np.uint8], tail: deque[tuple[int, int]], age: int, shared: bool
     ) -> None:
         """Draw one feature; coordinates are in eighths of a pixel (`shift=3` of OpenCV)."""
-        share = min(age / _TAIL_FRAMES, 1.0)
-        colour = (255 * (1 - share), 160 * (1 - abs(2 * share - 1)) + 40, 255 * share)
+        colour = _AGE_COLOURS[min(age, _TAIL_FRAMES)]
         way = np.array(tail, np.int32).reshape(-1, 1, 2)
         cv2.polylines(picture, [way], False, colour, 1, cv2.LINE_AA, 3)
         cv2.circle(picture, tail[-1], 16, colour, cv2.FILLED, cv2.LINE_AA, 3)

@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Review of a start in motion: the first seconds are solved again from the frames that follow it.
+"""Review of a start: the first seconds are solved again from the frames that follow it.
 
-The batch problem of a start over frames after it gives velocity and direction of gravity a second
-time. If these contradict the estimate, the start was wrong, and the estimator goes on from the new
-solution. After a start without a metre scale this waits until the scale is known.
+The batch problem of a start in motion over frames after it gives velocity and direction of gravity
+a second time. If these contradict the estimate, the start was wrong, and the estimator goes on from
+the new solution. After a start without a metre scale this waits until the scale is known.
+
+A start from standstill whose velocity became unknown before images said anything, as with one
+camera that moves off slowly, is always replaced by the solution of what follows: a filter's one
+step from so far away ends beside the minimum, and is sure of it.
 """
 
 from __future__ import annotations
@@ -30,29 +34,32 @@ _LEAST_VELOCITY, _LEAST_TILT_RAD = 0.1, np.deg2rad(2.0)
 frames, in a dark second for example, so that χ² alone doubts a velocity that is known to 1 mm/s."""
 _GIVE_UP_NS = 5_000_000_000
 """A start whose scale is known is compared within this time or not at all."""
+_UNKNOWN_VELOCITY = 0.1
+"""Standard deviation of a velocity, in m/s, from which a start from standstill is solved again."""
 
 
 class StartReview:
-    """Compares a start in motion with a solution of what follows.
+    """Compares a start with a solution of what follows.
 
     Attributes:
         done: whether there is nothing left to compare.
     """
 
-    def __init__(self, context: EngineContext, stamp_ns: int, scale_sigma: float) -> None:
+    def __init__(self, context: EngineContext, stamp_ns: int, scale_sigma: float | None) -> None:
         """Begin after a start.
 
         Args:
             context: shared with the engine.
             stamp_ns: time of the start, on the clock of the IMU.
-            scale_sigma: relative standard deviation of its scale.
+            scale_sigma: relative standard deviation of its scale; None from standstill.
         """
         self.done = False
-        self._begun_ns = stamp_ns
-        self._without_scale = scale_sigma > MAX_SCALE_SIGMA
+        self._begun_ns = self._doubtful_ns = stamp_ns
+        self._from_standstill = self._trusted = scale_sigma is None
+        self._without_scale = scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA
         self._initializer = Initializer(context, "motion", "wait")
         self._diagnostics = context.diagnostics
-        if self._without_scale:
+        if scale_sigma is not None and self._without_scale:
             message = f"start with a scale that is known to {scale_sigma:.0%} only"
             self._diagnostics.warn("scale_unknown", message)
 
@@ -69,18 +76,22 @@ class StartReview:
             frame: its features.
             state: the estimate at the frame, with its covariance.
         """
-        self.done = not self._without_scale and stamp_ns - self._begun_ns > _GIVE_UP_NS
+        if self._from_standstill and _velocity_sigma(state) > _UNKNOWN_VELOCITY:
+            self._trusted, self._doubtful_ns = False, stamp_ns
+        if self._trusted:
+            return None
+        self.done = not self._without_scale and stamp_ns - self._doubtful_ns > _GIVE_UP_NS
         window = None if self.done else self._initializer.try_to_start(stamp_ns, frame)
         if window is None:
             return None
         self.done = True
-        if not contradict(state, window.current(window.prior)):
+        if not self._from_standstill and not contradict(state, window.current(window.prior)):
             return None
+        reason = "what follows the start contradicts it"
+        if self._from_standstill:
+            reason = "the velocity was lost after standstill, before images showed it"
         seconds = (stamp_ns - self._begun_ns) * 1e-9
-        self._diagnostics.warn(
-            "start_corrected",
-            f"what follows the start contradicts it; solved again {seconds:.1f} s later",
-        )
+        self._diagnostics.warn("start_corrected", f"{reason}; solved again {seconds:.1f} s later")
         return window
 
 
@@ -104,6 +115,12 @@ def contradict(one: NavState, other: NavState) -> bool:
     lengths = [np.linalg.norm(difference[:3]), np.linalg.norm(tilt)]
     far = np.greater(lengths, [_LEAST_VELOCITY, _LEAST_TILT_RAD])
     return bool(np.any(far & (squares > threshold(np.array([3, 2]), _CONFIDENCE))))
+
+
+def _velocity_sigma(state: NavState) -> float:
+    """Largest standard deviation of the velocity along an axis, m/s."""
+    assert state.covariance is not None
+    return float(np.sqrt(np.max(np.diag(state.covariance)[6:9])))
 
 
 def _in_body(state: NavState) -> tuple[FloatArray, FloatArray]:

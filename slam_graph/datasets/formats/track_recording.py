@@ -5,8 +5,9 @@
 A recording is replayed bit for bit, so that every algorithm gets the same features. `TrackRecorder`
 writes recordings. All numbers are little-endian, and no file is a pickle:
 
-- ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, `name`, and the number of `cameras`,
-  `frames`, `imu_samples` and `features`, by which a truncated file is recognised;
+- ``meta.yaml``: `format` (``slam_graph-tracks``), `version`, the `name` of what was recorded (the
+  recording itself has the name of its folder), and the number of `cameras`, `frames`, `imu_samples`
+  and `features`, by which a truncated file is recognised;
 - ``calibration.yaml``: the rig, as `slam_graph.datasets.calibration.kalibr_calibration` writes it;
 - ``frames.bin``: for each frame `stamp` (int64, ns) and `counts` (int64 for each camera), the
   number of features of each camera;
@@ -167,7 +168,7 @@ class TrackRecordingSequence(RecordedSequence):
         rig = options.select(recorded if chain is None else read_kalibr(chain))
         truth = path / GROUNDTRUTH
         own = partial(load_trajectory, truth) if truth.is_file() else None
-        super().__init__(meta.require("name").text(), rig, options, own)
+        super().__init__(path.resolve().name, rig, options, own)
         counts = {
             name: int(meta.require(name).number()) for name in ("frames", "imu_samples", "features")
         }

@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""`slam-graph view`: results, recordings, maps and graphs in Rerun, after the fact."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from slam_graph.cli.options import Calibration, Format, Groundtruth, RerunAddress, Sources
+from slam_graph.cli.watching import Watching, keep_serving
+
+if TYPE_CHECKING:
+    from slam_graph.visualization import RerunRecording
+
+_Show = Callable[["RerunRecording"], None]
+_RRD = ".rrd"
+
+
+def view(
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="WHAT...",
+            help="Folder of results, .rrd file, map, pose graph, BAL problem or recording; several "
+            "folders of runs are compared.",
+        ),
+    ],
+    mode: Annotated[
+        Literal["spawn", "save", "connect", "serve"],
+        typer.Option("--rerun", help="Where it is shown; save writes --output."),
+    ] = "spawn",
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.rrd", help="Save a recording for Rerun here."),
+    ] = None,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option("--screenshot", metavar="FILE.png", help="Save a picture, without a window."),
+    ] = None,
+    size: Annotated[
+        str, typer.Option("--size", metavar="WxH", help="Size of the picture in pixels.")
+    ] = "1600x1000",
+    images: Annotated[
+        bool, typer.Option("--images/--no-images", help="Whether images of a recording are shown.")
+    ] = True,
+    known_map: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAP", help="Map that the run was located in."),
+    ] = None,
+    rerun_address: RerunAddress = None,
+    format_: Format = None,
+    calibration: Calibration = None,
+    groundtruth: Groundtruth = None,
+    sources: Sources = None,
+) -> None:
+    """Show a result, a recording, a map or a graph in Rerun.
+
+    Everything is read from files, so runs that were not watched can be seen as well. With
+    --screenshot no window is opened: a picture of it is written.
+    """
+    from slam_graph.errors import ConfigError
+
+    if output is not None and output.suffix != _RRD:
+        raise ConfigError(f"--output {output}: a recording for Rerun ends with {_RRD}")
+    if mode == "save" and output is None:
+        raise ConfigError("--rerun save needs --output FILE.rrd")
+    pixels = _size(size)
+    existing = _recording_of(what)
+    if existing is not None:
+        _show_existing(existing, mode, output, screenshot, pixels)
+        return
+    name, show = _shown(what, images, known_map, (format_, calibration, groundtruth, sources))
+    with tempfile.TemporaryDirectory(prefix="slam_graph_") as folder:
+        files = output is not None or screenshot is not None
+        path = output or Path(folder) / f"{name}{_RRD}"
+        watching = Watching("save" if files else mode, address=rerun_address)
+        with watching.recording(path, name) as recording:
+            show(recording)
+            if not files:
+                keep_serving(mode)
+        if screenshot is not None:
+            recording.screenshot(path, screenshot, pixels)
+    for written in (output, screenshot):
+        if written is not None:
+            typer.echo(str(written))
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        raise typer.BadParameter(f"'{text}' is not of the form WxH", param_hint="--size")
+    return int(width), int(height)
+
+
+def _recording_of(what: list[str]) -> Path | None:
+    """The recording for Rerun that is meant: a file, or that of a run that was watched."""
+    if len(what) != 1:
+        return None
+    path = Path(what[0])
+    if path.suffix == _RRD:
+        return path
+    for folder in (path, path / "latest"):
+        if (folder / "recording.rrd").is_file():
+            return folder / "recording.rrd"
+    return None
+
+
+def _show_existing(
+    path: Path,
+    mode: str,
+    output: Path | None,
+    screenshot: Path | None,
+    pixels: tuple[int, int],
+) -> None:
+    """Show a recording for Rerun."""
+    from slam_graph.errors import ConfigError
+    from slam_graph.visualization import RerunRecording
+
+    if output is not None:
+        raise ConfigError(f"{path} is a recording for Rerun already; copy it to {output}")
+    if screenshot is not None:
+        RerunRecording.screenshot(path, screenshot, pixels)
+        typer.echo(str(screenshot))
+    elif mode == "serve":
+        with RerunRecording.serve(path) as url:
+            typer.echo(f"open {url} in a browser", err=True)
+            keep_serving("serve")
+    elif mode == "connect":
+        raise ConfigError(f"{path}: open it in the viewer that is there, or use --rerun spawn")
+    else:
+        RerunRecording.open(path)
+
+
+def _shown(
+    what: list[str],
+    images: bool,
+    known_map: Path | None,
+    options: tuple[str | None, Path | None, Path | None, list[str] | None],
+) -> tuple[str, _Show]:
+    """The name of what is meant, and what logs it.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    from slam_graph.cli import view_files as files
+
+    if len(what) > 1:
+        return "comparison", files.runs_compared([Path(path) for path in what])
+    path = Path(what[0])
+    for folder in (path, path / "latest"):
+        if folder.is_dir() and (found := files.of_folder(folder, known_map)) is not None:
+            return folder.resolve().parent.name or path.name, found
+    if path.is_file() and options[0] is None and (found := files.of_file(path)) is not None:
+        return path.stem, found
+    from slam_graph.cli.options import open_recording
+
+    sequence = open_recording(what[0], *options)
+    return sequence.info().name, lambda recording: recording.show_recording(sequence, images)

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What `slam-graph view` finds in files: runs, comparisons, optimisations, maps, graphs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+from zipfile import is_zipfile
+
+if TYPE_CHECKING:
+    from slam_graph.arrays import FloatArray
+    from slam_graph.results import SavedRun
+    from slam_graph.visualization import RerunRecording
+
+_Show = Callable[["RerunRecording"], None]
+_GRAPH_SUFFIXES = {".g2o", ".graph", ".toro"}
+
+
+def of_folder(folder: Path, known_map: Path | None = None) -> _Show | None:
+    """What logs a folder of results; None if it is none."""
+    if (folder / "optimized.g2o").is_file():
+        return _optimized_graph(folder)
+    if (folder / "optimized.txt").is_file():
+        return _bundle(folder / "optimized.txt")
+    if (folder / "runs").is_dir() and (folder / "summary.json").is_file():
+        return _comparison(folder)
+    if (folder / "metrics.json").is_file() and (folder / "trajectory.tum").is_file():
+        return _run(folder, known_map)
+    if (folder / "map.slam").is_file():
+        return _map(folder / "map.slam")
+    return None
+
+
+def of_file(path: Path) -> _Show | None:
+    """What logs a map or a problem for `slam-graph optimize`; None if it is neither."""
+    from slam_graph.bundle_adjustment import is_bal
+
+    if path.suffix == ".slam" or (is_zipfile(path) and path.suffix != ".zip"):
+        return _map(path)
+    if path.suffix in _GRAPH_SUFFIXES:
+        return _graph(path)
+    if path.suffix in (".txt", ".bz2") and is_bal(path):
+        return _bundle(path)
+    if path.suffix == ".txt" and _begins_like_graph(path):
+        return _graph(path)
+    return None
+
+
+def _begins_like_graph(path: Path) -> bool:
+    """Whether the first line is one of a pose graph."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().startswith(("VERTEX", "EDGE", "ODOMETRY", "LANDMARK"))
+
+
+def _graph(path: Path) -> _Show:
+    """A pose graph as it is in its file, after odometry alone."""
+    from slam_graph.pose_graph import PoseGraphSolution, read_pose_graph
+
+    graph = read_pose_graph(path)
+    odometry = replace(graph, estimates=None)
+    poses = graph.estimates or PoseGraphSolution.of(odometry, graph.anchor_poses()).before
+    solution = PoseGraphSolution.of(odometry, poses)
+    return lambda recording: recording.show_pose_graph(solution)
+
+
+def _optimized_graph(folder: Path) -> _Show:
+    """A pose graph that was optimised, after odometry alone, with the weights of its edges."""
+    import numpy as np
+
+    from slam_graph.errors import DataError
+    from slam_graph.pose_graph import PoseGraphSolution, read_pose_graph
+
+    graph = read_pose_graph(folder / "optimized.g2o")
+    try:
+        table = np.loadtxt(folder / "edges.csv", delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{folder / 'edges.csv'}: cannot be read ({error})") from error
+    weights = table[:, 3] if len(table) == len(graph.edges) else None
+    assert graph.estimates is not None
+    odometry = replace(graph, estimates=None, name=folder.resolve().parent.name)
+    solution = PoseGraphSolution.of(odometry, graph.estimates, weights)
+    return lambda recording: recording.show_pose_graph(solution)
+
+
+def _bundle(path: Path) -> _Show:
+    """A bundle-adjustment problem as it is in its file."""
+    from slam_graph.bundle_adjustment import BalSolution, read_bal
+
+    solution = BalSolution.unsolved(read_bal(path))
+    return lambda recording: recording.show_bundle(solution)
+
+
+def _map(path: Path) -> _Show:
+    from slam_graph.results import load_map
+
+    content = load_map(path)
+    return lambda recording: recording.show_map(content)
+
+
+def _run(folder: Path, known_map: Path | None) -> _Show:
+    """A run from its files."""
+    from slam_graph.errors import SlamGraphError
+    from slam_graph.results import load_map, load_result
+
+    saved = load_result(folder)
+    known = None if known_map is None else load_map(known_map)
+    log = folder / "run.log"
+    lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
+    try:
+        rig = saved.rig
+    except SlamGraphError:  # paths and points can be shown without the cameras
+        rig = None
+
+    def show(recording: RerunRecording) -> None:
+        timing = _timing(folder / "timing.csv")
+        recording.show_run(saved, saved.points, timing, rig, lines, known)
+
+    return show
+
+
+def _timing(path: Path) -> dict[str, FloatArray]:
+    """The columns of `timing.csv` by the names of the stages; empty cells are NaN."""
+    import numpy as np
+
+    if not path.is_file():
+        return {}
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    if len(rows) < 2:
+        return {}
+    columns = zip(*rows[1:], strict=True)
+    found: dict[str, FloatArray] = {}
+    for title, cells in zip(rows[0], columns, strict=True):
+        kind = np.int64 if title == "stamp_ns" else np.float64
+        found[title.removesuffix("_ms")] = np.array([cell or "nan" for cell in cells]).astype(kind)
+    return found
+
+
+def runs_compared(folders: list[Path]) -> _Show:
+    """Several runs of one recording: in the world of the truth, or of the first one."""
+    import numpy as np
+
+    from slam_graph.errors import DataError
+    from slam_graph.results import load_result
+
+    saved = [load_result(folder) for folder in folders]
+    truth = saved[0].groundtruth
+    start_ns = min(int(run.trajectory.stamps_ns[0]) for run in saved if len(run.trajectory))
+    runs: dict[str, dict[str, FloatArray]] = {}
+    for number, run in enumerate(saved, start=1):
+        name = str(run.metrics["algorithm"])
+        name = name if name not in runs else f"{name} ({number})"
+        try:
+            runs[name] = _compared(run, saved[0], start_ns)
+        except DataError as error:
+            raise DataError(f"{folders[number - 1]}: cannot be compared: {error}") from error
+    path = None if truth is None else np.asarray(truth.positions)
+    return lambda recording: recording.show_comparison(runs, path)
+
+
+def _compared(run: SavedRun, first: SavedRun, start_ns: int) -> dict[str, FloatArray]:
+    """The path of a run in a common world, and its errors; see `RerunRecording.show_comparison`."""
+    import numpy as np
+
+    from slam_graph.evaluation import ape
+
+    truth = first.groundtruth
+    reference = first.trajectory if truth is None else truth
+    position = ape(reference, run.trajectory, "trans_part", "yaw")
+    what = "difference" if truth is None else "error"
+    rotation = ape(reference, run.trajectory, "angle_deg", "yaw")
+    moved = position.similarity.apply(run.trajectory)
+    return {
+        "path": moved.positions,
+        "time_s": np.asarray((position.stamps_ns - start_ns) * 1e-9, np.float64),
+        f"position {what} [m]": position.values,
+        f"orientation {what} [deg]": rotation.values,
+    }
+
+
+def _comparison(folder: Path) -> _Show | None:
+    """A comparison by `slam-graph compare`: all algorithms on the first data, with one seed."""
+    import numpy as np
+
+    files = sorted((folder / "runs").glob("*/*.npz"))
+    runs: dict[str, dict[str, FloatArray]] = {}
+    true_path: FloatArray | None = None
+    for file in files:
+        if file.parent != files[0].parent:
+            continue
+        with np.load(file, allow_pickle=False) as series:
+            if "time_s" not in series or "translation_m_yaw" not in series:
+                continue  # without a truth, or without motion
+            true_path = series.get("true_path", true_path)
+            runs[file.stem] = {
+                "path": series.get("path", np.zeros((0, 3))),
+                "time_s": series["time_s"],
+                "position error [m]": series["translation_m_yaw"],
+                "orientation error [deg]": series["rotation_deg_yaw"],
+            }
+    return (lambda recording: recording.show_comparison(runs, true_path)) if runs else None

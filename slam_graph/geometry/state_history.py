@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All states of a run as compact rows."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.geometry.trajectory import NavState, Trajectory
+
+_STATE_WIDTH = 16
+"""Position, quaternion (x y z w), velocity, accelerometer bias, gyroscope bias."""
+
+_ERROR_WIDTH = len(NavState.COMPONENTS)
+_POSE_WIDTH = 6
+
+
+class StateHistory:
+    """All states of a run, as compact rows: about 0.6 kB a state.
+
+    It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
+    NaN.
+    """
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._states = array("d")
+        self._sigmas = array("d")
+        self._pose_covariances = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def __repr__(self) -> str:
+        return f"StateHistory({len(self)} states)"
+
+    def append(self, state: NavState) -> None:
+        """Add the state of the next frame."""
+        pose = state.world_T_body
+        quaternion: Any = pose.rotation().toQuaternion()  # an Eigen type that the stubs do not know
+        row = np.concatenate(
+            [
+                pose.translation(),
+                quaternion.coeffs(),
+                state.velocity,
+                state.accel_bias,
+                state.gyro_bias,
+            ]
+        )
+        covariance = state.covariance
+        if covariance is None:
+            covariance = np.full((_ERROR_WIDTH, _ERROR_WIDTH), np.nan)
+        variances = np.maximum(np.diag(covariance), 0.0)
+        self._stamps_ns.append(state.stamp_ns)
+        self._states.extend(row.tolist())
+        self._sigmas.extend(np.sqrt(variances).tolist())
+        self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
+
+    def trajectory(self) -> Trajectory:
+        """The states as a trajectory with velocities and biases."""
+        rows = _table(self._states, _STATE_WIDTH)
+        return Trajectory(
+            np.array(self._stamps_ns, dtype=np.int64),
+            rows[:, 0:3],
+            rows[:, 3:7],
+            velocities=rows[:, 7:10],
+            accel_biases=rows[:, 10:13],
+            gyro_biases=rows[:, 13:16],
+        )
+
+    def sigmas(self) -> FloatArray:
+        """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
+        return _table(self._sigmas, _ERROR_WIDTH)
+
+    def pose_covariances(self) -> FloatArray:
+        """(N, 6, 6) covariances of rotation and position, in the body frame."""
+        return _table(self._pose_covariances, _POSE_WIDTH * _POSE_WIDTH).reshape(
+            -1, _POSE_WIDTH, _POSE_WIDTH
+        )
+
+
+def _table(values: array[float], width: int) -> FloatArray:
+    """A copy of flat values as rows of `width`."""
+    return np.array(values, dtype=np.float64).reshape(-1, width)

@@ -1,0 +1,273 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of a run: its paths from above and from the side, and errors and ±3σ over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.errors import DataError
+from slam_graph.evaluation import nees_of_run, synchronize
+from slam_graph.geometry import Similarity, StateHistory, Trajectory, interpolate
+
+if TYPE_CHECKING:
+    from slam_graph.backend import FinalBa
+    from slam_graph.visualization import Panel, Picture
+
+CAUSAL, SMOOTHED, LOOPS_CLOSED = "causal", "smoothed", "loops closed"
+_TRUTH = "ground truth"
+
+_AXES = ("x [m]", "y [m]", "z [m]", "yaw [deg]")
+_COLUMNS = ("AAAAABBB", "CDEF")
+_WIDTHS_INCHES = (5.0, 5.8)
+_HEIGHT_INCHES = 6.6
+
+_POINTS_REACH = 0.4
+"""Features are drawn as far from the path as this part of its largest extent."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Poses with their covariances.
+
+    Attributes:
+        trajectory: N poses.
+        covariances: (N, 6, 6) rotation before position, body frame; NaN where unknown.
+    """
+
+    trajectory: Trajectory
+    covariances: FloatArray
+
+    @staticmethod
+    def of_sigmas(trajectory: Trajectory, sigmas: FloatArray) -> PoseEstimate:
+        """With standard deviations (N, 15 or more) alone, in the order of `NavState.COMPONENTS`."""
+        return PoseEstimate(trajectory, sigmas[:, :6, None] ** 2 * np.eye(6))
+
+    @staticmethod
+    def of_history(history: StateHistory) -> PoseEstimate:
+        """The poses of all states."""
+        return PoseEstimate(history.trajectory(), history.pose_covariances())
+
+    def moved(self, similarity: Similarity) -> PoseEstimate:
+        """The same in another world; covariances are in the body and stay."""
+        return PoseEstimate(similarity.apply(self.trajectory), self.covariances)
+
+    def world_sigmas(self) -> FloatArray:
+        """(N, 4) standard deviations of x, y, z [m] and yaw [deg], in the axes of the world."""
+        R = Rotation.from_quat(self.trajectory.quaternions).as_matrix()
+        position = np.einsum("nij,njk,nik->ni", R, self.covariances[:, 3:, 3:], R)
+        up = R[:, 2, :]
+        yaw = np.einsum("nj,njk,nk->n", up, self.covariances[:, :3, :3], up)
+        sigmas = np.sqrt(np.maximum(np.column_stack([position, yaw]), 0.0))
+        return np.asarray(sigmas * (1.0, 1.0, 1.0, np.degrees(1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class RunView:
+    """What the picture of a run shows, in one world: that of the truth, if there is one.
+
+    Attributes:
+        estimates: by their names.
+        paths: other trajectories, by their names.
+        truth: ground truth, or None.
+        points: (P, 3) features.
+        start_ns: where time begins.
+    """
+
+    estimates: Mapping[str, PoseEstimate]
+    paths: Mapping[str, Trajectory]
+    truth: Trajectory | None
+    points: FloatArray
+    start_ns: int
+
+    def moved(self, similarity: Similarity) -> RunView:
+        """All but the truth in another world."""
+        return RunView(
+            {name: estimate.moved(similarity) for name, estimate in self.estimates.items()},
+            {name: similarity.apply(path) for name, path in self.paths.items()},
+            self.truth,
+            self.points @ similarity.rotation.T + similarity.translation,
+            self.start_ns,
+        )
+
+    def aligned(self) -> RunView:
+        """In the world of the truth: the yaw and translation that fit the best path over its whole.
+
+        The covariances stay relative to the first state.
+        """
+        if self.truth is None:
+            return self
+        best = self.estimates.get(SMOOTHED, self.estimates[CAUSAL]).trajectory
+        try:
+            true, own = synchronize(self.truth, best)
+            return self.moved(Similarity.of_positions(true.positions, own.positions, "yaw"))
+        except DataError:  # no common time, or what never moves determines no yaw
+            return self
+
+
+def with_covariances_after_alignment(
+    view: RunView, histories: Mapping[str, StateHistory], given: bool, final_ba: FinalBa | None
+) -> RunView:
+    """The view in the world of the truth, with the covariances of what the alignment leaves.
+
+    Args:
+        view: in the world of the run.
+        histories: states of the estimates, by the names of these.
+        given: whether the start was given in the world of the truth.
+        final_ba: the smoothed trajectory, by which the run is aligned.
+    """
+    if view.truth is None or given:
+        return view
+    estimates = {}
+    similarity = None
+    for name, history in histories.items():
+        with suppress(DataError):
+            judged, alignment = nees_of_run(view.truth, history, False, final_ba)
+            if alignment == "yaw":
+                trajectory = history.trajectory()
+                covariances = np.full((len(trajectory), 6, 6), np.nan)
+                rows = np.searchsorted(trajectory.stamps_ns, judged.stamps_ns)
+                covariances[rows] = judged.covariances
+                mapped = judged.similarity.apply(trajectory)
+                estimates[name] = PoseEstimate(mapped, covariances)
+                similarity = judged.similarity
+    if similarity is None:
+        return view.aligned()
+    moved = view.moved(similarity)
+    return RunView(
+        {**moved.estimates, **estimates}, moved.paths, view.truth, moved.points, view.start_ns
+    )
+
+
+def run_figure(view: RunView, metrics: Mapping[str, Any]) -> Picture:
+    """Draw a run.
+
+    Args:
+        view: what to draw.
+        metrics: the content of `metrics.json`, for the title.
+    """
+    from slam_graph.visualization import panel_figure
+
+    panels = [_path_panel(view, 1, "from above"), _path_panel(view, 2, "from the side")]
+    panels += _series_panels(view)
+    return panel_figure(_title(metrics), panels, _COLUMNS, _WIDTHS_INCHES, _HEIGHT_INCHES)
+
+
+def _path_panel(view: RunView, axis: int, title: str) -> Panel:
+    """All paths over x and another axis of the world."""
+    from slam_graph.visualization import Panel
+
+    paths = {} if view.truth is None else {_TRUTH: view.truth}
+    paths |= {name: estimate.trajectory for name, estimate in view.estimates.items()}
+    paths |= view.paths
+    curves = {
+        name: (path.positions[:, 0], path.positions[:, axis])
+        for name, path in paths.items()
+        if len(path)
+    }
+    dots = _near(view.points, [path.positions for path in paths.values() if len(path)])
+    return Panel(
+        "x [m]",
+        f"{'xyz'[axis]} [m]",
+        curves,
+        "path",
+        dots=dots[:, [0, axis]] if len(dots) else None,
+        title=title,
+    )
+
+
+def _near(points: FloatArray, paths: list[FloatArray]) -> FloatArray:
+    """The points that are not far from the paths: a few wrong ones would make these small."""
+    if not paths or not len(points):
+        return np.zeros((0, 3))
+    positions = np.concatenate(paths)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    reach = _POINTS_REACH * float((high - low).max())
+    inside = ((points > low - reach) & (points < high + reach)).all(axis=1)
+    return np.asarray(points[inside])
+
+
+def _series_panels(view: RunView) -> list[Panel]:
+    """Errors of position and yaw, or without a truth what smoothing changed, in ±3σ."""
+    from slam_graph.visualization import Panel
+
+    lines: dict[str, tuple[FloatArray, FloatArray]] = {}
+    sigmas: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for name, estimate in view.estimates.items():
+        if not len(estimate.trajectory):
+            continue
+        sigmas[name] = (_seconds(view, estimate.trajectory), 3.0 * estimate.world_sigmas())
+        if view.truth is not None:
+            with suppress(DataError):
+                true, own = synchronize(view.truth, estimate.trajectory)
+                lines[name] = (_seconds(view, own), _differences(own, true))
+    if view.truth is None and SMOOTHED in sigmas:
+        causal, smoothed = (view.estimates[name].trajectory for name in (CAUSAL, SMOOTHED))
+        reference, valid = interpolate(smoothed, causal.stamps_ns)
+        own = causal.select(valid)
+        lines[f"{CAUSAL} − {SMOOTHED}"] = (_seconds(view, own), _differences(own, reference))
+    title = "errors in the axes of the world, and ±3σ"
+    if view.truth is None:
+        changed = ", and what smoothing changed" if SMOOTHED in sigmas else ""
+        title = f"±3σ in the axes of the world{changed}"
+    return [
+        Panel(
+            "time [s]",
+            axis,
+            {name: (x, values[:, k]) for name, (x, values) in lines.items()},
+            "errors",
+            bounds={name: (x, values[:, k]) for name, (x, values) in sigmas.items()},
+            title=title if k == 0 else "",
+        )
+        for k, axis in enumerate(_AXES)
+    ]
+
+
+def _seconds(view: RunView, trajectory: Trajectory) -> FloatArray:
+    return np.asarray((trajectory.stamps_ns - view.start_ns) * 1e-9)
+
+
+def _differences(estimate: Trajectory, reference: Trajectory) -> FloatArray:
+    """(N, 4) estimate less reference at the same times: x, y, z [m] and yaw [deg], world axes."""
+    turned = Rotation.from_quat(estimate.quaternions) * (
+        Rotation.from_quat(reference.quaternions).inv()
+    )
+    yaw = np.degrees(turned.as_rotvec()[:, 2])
+    return np.column_stack([estimate.positions - reference.positions, yaw])
+
+
+def _title(metrics: Mapping[str, Any]) -> str:
+    """What was run, how it ended, and the root mean square errors where there is a truth."""
+    cameras = metrics["cameras"]
+    ending = "" if metrics["status"] == "ok" else f"  ·  {metrics['status']}"
+    lines = [
+        f"{metrics['dataset']['name']}  ·  {metrics['algorithm']}, "
+        f"{cameras} camera{'' if cameras == 1 else 's'}{ending}"
+    ]
+    mode = "none" if metrics["extent"]["start_was_given"] else "yaw"
+    tables = {
+        CAUSAL: metrics["accuracy"],
+        SMOOTHED: (metrics["final_ba"] or {}).get("accuracy"),
+        LOOPS_CLOSED: (metrics["loop_closure"] or {}).get("accuracy"),
+    }
+    errors = [
+        f"{name} {table[mode]['ate']['translation_m']['rmse']:.3f} m, "
+        f"{table[mode]['ate']['rotation_deg']['rmse']:.2f}°"
+        for name, table in tables.items()
+        if table and "ate" in table[mode]
+    ]
+    if errors:
+        how = "not aligned" if mode == "none" else "aligned in yaw and position"
+        lines.append(f"RMSE ({how}): {'  ·  '.join(errors)}")
+    elif metrics["extent"]["estimated_frames"]:
+        lines.append("no ground truth; ±3σ is relative to the first state")
+    else:
+        lines.append(metrics["message"] or "no estimate")
+    return "\n".join(lines)

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a result shows of itself: a picture, a table in Jupyter, and the Rerun viewer in a notebook.
+
+The same of a result in memory and of one that was read back.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets import Sequence
+from slam_graph.display import Displayed
+from slam_graph.errors import DataError, closest
+from slam_graph.geometry import Trajectory
+from slam_graph.maps import SlamMap
+from slam_graph.results.run_picture import RunView, run_figure
+from slam_graph.results.scene import SceneParts, export_scene
+from slam_graph.results.scene_files import (
+    SCENE_FORMATS,
+    require_models,
+    write_colmap,
+    write_nerfstudio,
+)
+from slam_graph.sensors import Rig
+
+if TYPE_CHECKING:
+    from slam_graph.visualization import Picture
+
+
+class RunSummary(Displayed):
+    """Base of the results of a run."""
+
+    metrics: Any  # a table, which the subclasses compute or read
+
+    @property
+    @abstractmethod
+    def rig(self) -> Rig:
+        """The sensors that were used, with the calibration from before the run."""
+
+    @property
+    @abstractmethod
+    def best_trajectory(self) -> Trajectory:
+        """The smoothed trajectory if there is one, else the causal one."""
+
+    @property
+    @abstractmethod
+    def loop_closed(self) -> Trajectory | None:
+        """The best trajectory after loop closure, if loops were to be closed."""
+
+    @property
+    @abstractmethod
+    def points(self) -> FloatArray:
+        """(P, 3) last estimates of the features that were in the state, in the world, m."""
+
+    @abstractmethod
+    def _view(self) -> RunView:
+        """What the picture shows, in the world of the truth if there is one."""
+
+    @abstractmethod
+    def _known_map(self) -> SlamMap | None:
+        """The map of the run, if there is one."""
+
+    def plot(self) -> Picture:
+        """The picture of the run: paths, and errors or what smoothing changed, in ±3σ.
+
+        It is what `trajectory.png` shows, as a matplotlib figure.
+        """
+        return run_figure(self._view(), self.metrics)
+
+    def show(self, width: int = 950, height: int = 600) -> None:
+        """The run in the Rerun viewer, inside the notebook.
+
+        Args:
+            width: of the viewer, pixels.
+            height: of the viewer, pixels.
+
+        Raises:
+            ConfigError: if the viewer for notebooks is not installed.
+        """
+        view = self._view()
+        paths = {name: estimate.trajectory for name, estimate in view.estimates.items()}
+        paths |= dict(view.paths)
+        self._drawn("inline_viewer.show_inline", paths, view.truth, view.points, (width, height))
+
+    def export(
+        self,
+        folder: Path | str,
+        recording: Sequence,
+        formats: Iterable[str] = SCENE_FORMATS,
+        spacing_m: float = 0.1,
+    ) -> list[Path]:
+        """Write keyframes with their images, and points, for COLMAP or nerfstudio.
+
+        Keyframes are chosen by motion. Of a run that saved a map its keyframes are among them, the
+        points are those of the map, and observations of the first camera are known.
+
+        Args:
+            folder: is given `images/`, and for `colmap` a model in `sparse/0/`, for `nerfstudio`
+                `transforms.json` and `points.ply`.
+            recording: that was run, for its images.
+            formats: `colmap`, `nerfstudio`, or both.
+            spacing_m: between keyframes; a turn of 0.1 rad makes one too.
+
+        Returns:
+            The files, without the images.
+
+        Raises:
+            DataError: if a format is unknown, there are no images, or the formats lack the camera
+                model.
+        """
+        folder, formats = Path(folder), list(formats)
+        for name in formats:
+            if name not in SCENE_FORMATS:
+                raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
+        require_models(self.rig)
+        trajectory = self.loop_closed or self.best_trajectory
+        parts = SceneParts(self.rig, trajectory, self.points, self._known_map(), spacing_m)
+        scene = export_scene(parts, recording, folder / "images")
+        files = []
+        if "colmap" in formats:
+            files += write_colmap(folder / "sparse" / "0", scene)
+        if "nerfstudio" in formats:
+            files += write_nerfstudio(folder, scene)
+        return files
+
+    def _facts(self) -> dict[str, object]:
+        metrics = self.metrics
+        data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
+        cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
+        return {
+            "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
+            "algorithm": f"{metrics['algorithm']}, seed {metrics['seed']}",
+            "status": f"{metrics['status']}. {metrics['message']}".rstrip(". "),
+            "estimated": f"{extent['estimated_frames']} of {extent['frames']} frames, "
+            f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
+            "error": _errors(metrics["accuracy"]),
+            "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy")),
+            "error, loops closed": _errors((metrics["loop_closure"] or {}).get("accuracy")),
+            "speed": (
+                None
+                if timing["real_time_factor"] is None
+                else f"{timing['frames_per_s']:.0f} frames/s, "
+                f"{timing['real_time_factor']:.1f} x real time"
+            ),
+            "warnings": ", ".join(f"{k} {n}" for k, n in metrics["warnings"].items()) or None,
+        }
+
+    def _sketch(self) -> Any:
+        return self.plot()
+
+
+def _errors(accuracy: dict[str, Any] | None) -> str | None:
+    """Root mean square errors after alignment of yaw and position."""
+    table = (accuracy or {}).get("yaw", {}).get("ate")
+    if table is None:
+        return None
+    return (
+        f"{table['translation_m']['rmse']:.4f} m, {table['rotation_deg']['rmse']:.3f}° RMS, "
+        "aligned in yaw and position"
+    )

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps in Rerun: their points, keyframes and links."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.maps import SlamMap
+from slam_graph.visualization.rerun_blueprints import Eye, space, whole
+from slam_graph.visualization.rerun_outcome import POINT_RADIUS
+from slam_graph.visualization.rerun_palette import CYCLE, GREEN, robust_range, scaled
+from slam_graph.visualization.rerun_stream import RerunStream
+
+
+def show_map(stream: RerunStream, content: SlamMap) -> None:
+    """Log a map: points by the number of their observations, keyframes and links."""
+    import rerun.blueprint as rrb
+
+    log_map(stream, "map", content)
+    sizes = content.summary()
+    rows = "\n".join(
+        f"| {name.replace('_', ' ')} | {sizes[name]} |"
+        for name in ("keyframes", "features", "observations", "links", "words", "created")
+    )
+    names = ", ".join(recording.name for recording in content.recordings)
+    text = (
+        f"# Map of {names}\n\n| | |\n|---|---|\n{rows}\n\n**Points** are coloured by the number of "
+        "their observations: dark blue few, yellow many. Lines through the keyframes have a colour "
+        "for each recording; green lines are links between keyframes of the same place."
+    )
+    stream.log("summary", stream.rr.TextDocument(text, media_type="text/markdown"), static=True)
+    eye = Eye.on(content.poses.translations, content.points)
+    stream.arrange(
+        whole(
+            rrb.Horizontal(
+                space("Map", "/map", eye=eye),
+                rrb.TextDocumentView(name="Summary", origin="/summary"),
+                column_shares=[78, 22],
+            ),
+            timeline=None,
+        )
+    )
+
+
+def log_map(stream: RerunStream, entity: str, content: SlamMap) -> None:
+    """Log the points, keyframes and links of a map.
+
+    Args:
+        stream: where it goes.
+        entity: of its world.
+        content: the map.
+    """
+    rr, places = stream.rr, content.poses.translations
+    stream.log(entity, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    known = content.features[content.features >= 0]
+    views = np.bincount(known, minlength=len(content.points)).astype(np.float64)
+    colours = scaled(np.log(np.maximum(views, 1.0)), 0.0, robust_range(np.log1p(views))[1])
+    cloud = rr.Points3D(content.points, colors=colours, radii=POINT_RADIUS)
+    stream.log(f"{entity}/points", cloud, static=True)
+    for number, trajectory in enumerate(content.trajectories()):
+        colour = CYCLE[number % len(CYCLE)]
+        name = f"{entity}/recordings/{number}"
+        path = rr.LineStrips3D([trajectory.positions], colors=colour, radii=-1.0)
+        stream.log(name, path, static=True)
+        marks = rr.Points3D(trajectory.positions, colors=colour, radii=-2.0)
+        stream.log(f"{name}/keyframes", marks, static=True)
+    if len(content.links):
+        lines = rr.LineStrips3D(places[content.links.ends], colors=GREEN, radii=-0.7)
+        stream.log(f"{entity}/links", lines, static=True)

@@ -1,0 +1,292 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a run has found out, in Rerun: paths, map, loop closures, states and errors over time.
+
+It takes what the files of a result hold, so that a run that was not watched can be seen as well.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.errors import DataError
+from slam_graph.evaluation import mean_bounds, synchronize
+from slam_graph.geometry import Similarity, Trajectory
+from slam_graph.visualization.rerun_palette import (
+    CAUSAL,
+    IN_MAP,
+    LIGHT_GREY,
+    LOOP,
+    SMOOTHED,
+    TRUTH,
+    Colour,
+    by_height,
+)
+from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
+from slam_graph.visualization.rerun_stream import RerunStream
+
+PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.1, TRUTH: -0.7, IN_MAP: -2.6}
+"""Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
+
+POINT_RADIUS = -1.3
+
+_TRUTH_POINTS = 2000
+"""About so many points of the true path are drawn."""
+
+LEGEND = """\
+# What is shown
+
+**Space.** Light blue: causal path. Red: smoothed path. Light grey: ground truth, aligned in yaw
+and position over the whole run. Small points: the map, coloured by height (dark blue is low, yellow
+is high). Larger points are features of this frame: green, in the state; yellow, used in this step;
+red, rejected by the gate. White points: past poses in the window; purple: keyframes. Green:
+loop closures and the path after them. The arrow at the start is gravity. Ellipsoids at the body: 1σ
+and 3σ of its position.
+
+**Cameras.** Tails are the last 12 places of a feature; dark is young, yellow is old. Points: green,
+tracked; yellow, new; light blue, seen by another camera too; red, rejected by the gate; orange,
+rejected by RANSAC; purple, moves by itself. White points: landmarks projected into the image; red
+lines: their residuals, ten times as long.
+
+**Plots.** x red, y green, z light blue, thin lines ±3σ. Errors are in the axes of the body.
+"""
+
+
+class FinishedRun(Protocol):
+    """What is known at the end of a run: `RunResult`, or `SavedRun`."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The causal estimate."""
+        ...
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
+        ...
+
+    @property
+    def smoothed(self) -> Trajectory | None:
+        """The trajectory of the final bundle adjustment."""
+        ...
+
+    @property
+    def groundtruth(self) -> Trajectory | None:
+        """The true path."""
+        ...
+
+    @property
+    def start_was_given(self) -> bool:
+        """Whether the estimate lives in the world of the truth."""
+        ...
+
+    @property
+    def loop_closed(self) -> Trajectory | None:
+        """The trajectory after loop closure."""
+        ...
+
+    @property
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the ends of accepted loop closures."""
+        ...
+
+    @property
+    def in_map(self) -> Trajectory | None:
+        """Poses in a known map."""
+        ...
+
+    @property
+    def nees_series(self) -> tuple[IntArray, FloatArray] | None:
+        """Times (K,), and NEES (K, 2) of position and orientation."""
+        ...
+
+
+class OutcomeLog:
+    """Logs what is known at the end of a run.
+
+    Args:
+        stream: where it goes.
+        world: entity of the world of the run.
+        series: of the plots.
+        stamps_ns: times of all frames, by which rows get the numbers of their frames.
+    """
+
+    def __init__(
+        self, stream: RerunStream, world: str, series: SeriesLog, stamps_ns: list[int]
+    ) -> None:
+        self._stream, self._world, self._series = stream, world, series
+        self._stamps_ns = stamps_ns
+        self._truth_sent = False
+
+    def show(self, run: FinishedRun) -> frozenset[str]:
+        """Log everything but the causal states.
+
+        Returns:
+            Entities of the plots that have values.
+        """
+        if run.smoothed is not None:
+            self.path("path/smoothed", run.smoothed, SMOOTHED)
+        self._show_loops(run)
+        if run.in_map is not None:
+            self.path("/known_map/path", run.in_map, IN_MAP)
+        plots = {"error/position", "error/orientation"} if self._show_errors(run) else set()
+        nees = run.nees_series
+        if nees is not None and len(nees[0]):
+            self._show_nees(*nees)
+            plots.add("consistency/nees")
+        return frozenset(plots)
+
+    def show_states(self, run: FinishedRun) -> frozenset[str]:
+        """Log the causal states, as a run that is watched logs them one by one.
+
+        Returns:
+            Entities of the plots that have values.
+        """
+        causal, rr = run.trajectory, self._stream.rr
+        frames = self.frames(causal.stamps_ns)
+        body = f"{self._world}/body"
+        self.path("path/causal", causal, CAUSAL)
+        columns = rr.Transform3D.columns(
+            translation=causal.positions, quaternion=causal.quaternions
+        )
+        self._stream.send_columns(body, frames, causal.stamps_ns, columns)
+        rows: dict[str, tuple[FloatArray | None, FloatArray | None]] = {
+            "state/velocity": (causal.velocities, None),
+            "state/accel_bias": (causal.accel_biases, run.sigmas[:, 9:12]),
+            "state/gyro_bias": (causal.gyro_biases, run.sigmas[:, 12:15]),
+        }
+        shown = set()
+        for entity, (values, sigmas) in rows.items():
+            if values is None:
+                continue
+            shown.add(entity)
+            self._series.send(entity, frames, causal.stamps_ns, values)
+            if sigmas is not None:
+                bounds = three_sigma(values, sigmas)
+                self._series.send(f"{entity}/bounds", frames, causal.stamps_ns, bounds)
+        return frozenset(shown)
+
+    def frames(self, stamps_ns: IntArray) -> IntArray:
+        """(N,) numbers of the last frames at or before some times."""
+        found = np.searchsorted(self._stamps_ns, stamps_ns, "right") - 1
+        return np.asarray(np.maximum(found, 0), np.int64)
+
+    def path(self, entity: str, trajectory: Trajectory, colour: Colour) -> None:
+        """Log a path that grows: one entity with a piece for each frame."""
+        if len(trajectory) < 2:
+            return
+        rr, positions = self._stream.rr, trajectory.positions
+        pieces = np.stack([positions[:-1], positions[1:]], axis=1)
+        stamps_ns = trajectory.stamps_ns[1:]
+        name = entity.removeprefix("/") if entity.startswith("/") else f"{self._world}/{entity}"
+        self.style(name, colour)
+        columns = rr.LineStrips3D.columns(strips=list(pieces))
+        self._stream.send_columns(name, self.frames(stamps_ns), stamps_ns, columns)
+
+    def style(self, entity: str, colour: Colour) -> None:
+        """Say how the pieces of a path look; each piece has its points only."""
+        lines = self._stream.rr.LineStrips3D.from_fields(
+            colors=[colour], radii=[PATH_RADII[colour]]
+        )
+        self._stream.log(entity, lines, static=True)
+
+    def show_truth(self, truth: Trajectory, estimate: Trajectory, given: bool) -> None:
+        """Log the true path in the world of the estimate, fitted over what both share."""
+        try:
+            onto = _onto(estimate, truth, given)
+        except DataError:
+            return
+        rr, entity = self._stream.rr, f"{self._world}/path/groundtruth"
+        if not self._truth_sent:
+            self._truth_sent = True
+            step = max(1, len(truth) // _TRUTH_POINTS)
+            line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=PATH_RADII[TRUTH])
+            self._stream.log(entity, line, static=True)
+        placed = rr.Transform3D(translation=onto.translation, mat3x3=onto.rotation)
+        self._stream.log(entity, placed, static=True)
+
+    def show_gravity(self, position: FloatArray) -> None:
+        """Log the direction of gravity at the start of the path."""
+        arrow = self._stream.rr.Arrows3D(
+            vectors=[[0.0, 0.0, -0.6]],
+            origins=[position],
+            colors=LIGHT_GREY,
+            radii=-1.5,
+            labels=["gravity"],
+            show_labels=True,
+        )
+        self._stream.log(f"{self._world}/gravity", arrow, static=True)
+
+    def show_points(self, points: FloatArray) -> None:
+        """Log a map whose points are known only as they are at the end."""
+        cloud = self._stream.rr.Points3D(points, colors=by_height(points), radii=POINT_RADIUS)
+        self._stream.log(f"{self._world}/map/points", cloud, static=True)
+
+    def show_legend(self) -> None:
+        """Log what the colours mean."""
+        text = self._stream.rr.TextDocument(LEGEND, media_type="text/markdown")
+        self._stream.log("legend", text, static=True)
+
+    def _show_loops(self, run: FinishedRun) -> None:
+        """The loop-closed path, and lines between the places that were recognised."""
+        closed, loops_ns = run.loop_closed, run.loop_ends_ns
+        if closed is None:
+            return
+        self.path("path/loop_closed", closed, LOOP)
+        if len(loops_ns) == 0:
+            return
+        rows = np.clip(np.searchsorted(closed.stamps_ns, loops_ns), 0, len(closed) - 1)
+        lines = self._stream.rr.LineStrips3D(closed.positions[rows], colors=LOOP, radii=-1.2)
+        self._stream.log(f"{self._world}/loop_closures", lines, static=True)
+
+    def _show_errors(self, run: FinishedRun) -> bool:
+        """The true path and the errors of the causal estimate; False without a truth."""
+        truth, causal = run.groundtruth, run.trajectory
+        if truth is None or len(causal) == 0:
+            return False
+        best = causal if run.smoothed is None else run.smoothed
+        self.show_truth(truth, best, run.start_was_given)
+        try:
+            moved = _onto(causal, truth, run.start_was_given).apply(truth)
+            true, own = synchronize(moved, causal)
+        except DataError:
+            return False
+        rows = np.searchsorted(causal.stamps_ns, own.stamps_ns)
+        rotations = Rotation.from_quat(own.quaternions)
+        turned = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
+        errors: dict[str, tuple[FloatArray, Any]] = {
+            "error/position": (
+                rotations.inv().apply(true.positions - own.positions),
+                run.sigmas[rows, 3:6],
+            ),
+            "error/orientation": (np.rad2deg(turned), np.rad2deg(run.sigmas[rows, :3])),
+        }
+        frames = self.frames(own.stamps_ns)
+        for entity, (values, sigmas) in errors.items():
+            self._series.send(entity, frames, own.stamps_ns, values)
+            band = three_sigma(np.zeros_like(values), sigmas)
+            self._series.send(f"{entity}/bounds", frames, own.stamps_ns, band)
+        return True
+
+    def _show_nees(self, stamps_ns: IntArray, values: FloatArray) -> None:
+        frames = self.frames(stamps_ns)
+        self._series.send("consistency/nees", frames, stamps_ns, values)
+        low, high = mean_bounds(3, 1)
+        bounds = np.tile([high, low], (len(values), 1))
+        self._series.send("consistency/nees/bounds", frames, stamps_ns, bounds)
+
+
+def _onto(estimate: Trajectory, truth: Trajectory, given: bool) -> Similarity:
+    """The map from the world of the truth to that of an estimate.
+
+    Raises:
+        DataError: if the two share no time, or determine no yaw.
+    """
+    if given:
+        return Similarity.identity()
+    true, own = synchronize(truth, estimate)
+    return Similarity.of_positions(own.positions, true.positions, "yaw")

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The door to Rerun for the rest of the package: watch a run, show a result, make a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from slam_graph.arrays import FloatArray
+from slam_graph.bundle_adjustment import BalSolution
+from slam_graph.datasets import Sequence
+from slam_graph.maps import SlamMap
+from slam_graph.pose_graph import PoseGraphSolution
+from slam_graph.sensors import Rig
+from slam_graph.visualization.rerun_images import ImagesMode
+from slam_graph.visualization.rerun_map import show_map
+from slam_graph.visualization.rerun_outcome import FinishedRun
+from slam_graph.visualization.rerun_problems import show_bundle, show_pose_graph
+from slam_graph.visualization.rerun_screenshot import (
+    open_recording,
+    save_screenshot,
+    serve_recording,
+    stop,
+)
+from slam_graph.visualization.rerun_stream import RerunMode, RerunStream
+from slam_graph.visualization.rerun_viewer import DetailMode, RerunViewer
+from slam_graph.visualization.rerun_world import (
+    ComparedRun,
+    SavedDetails,
+    show_comparison,
+    show_recording,
+    show_saved_run,
+)
+
+
+class RerunRecording:
+    """A recording for Rerun; a context manager that completes it.
+
+    Args:
+        mode: `save` to a file, `spawn` a window, `connect` to a viewer that is open, or `serve` to
+            browsers.
+        name: of the recording.
+        path: of the file to save; it appears when the recording is closed.
+        address: of the viewer to connect to.
+
+    Attributes:
+        url: where a browser shows it, if it is served.
+
+    Raises:
+        DataError: if no viewer can be shown or reached, or the file cannot be written.
+    """
+
+    def __init__(
+        self, mode: RerunMode, name: str, path: Path | None = None, address: str | None = None
+    ) -> None:
+        self._stream = RerunStream(mode, name, path, address)
+        self.url = self._stream.url
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Send what is left; a saved file appears under its name."""
+        self._stream.close()
+
+    def viewer(
+        self,
+        images: ImagesMode = "all",
+        detail: DetailMode = "normal",
+        known_map: SlamMap | None = None,
+    ) -> RerunViewer:
+        """A viewer of a run for the pipeline, which closes the recording.
+
+        Args:
+            images: of which frames images are sent.
+            detail: `graph` adds the factor graph of every window and its information.
+            known_map: the map that the run is located in, if there is one.
+        """
+        return RerunViewer(self._stream, images, detail, known_map)
+
+    def show_run(
+        self,
+        run: FinishedRun,
+        points: FloatArray,
+        timing: Mapping[str, FloatArray],
+        rig: Rig | None = None,
+        log: Iterable[str] = (),
+        known_map: SlamMap | None = None,
+    ) -> None:
+        """A run that has ended, from what its files hold.
+
+        Args:
+            run: trajectories and errors.
+            points: (P, 3) its map, m.
+            timing: (F,) milliseconds of stages by their names, and `stamp_ns`.
+            rig: the sensors, if they are known.
+            log: lines.
+            known_map: the map that it was located in, if it is at hand.
+        """
+        details = SavedDetails(rig, points, timing, log, known_map)
+        show_saved_run(self._stream, run, details)
+
+    def show_map(self, content: SlamMap) -> None:
+        """A map."""
+        show_map(self._stream, content)
+
+    def show_recording(self, sequence: Sequence, images: bool = True) -> None:
+        """A recording as it is; images only if wanted."""
+        show_recording(self._stream, sequence, images)
+
+    def show_pose_graph(self, solution: PoseGraphSolution) -> None:
+        """A pose graph before and after its optimisation."""
+        show_pose_graph(self._stream, solution)
+
+    def show_bundle(self, solution: BalSolution) -> None:
+        """A bundle adjustment before and after."""
+        show_bundle(self._stream, solution)
+
+    def show_comparison(
+        self, runs: Mapping[str, Mapping[str, FloatArray]], true_path: FloatArray | None
+    ) -> None:
+        """Several runs over one another.
+
+        Args:
+            runs: for each name `path` (N, 3) in m, `time_s` (N,), and errors (N,) by the titles of
+                their plots.
+            true_path: (M, 3) in the same world, if there is one.
+        """
+        compared = [
+            ComparedRun(
+                name,
+                columns["path"],
+                columns["time_s"],
+                {title: c for title, c in columns.items() if title not in ("path", "time_s")},
+            )
+            for name, columns in runs.items()
+        ]
+        show_comparison(self._stream, compared, true_path)
+
+    @staticmethod
+    def screenshot(recording: Path, picture: Path, size: tuple[int, int] = (1600, 1000)) -> None:
+        """A picture of how a saved recording opens; see `save_screenshot` for arguments."""
+        save_screenshot(recording, picture, size)
+
+    @staticmethod
+    def open(recording: Path) -> None:
+        """Open a saved recording in a window, and go on; see `open_recording` for errors."""
+        open_recording(recording)
+
+    @staticmethod
+    @contextmanager
+    def serve(recording: Path) -> Iterator[str]:
+        """Serve a saved recording to browsers while the block runs; gives the address to open."""
+        server, url = serve_recording(recording)
+        try:
+            yield url
+        finally:
+            stop(server)

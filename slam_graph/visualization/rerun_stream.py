@@ -1,0 +1,208 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A recording stream of Rerun: to a file, a window, a viewer that is open, or a browser."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from slam_graph.arrays import IntArray
+from slam_graph.errors import DataError
+
+RerunMode = Literal["save", "spawn", "connect", "serve"]
+
+FRAME, SENSOR_TIME = "frame", "sensor_time"
+"""The timelines: number of the frame, and its time on the clock of the sensors."""
+
+DEFAULT_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
+
+_ABSOLUTE_NS = 10**17
+"""Stamps from here on (three years after 1970) are shown as dates, others as seconds."""
+
+_TICK_S, _CHUNK_BYTES = 60.0, 1 << 20
+
+_CONNECT_TIMEOUT_S = 3.0
+
+
+class RerunStream:
+    """A recording stream of its own, with the two timelines of this package.
+
+    Args:
+        mode: `save` to a file, `spawn` a window, `connect` to a viewer that is open, or `serve` to
+            browsers.
+        name: of the recording.
+        path: of the file to save; it appears when the stream is closed.
+        address: of the viewer to connect to.
+
+    Attributes:
+        rr: the module `rerun`.
+        saves: whether it goes to a file.
+        url: where a browser shows a recording that is served; None in other modes.
+
+    Raises:
+        DataError: if no viewer can be shown or reached, or the file cannot be written.
+    """
+
+    def __init__(
+        self, mode: RerunMode, name: str, path: Path | None = None, address: str | None = None
+    ) -> None:
+        import rerun
+
+        self.rr: Any = rerun
+        self.url: str | None = None
+        # a file is written in large pieces: small ones have more frame than content
+        batches = rerun.ChunkBatcherConfig(flush_tick=_TICK_S, flush_num_bytes=_CHUNK_BYTES)
+        self.saves = mode == "save"
+        self._raw: Any = rerun.RecordingStream(
+            "slam_graph", batcher_config=batches if self.saves else None
+        )
+        for switch in (rerun.set_log_time_enabled, rerun.set_log_tick_enabled):
+            switch(False, recording=self._raw)
+        self._path = self._partial = path if mode == "save" else None
+        self._absolute: bool | None = None
+        if mode == "save":
+            self._save(path)
+        elif mode == "spawn":
+            self._spawn()
+        elif mode == "connect":
+            address = address or DEFAULT_ADDRESS
+            require_viewer(address)
+            self._raw.connect_grpc(address)
+        else:
+            self._serve()
+        self._raw.send_recording_name(name)
+
+    def at(self, frame: int, stamp_ns: int) -> None:
+        """Set the time of what is logged next."""
+        self._raw.set_time(FRAME, sequence=frame)
+        self._raw.set_time(SENSOR_TIME, **self._time(np.int64(stamp_ns)))
+
+    def log(self, entity: str, *what: Any, static: bool = False) -> None:
+        """Log something at the time that was set, or for all times."""
+        self._raw.log(entity, *what, static=static)
+
+    def send_columns(
+        self, entity: str, frames: IntArray, stamps_ns: IntArray, columns: Any
+    ) -> None:
+        """Log N rows at their times at once.
+
+        Args:
+            entity: where.
+            frames: (N,) numbers of the frames.
+            stamps_ns: (N,) times.
+            columns: of an archetype of Rerun.
+        """
+        if len(frames) == 0:
+            return
+        times = [
+            self.rr.TimeColumn(FRAME, sequence=frames),
+            self.rr.TimeColumn(SENSOR_TIME, **self._time(stamps_ns)),
+        ]
+        self._raw.send_columns(entity, indexes=times, columns=columns)
+
+    def send_along(self, entity: str, times: Any, columns: Any) -> None:
+        """Log N rows on a timeline of their own.
+
+        Args:
+            entity: where.
+            times: `TimeColumn` of Rerun.
+            columns: of an archetype of Rerun.
+        """
+        self._raw.send_columns(entity, indexes=[times], columns=columns)
+
+    def arrange(self, blueprint: Any) -> None:
+        """Send the layout of the viewer."""
+        self._raw.send_blueprint(blueprint)
+
+    def close(self) -> None:
+        """Send what is left; a saved file appears under its name."""
+        self._raw.flush()
+        self._raw.disconnect()
+        if self._path is not None and self._partial is not None:
+            os.replace(self._partial, self._path)
+            self._partial = None
+
+    def _time(self, stamps_ns: Any) -> Mapping[str, Any]:
+        """Stamps as dates or, where they count from another time than 1970, as seconds."""
+        if self._absolute is None:
+            self._absolute = bool(np.max(stamps_ns) >= _ABSOLUTE_NS)
+        if self._absolute:
+            return {"timestamp": stamps_ns.astype("datetime64[ns]")}
+        return {"duration": stamps_ns.astype("timedelta64[ns]")}
+
+    def _save(self, path: Path | None) -> None:
+        if path is None:
+            raise ValueError("a recording to save needs a path")
+        self._partial = path.with_name(f".{path.name}.partial")
+        try:
+            self._partial.touch()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        self._raw.save(self._partial)
+
+    def _spawn(self) -> None:
+        if not has_display():
+            raise DataError(
+                "cannot open a Rerun window: there is no display (DISPLAY and WAYLAND_DISPLAY are "
+                "not set); use --rerun save, or --rerun serve for a browser"
+            )
+        try:
+            self._raw.spawn()
+        except (RuntimeError, OSError) as error:
+            first = str(error).splitlines()[0]
+            raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error
+
+    def _serve(self) -> None:
+        try:
+            source = self._raw.serve_grpc(grpc_port=free_port())
+            port = free_port()
+            self.rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=source)
+        except (RuntimeError, OSError, ValueError) as error:
+            first = str(error).splitlines()[0]
+            raise DataError(f"cannot serve to browsers ({first}); use --rerun save") from error
+        self.url = f"http://localhost:{port}/?url={source.replace('+', '%2B')}"
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def require_viewer(address: str) -> None:
+    """Make sure that something listens at an address.
+
+    Raises:
+        DataError: if nothing does, or the address is none.
+    """
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or not port or not parts.scheme.startswith("rerun"):
+        raise DataError(f"{address}: no address of a viewer; one looks like {DEFAULT_ADDRESS}")
+    try:
+        socket.create_connection((host, port), _CONNECT_TIMEOUT_S).close()
+    except OSError as error:
+        raise DataError(
+            f"{address}: no Rerun viewer can be reached ({error.strerror or error}); start one "
+            "with `rerun`, or use --rerun save"
+        ) from error
+
+
+def free_port() -> int:
+    """A port of this machine that nothing listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures: one colour for one name, σ in the axes of the world, and something for every input."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import slam_graph as sg
+from slam_graph.evaluation.evaluation_report import nees_of_run
+from slam_graph.geometry.trajectory import Trajectory, interpolate
+from slam_graph.results.run_picture import PoseEstimate
+from slam_graph.visualization.bundle_picture import bundle_figure
+from slam_graph.visualization.panels import Panel, panel_figure
+from slam_graph.visualization.style import line_styles
+
+PNG = b"\x89PNG"
+
+
+def test_a_name_has_one_style_and_no_two_are_alike() -> None:
+    names = ["ekf", "mine", "msckf", "msckf_no_fej", "swf", "okvis", "a", "b", "c", "d", "e", "f"]
+    styles = line_styles(names)
+    assert sorted(styles) == sorted(names)
+    assert len({(style.color, style.dash) for style in styles.values()}) == len(names)
+    assert styles["msckf"] == line_styles(["swf", "msckf"])["msckf"]
+    assert styles["msckf_no_fej"].color == styles["msckf"].color
+
+
+def test_sigmas_are_turned_into_the_axes_of_the_world() -> None:
+    rng = np.random.default_rng(0)
+    turns = Rotation.random(4, random_state=1)
+    roots = rng.normal(size=(4, 6, 6))
+    P = roots @ roots.transpose(0, 2, 1)
+    stamps = np.arange(4) * 10**9
+    sigmas = PoseEstimate(Trajectory(stamps, np.zeros((4, 3)), turns.as_quat()), P).world_sigmas()
+    for R, covariance, row in zip(turns.as_matrix(), P, sigmas, strict=True):
+        position = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
+        yaw = np.degrees(np.sqrt((R @ covariance[:3, :3] @ R.T)[2, 2]))
+        np.testing.assert_allclose(row, [*position, yaw])
+
+
+def test_a_run_without_any_estimate_is_pictured_too(tmp_path: Path) -> None:
+    result = sg.run("demo", duration_s=0.5)
+    assert result.status == "not_initialized"
+    result.save(tmp_path)
+    assert (tmp_path / "trajectory.png").read_bytes()[:4] == PNG
+    assert sg.load_result(tmp_path).plot().png(40)[:4] == PNG
+
+
+@pytest.mark.parametrize("runs", [0, 1, 5])
+def test_bars_and_boxes_of_any_number_of_samples(runs: int) -> None:
+    rng = np.random.default_rng(0)
+    samples = {"swf": rng.uniform(1, 2, runs), "ekf": rng.uniform(90, 99, runs), "mine": np.ones(1)}
+    curve = (np.arange(3.0), np.array([1.0, np.nan, 2.0]))
+    panels = [
+        Panel("error [m]", "", samples=samples),
+        Panel("x", "y", {"swf": curve}),
+        Panel("", ""),
+    ]
+    assert panel_figure("runs", panels).png(40)[:4] == PNG
+
+
+@pytest.mark.parametrize("points", [1, 3, 500])
+def test_scenes_of_any_size_keep_their_proportions(points: int) -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.normal(size=(points, 3)) * (20.0, 5.0, 0.1)
+    scene[0] = 0.0 if points < 500 else 1e6
+    figure = bundle_figure("scene", scene, rng.normal(size=(2, 3)), {"before": np.ones(4)})
+    assert figure.png(40)[:4] == PNG
+    projections = [axes for axes in figure.axes if axes.get_xscale() == "linear"]
+    assert len(projections) == 3
+    for axes in projections:
+        assert axes.get_aspect() == 1.0
+        assert axes.get_xlabel()
+        assert axes.get_ylabel()
+        assert np.ptp(axes.get_xlim()) < 1e4, "one point far away makes the others no smaller"
+
+
+def test_errors_and_bounds_of_a_picture_are_those_of_the_nees() -> None:
+    """Without a given start the estimate is aligned, and its covariance is of what is left."""
+    flight = sg.simulate(duration_s=8.0, rate_hz=10.0, cameras=1, flight={"hover_s": 2.0})
+    result = sg.run(flight, overrides={"backend.initialization.mode": "static"})
+    result.check()
+    truth = result.groundtruth
+    assert truth is not None
+    assert not result.start_was_given
+    view = result._view()
+    for name, history in (("causal", result.history), ("smoothed", result.final_ba.history)):
+        judged, alignment = nees_of_run(truth, history, False, result.final_ba)
+        assert alignment == "yaw"
+        estimate = view.estimates[name]
+        own = np.isin(estimate.trajectory.stamps_ns, judged.stamps_ns)
+        true, _ = interpolate(truth, judged.stamps_ns)
+        error = estimate.trajectory.positions[own] - true.positions
+        R = Rotation.from_quat(estimate.trajectory.quaternions[own]).as_matrix()
+        P = R @ estimate.covariances[own, 3:, 3:] @ R.transpose(0, 2, 1)
+        nees = np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])
+        np.testing.assert_allclose(nees, judged.position, rtol=1e-6)

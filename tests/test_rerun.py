@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings for Rerun, read back by Rerun: what is promised is in them, at its times."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from flight import rig
+from map_flights import World
+from pose_graphs import laps
+from rerun.chunk import RrdReader
+from typer.testing import CliRunner
+
+import slam_graph as sg
+from slam_graph.bundle_adjustment import adjust_bundle, read_bal
+from slam_graph.cli.main import app
+from slam_graph.errors import DataError
+from slam_graph.pose_graph import optimize_pose_graph
+from slam_graph.results import RunResult
+from slam_graph.visualization import RerunRecording
+
+DURATION_S = 6.0
+TIMELINES = {"frame", "sensor_time"}
+
+OF_A_RUN = {
+    *("/world/path/causal", "/world/path/smoothed", "/world/path/groundtruth", "/world/gravity"),
+    *("/world/body", "/world/body/position_sigma", "/world/features", "/world/map/points"),
+    *("/world/window", "/world/body/cam0", "/world/body/cam0/features", "/world/body/cam0/tails"),
+    *("/world/body/cam0/residuals", "/world/body/cam0/residuals/reprojected", "/log", "/legend"),
+    *("/state/velocity", "/state/gyro_bias", "/state/gyro_bias/bounds", "/state/accel_bias"),
+    *("/state/accel_bias/bounds", "/imu/gyro", "/imu/accel", "/error/position"),
+    *("/error/position/bounds", "/error/orientation", "/consistency/nees", "/consistency/nis"),
+    *("/work/milliseconds", "/work/backend", "/work/counts", "/work/rejected", "/work/cost"),
+    *("/window/graph/variables", "/window/graph/projections", "/window/graph/prior"),
+    *("/window/before/matrix", "/window/after/matrix"),
+}
+
+
+@dataclass
+class Content:
+    """What is in a recording.
+
+    Attributes:
+        rows: of each entity.
+        static: entities that hold for all times.
+        timelines: all that there are.
+        components: of each entity.
+        layouts: names of the views and containers of each layout that was sent.
+    """
+
+    rows: Counter[str] = field(default_factory=Counter)
+    static: set[str] = field(default_factory=set)
+    timelines: set[str] = field(default_factory=set)
+    components: dict[str, set[str]] = field(default_factory=dict)
+    layouts: list[set[str]] = field(default_factory=list)
+
+    @property
+    def entities(self) -> set[str]:
+        return set(self.rows) | self.static
+
+    def has_layout(self, *names: str) -> bool:
+        """Whether one of the layouts has all of these."""
+        return any(layout >= set(names) for layout in self.layouts)
+
+
+def content(path: Path) -> Content:
+    """Everything in a recording."""
+    reader, found = RrdReader(path), Content()
+    for chunk in reader.stream():
+        entity = str(chunk.entity_path)
+        batch = chunk.to_record_batch()
+        found.components.setdefault(entity, set()).update(batch.schema.names)
+        if chunk.is_static:
+            found.static.add(entity)
+        else:
+            found.rows[entity] += chunk.num_rows
+            found.timelines |= set(chunk.timeline_names)
+    for blueprint in reader.blueprints():
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+        columns = [
+            b.column(n) for b in batches for n in b.schema.names if n.endswith("display_name")
+        ]
+        found.layouts.append({text for c in columns for row in c.to_pylist() for text in row or ()})
+    return found
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Content]:
+    """A short run that was watched in all detail."""
+    path = tmp_path_factory.mktemp("rerun") / "recording.rrd"
+    viewer = RerunRecording("save", "flight", path).viewer(detail="graph")
+    sequence = sg.simulate(trajectory="figure8", duration_s=DURATION_S, seed=1)
+    logger = logging.getLogger("slam_graph")
+    level = logger.level
+    logger.setLevel(logging.INFO)  # as the command line has it
+    result = sg.run(sequence, viewer=viewer)
+    logger.setLevel(level)
+    assert not result.warnings["viewer_failed"]
+    return result, content(path)
+
+
+def test_a_run_has_everything_that_is_promised(watched: tuple[RunResult, Content]) -> None:
+    _, found = watched
+    assert found.entities >= OF_A_RUN
+    assert found.timelines == TIMELINES
+
+
+def test_a_path_is_one_entity_with_a_piece_for_each_frame(
+    watched: tuple[RunResult, Content],
+) -> None:
+    result, found = watched
+    states = len(result.trajectory)
+    assert found.rows["/world/path/causal"] == states
+    assert found.rows["/world/body"] == states
+    assert result.smoothed is not None
+    assert found.rows["/world/path/smoothed"] == len(result.smoothed) - 1
+    assert found.rows["/window/before/matrix"] == states
+    assert len([entity for entity in found.entities if "/path/" in entity]) == 3
+
+
+def test_the_layout_has_space_cameras_plots_and_window(
+    watched: tuple[RunResult, Content],
+) -> None:
+    _, found = watched
+    views = ("Run", "cam0", "Window", "Factor graph of the window", "Legend", "Log")
+    plots = ("velocity [m/s]", "gyro bias [rad/s]", "time [ms]", "NIS / degrees of freedom")
+    assert len(found.layouts) == 2
+    assert found.has_layout(*views, *plots), "during the run"
+    assert found.has_layout(*views, *plots, "position error [m]", "NEES"), "at its end"
+
+
+def test_a_result_that_was_not_watched_is_shown_from_its_files(
+    watched: tuple[RunResult, Content], tmp_path: Path
+) -> None:
+    result, _ = watched
+    result.save(tmp_path / "run")
+    found = viewed(tmp_path, tmp_path / "run")
+    paths = {f"/world/path/{name}" for name in ("causal", "smoothed", "groundtruth")}
+    plots = {"/state/velocity", "/state/gyro_bias/bounds", "/error/position", "/work/milliseconds"}
+    assert found.entities >= paths | plots | {"/world/map/points", "/world/body", "/legend"}
+    assert found.timelines == TIMELINES
+    assert found.rows["/world/path/causal"] == len(result.trajectory) - 1
+    both = viewed(tmp_path, tmp_path / "run", tmp_path / "run")
+    name = result.config.algorithm.name
+    assert both.has_layout("Paths", "position error [m]", "Summary")
+    assert len([entity for entity in both.entities if entity.startswith(f"/paths/{name}")]) == 2
+
+
+def viewed(tmp_path: Path, *what: Path) -> Content:
+    """What `slam-graph view` saves."""
+    path = tmp_path / "viewed.rrd"
+    done = CliRunner().invoke(app, ["view", *map(str, what), "--output", str(path)])
+    assert done.exit_code == 0, done.exception
+    return content(path)
+
+
+@pytest.mark.parametrize(("images", "frames"), [("none", 0), ("keyframes", 3), ("all", 13)])
+def test_images_are_sent_of_the_frames_that_are_asked_for(
+    images: str, frames: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "recording.rrd"
+    viewer = RerunRecording("save", "images", path).viewer(images)
+    sequence = sg.simulate(
+        trajectory="figure8", kind="images", duration_s=1.2, rate_hz=10.0, cameras=1
+    )
+    sg.run(sequence, viewer=viewer, final_ba={"enabled": False})
+    found = content(path)
+    assert found.rows["/world/body/cam0/features"] == 13
+    assert found.rows["/world/body/cam0/image"] == frames
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_pose_graph_is_shown_before_and_after(dimension: int, tmp_path: Path) -> None:
+    graph, _ = laps(dimension, noise=0.01)
+    solution = optimize_pose_graph(graph)
+    with RerunRecording("save", "graph", tmp_path / "graph.rrd") as recording:
+        recording.show_pose_graph(solution)
+    found = content(tmp_path / "graph.rrd")
+    for stage in ("before", "after"):
+        parts = {f"/{stage}/{kind}" for kind in ("odometry", "loop_closures", "poses")}
+        assert found.static >= parts
+        loops = int(np.count_nonzero(~graph.is_odometry))
+        assert found.rows[f"/residuals/{stage}/loop_closures"] == loops
+    assert found.timelines == {"edge"}
+    assert found.has_layout("Before", "After", "log10 χ² of each edge", "Summary")
+
+
+def test_graph_files_are_shown_as_they_are(tmp_path: Path) -> None:
+    graph, _ = laps(3, noise=0.01)
+    file = tmp_path / "laps.g2o"
+    file.write_text("".join(optimize_pose_graph(graph).g2o_lines()))
+    assert viewed(tmp_path, file).entities >= {"/before/poses", "/after/poses"}
+
+
+def test_a_bundle_adjustment_is_shown_before_and_after(tmp_path: Path) -> None:
+    file = Path(gtsam.__file__).parent / "Data" / "dubrovnik-3-7-pre.txt"
+    with RerunRecording("save", "bundle", tmp_path / "bundle.rrd") as recording:
+        recording.show_bundle(adjust_bundle(read_bal(file)))
+    found = content(tmp_path / "bundle.rrd")
+    for stage in ("before", "after"):
+        assert found.static >= {f"/{stage}/points", f"/{stage}/cameras", f"/errors/{stage}"}
+    assert found.has_layout("Before", "After", "Errors before [px]", "Errors after [px]")
+    problem = viewed(tmp_path, file)
+    assert "/before/points" in problem.static
+    assert "/after/points" not in problem.static
+
+
+def test_a_map_is_shown(tmp_path: Path) -> None:
+    content_of_map = World().map()
+    sg.save_map(content_of_map, tmp_path / "map.slam")
+    found = viewed(tmp_path, tmp_path / "map.slam")
+    assert found.static >= {"/map/points", "/map/recordings/0", "/map/recordings/0/keyframes"}
+
+
+def test_a_recording_is_shown_as_it_is(tmp_path: Path) -> None:
+    sg.simulate(trajectory="figure8", duration_s=1.0).save(tmp_path / "flight")
+    found = viewed(tmp_path, tmp_path / "flight")
+    assert found.entities >= {"/imu/gyro", "/imu/accel", "/world/body/cam0/features"}
+    assert "/world/path/groundtruth" in found.entities
+    assert found.timelines == TIMELINES
+
+
+def refused(*arguments: str | Path) -> str:
+    """The error of a command that cannot be done."""
+    done = CliRunner().invoke(app, ["view", *map(str, arguments)])
+    assert done.exit_code != 0
+    assert done.exception is not None
+    return str(done.exception) if isinstance(done.exception, sg.SlamGraphError) else done.output
+
+
+def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(DataError, match="no display"):
+        RerunRecording("spawn", "name")
+    with pytest.raises(DataError, match="no Rerun viewer can be reached"):
+        RerunRecording("connect", "name", address="rerun+http://127.0.0.1:9/proxy")
+    with pytest.raises(DataError, match="no address of a viewer"):
+        RerunRecording("connect", "name", address="localhost")
+    with pytest.raises(DataError, match="cannot be written"):
+        RerunRecording("save", "name", tmp_path / "nowhere" / "recording.rrd")
+    assert "no such file" in refused(tmp_path / "missing.rrd", "--rerun", "serve")
+    assert "no such file" in refused(tmp_path / "missing")
+    assert "ends with .rrd" in refused("demo", "--output", tmp_path / "file.txt")
+    assert "not of the form WxH" in refused("demo", "--size", "big")
+
+
+@pytest.mark.parametrize("call", ["open", "show", "finish"])
+def test_a_viewer_that_fails_does_not_end_the_run(call: str, tmp_path: Path) -> None:
+    viewer = RerunRecording("save", "flight", tmp_path / "recording.rrd").viewer()
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("the window was closed")
+
+    setattr(viewer, call, fail)
+    sequence = sg.simulate(trajectory="figure8", duration_s=2.0)
+    result = sg.run(sequence, viewer=viewer, final_ba={"enabled": False})
+    assert result.status == "ok"
+    assert result.warnings["viewer_failed"] == 1
+
+
+def test_an_estimator_tells_which_features_move_by_themselves() -> None:
+    estimator = sg.Estimator(rig(), sg.load_config().algorithm)
+    assert len(estimator.dynamic) == 0
+    estimator._standstill.add_dynamic(np.array([7, 3]))
+    assert estimator.dynamic.tolist() == [3, 7]
+
+
+def drivers() -> Iterator[Path]:
+    for folder in ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d"):
+        yield from Path(folder).glob("*.json")
+
+
+def viewers_of(name: str) -> list[Path]:
+    """Processes of viewers that show a recording of this name."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = process.read_bytes()
+        except OSError:
+            continue  # it has just ended
+        if b"--headless" in words and f"/{name}.rrd".encode() in words:
+            found.append(process)
+    return found
+
+
+@pytest.fixture
+def graph_file(tmp_path: Path) -> Path:
+    graph, _ = laps(2, noise=0.01)
+    file = tmp_path / f"{tmp_path.parent.name}_pictured.g2o"
+    file.write_text("".join(optimize_pose_graph(graph).g2o_lines()))
+    return file
+
+
+@pytest.mark.skipif(not list(drivers()), reason="no Vulkan driver")
+def test_a_picture_is_made_without_a_display(graph_file: Path, tmp_path: Path) -> None:
+    import cv2
+
+    picture = tmp_path / "picture.png"
+    arguments = ["view", str(graph_file), "--screenshot", str(picture), "--size", "640x400"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.exception
+    image = cv2.imread(str(picture))
+    assert image is not None
+    assert image.shape == (400, 640, 3)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100, "something is drawn"
+    assert not viewers_of(graph_file.stem), "the viewer has ended"
+
+
+def test_without_a_driver_the_error_says_so(
+    graph_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setenv(variable, "/nonexistent")
+    monkeypatch.setenv("LIBGL_DRIVERS_PATH", "/nonexistent")
+    said = refused(graph_file, "--screenshot", tmp_path / "picture.png")
+    assert "Vulkan driver" in said
+    assert not (tmp_path / "picture.png").exists()

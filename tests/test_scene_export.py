@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Exports for COLMAP and nerfstudio: what OpenCV projects by them is what was observed."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import slam_graph as sg
+from slam_graph.cli.main import app
+from slam_graph.errors import ConfigError, DataError
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four seconds of rendered images of one camera, as a recording."""
+    folder = tmp_path_factory.mktemp("scene") / "flight"
+    sg.simulate(kind="images", duration_s=4.0, rate_hz=8.0, cameras=1, seed=3).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(flight: Path) -> Path:
+    """A run on it that saved a map."""
+    folder = flight.parent / "result"
+    found = sg.run(flight, overrides={"map.enabled": True})
+    found.check()
+    found.save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(flight: Path, result: Path) -> Path:
+    folder = flight.parent / "scene"
+    sg.load_result(result).export(folder, sg.open_dataset(flight))
+    return folder
+
+
+def rows(path: Path) -> list[list[str]]:
+    lines = path.read_text().splitlines()
+    return [line.split() for line in lines if not line.startswith("#")]
+
+
+def test_the_model_of_colmap_projects_to_what_was_observed(scene: Path, result: Path) -> None:
+    model = scene / "sparse" / "0"
+    ((_, name, *numbers),) = rows(model / "cameras.txt")
+    assert name == "OPENCV"
+    fx, fy, cx, cy, *distortion = map(float, numbers[2:])
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    points = {int(row[0]): np.array(row[1:4], float) for row in rows(model / "points3D.txt")}
+    tracks = {int(row[0]): row[8:] for row in rows(model / "points3D.txt")}
+    images = rows(model / "images.txt")
+    known = sg.load_result(result).slam_map
+    assert known is not None
+    assert sum(len(seen) > 0 for seen in images[1::2]) == len(known) > 2
+    assert len(images) > 2 * len(known)
+    errors, observations = [], 0
+    for head, seen in zip(images[::2], images[1::2], strict=True):
+        qw, qx, qy, qz, *t = map(float, head[1:8])
+        angle = 2 * np.arctan2(np.linalg.norm([qx, qy, qz]), qw)
+        axis = np.array([qx, qy, qz]) / max(np.linalg.norm([qx, qy, qz]), 1e-12)
+        assert cv2.imread(str(scene / "images" / head[9])).shape == (480, 752, 3)
+        if not seen:
+            continue
+        table = np.array(seen, float).reshape(-1, 3)
+        observations += len(table)
+        X = np.array([points[int(number)] for number in table[:, 2]])
+        pixels = cv2.projectPoints(X, angle * axis, np.array(t), K, np.array(distortion))[0]
+        errors += np.linalg.norm(pixels[:, 0] - table[:, :2], axis=1).tolist()
+        number, row = head[0], len(table) - 1
+        pairs = np.array(tracks[int(table[row, 2])]).reshape(-1, 2).tolist()
+        assert [number, str(row)] in pairs
+    assert sum(len(track) for track in tracks.values()) == 2 * observations
+    assert np.median(errors) < 1.0
+
+
+def test_nerfstudio_has_the_same_cameras(scene: Path) -> None:
+    table = json.loads((scene / "transforms.json").read_text())
+    heads = rows(scene / "sparse" / "0" / "images.txt")[::2]
+    assert [f["file_path"] for f in table["frames"]] == [f"images/{head[9]}" for head in heads]
+    for frame, head in zip(table["frames"], heads, strict=True):
+        pose = np.array(frame["transform_matrix"])
+        qw, qx, qy, qz, *t = map(float, head[1:8])
+        R = cv2.Rodrigues(pose[:3, :3] @ np.diag([1.0, -1.0, -1.0]))[0]
+        np.testing.assert_allclose(pose[:3, 3], -(_turn(qw, qx, qy, qz).T @ t), atol=1e-9)
+        np.testing.assert_allclose(cv2.Rodrigues(R)[0], _turn(qw, qx, qy, qz).T, atol=1e-9)
+    assert (scene / table["ply_file_path"]).read_bytes().startswith(b"ply\n")
+
+
+def _turn(w: float, x: float, y: float, z: float) -> np.ndarray:
+    """The matrix of a unit quaternion."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_without_a_map_keyframes_are_chosen_by_motion(
+    flight: Path, result: Path, tmp_path: Path
+) -> None:
+    for file in result.iterdir():
+        if file.is_file() and file.name != "map.slam":
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    saved = sg.load_result(tmp_path)
+    assert saved.slam_map is None
+    saved.export(tmp_path / "scene", sg.open_dataset(flight), ["nerfstudio"])
+    frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
+    centres = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in frames])
+    assert 5 < len(frames) < 32
+    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 1.0
+    assert not (tmp_path / "scene" / "sparse").exists()
+
+
+def test_the_command_writes_what_is_asked_for(flight: Path, result: Path, tmp_path: Path) -> None:
+    def call(*words: object) -> tuple[int, str, BaseException | None]:
+        done = CliRunner().invoke(app, ["export", str(result), *map(str, words)])
+        return done.exit_code, done.output, done.exception
+
+    files = {name: tmp_path / f"poses.{name}" for name in ("tum", "kitti", "euroc")}
+    options = [word for name, path in files.items() for word in (f"--{name}", path)]
+    code, printed, _ = call(*options, "--which", "causal")
+    assert code == 0
+    assert printed.split() == [str(path) for path in files.values()]
+    causal = sg.load_result(result).trajectory
+    assert all(len(rows(path)) == len(causal) for path in files.values())
+    code, _, _ = call("--colmap", tmp_path / "c", "--recording", flight)
+    assert code == 0
+    assert (tmp_path / "c" / "sparse" / "0" / "points3D.txt").is_file()
+    assert isinstance(call()[2], ConfigError)
+    assert isinstance(call("--colmap", tmp_path / "d")[2], ConfigError)
+    assert isinstance(call("--tum", tmp_path / "e", "--which", "loop")[2], DataError)
+    assert isinstance(call("--colmap", tmp_path / "d", "--recording", "demo")[2], DataError)
