@@ -181,7 +181,8 @@ def _echo(rows: list[_Row]) -> None:
     wrong = [row for row in rows if row["status"] != "ok"]
     typer.echo("")
     for row in wrong[:_MOST_REASONS]:
-        typer.echo(f"  {row['name']}: {row['message'] or row['status']}")
+        reason = (row["message"] or row["status"]).removeprefix(f"{row['name']}: ")
+        typer.echo(f"  {row['name']}: {reason}")
     if len(wrong) > _MOST_REASONS:
         typer.echo(f"  and {len(wrong) - _MOST_REASONS} more, in summary.csv")
 

@@ -64,7 +64,8 @@ class BatchProgress:
         self._failed += failure is not None
         self._over.add(name)
         self._parts.pop(name, None)
-        line = f"{count}/{total} {name}" + ("" if failure is None else f": failed: {failure}")
+        reason = "" if failure is None else failure.removeprefix(f"{name}: ")
+        line = f"{count}/{total} {name}" + (f": failed: {reason}" if reason else "")
         if self._live is None:
             typer.echo(line, err=True)
         elif failure is not None:

@@ -129,7 +129,9 @@ def executor_for(workers: int | None, scheduler: str | None) -> Executor:
     if scheduler is None:
         return LocalProcesses(workers)
     if workers is not None:
-        raise ConfigError("workers is for this machine; a Dask cluster has its own: give only one")
+        raise ConfigError(
+            "a number of processes is for this machine, a Dask cluster has its own; give only one"
+        )
     return DaskCluster(scheduler)
 
 
