@@ -19,7 +19,8 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.experiment.comparison_plan import Comparison, load_configs, run_tasks
 from slam_graph.experiment.comparison_results import Table, read_result
 from slam_graph.experiment.executors import LocalProcesses
-from slam_graph.experiment.tasks import HASH_LENGTH, RunTask, Source
+from slam_graph.experiment.settings_hash import HASH_LENGTH
+from slam_graph.experiment.tasks import RunTask, Source
 
 RESULTS = Path("results/benchmarks")
 

@@ -34,6 +34,7 @@ __all__ = [
     "__version__",
     "adjust_bundle",
     "ape",
+    "batch",
     "build_frontend",
     "certify",
     "close_loops",
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets import dataset_from_arrays, open_dataset, read_groundtruth
     from slam_graph.errors import SlamGraphError
     from slam_graph.evaluation import ape, rpe
-    from slam_graph.experiment import compare
+    from slam_graph.experiment import batch, compare
     from slam_graph.frontend import build_frontend
     from slam_graph.geometry import NavState, StateHistory, Trajectory
     from slam_graph.loop_closure import close_loops
@@ -81,7 +82,7 @@ else:
             "datasets": ("dataset_from_arrays", "open_dataset", "read_groundtruth"),
             "errors": ("SlamGraphError",),
             "evaluation": ("ape", "rpe"),
-            "experiment": ("compare",),
+            "experiment": ("batch", "compare"),
             "frontend": ("build_frontend",),
             "geometry": ("NavState", "StateHistory", "Trajectory"),
             "loop_closure": ("close_loops",),

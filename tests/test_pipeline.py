@@ -46,6 +46,7 @@ class Watcher:
     def __init__(self) -> None:
         self.calls: list[str] = []
         self.stamps: list[int] = []
+        self.adjusted: list[float] = []
 
     def open(self, *_: object) -> None:
         self.calls.append("open")
@@ -66,7 +67,7 @@ class Watcher:
         self.stamps.append(stamp_ns)
 
     def adjusting(self, done: int, keyframes: int, steps: int) -> None:
-        assert 0 <= done < keyframes
+        self.adjusted.append(done / keyframes)
 
 
 def test_the_same_seed_gives_the_same_trajectory_and_all_are_told() -> None:
@@ -79,6 +80,9 @@ def test_the_same_seed_gives_the_same_trajectory_and_all_are_told() -> None:
     assert watcher.calls == ["open", *["write", "show"] * first.logs.frames, "finish", "close"]
     assert watcher.stamps == sorted(watcher.stamps)
     assert len(watcher.stamps) == first.logs.frames
+    assert watcher.adjusted == sorted(watcher.adjusted), "the final bundle adjustment went back"
+    assert len(set(watcher.adjusted)) > 2, "it moves"
+    assert watcher.adjusted[-1] < 1.0
     stages = first.metrics["timing"]["stages"]
     assert {"read", "frontend", "backend", "total"} <= stages.keys()
     assert stages["total"]["mean_ms"] >= stages["backend"]["mean_ms"]

@@ -71,7 +71,7 @@ def fault_of(line: str) -> str:
     if shown.exit_code != 0:
         return f"no command {command}"
     options = [word for word in words if word.startswith("-")]
-    unknown = [word for word in options if not re.search(rf"(^|\s){word}\b", shown.stdout)]
+    unknown = [word for word in options if not re.search(rf"(^|[\s,]){word}\b", shown.stdout)]
     return f"no option {unknown}" if unknown else ""
 
 

@@ -242,7 +242,7 @@ def test_the_noise_of_the_imu_is_found_from_the_residuals(scale: float, tmp_path
     truth = sequence.groundtruth()
     stamps_ns = segment.keyframe_stamps_ns
     states = states_at(truth, stamps_ns, segment.imu, task.preintegration)
-    problem = BundleAdjustment(SegmentStart(segment, states, 0), task, lambda _: None)
+    problem = BundleAdjustment(SegmentStart(segment, states, 0), task, lambda *_: None)
     problem.solve()
     found = problem.imu_noise
     np.testing.assert_allclose([found.gyro, found.accel], scale, rtol=0.25)

@@ -37,7 +37,7 @@ def echo_table(rows: Iterable[Sequence[str]], indent: str = "") -> None:
 _WIDTH = 100
 """Tables are no wider, also where the output is no terminal."""
 
-_TEXT_COLUMNS = ("algorithm", "status")
+_TEXT_COLUMNS = ("recording", "algorithm", "status")
 
 
 def echo_rich_table(
@@ -91,11 +91,18 @@ class _ListHandler(logging.Handler):
         self.lines.append(self.format(record) + "\n")
 
 
+class _WarningHandler(logging.Handler):
+    """Prints warnings on stderr as it is at that time: above a bar, if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        typer.echo(self.format(record), err=True)
+
+
 @contextmanager
 def collected_log() -> Iterator[list[str]]:
     """Collect what the package logs, and show its warnings on stderr."""
     lines: list[str] = []
-    shown = logging.StreamHandler(sys.stderr)
+    shown = _WarningHandler()
     shown.addFilter(lambda record: record.levelno == logging.WARNING)
     shown.setFormatter(logging.Formatter("warning: %(message)s"))
     logger = logging.getLogger("slam_graph")
@@ -111,12 +118,11 @@ def collected_log() -> Iterator[list[str]]:
 
 
 _BAR_WIDTH = 28
-_TERMINAL_PERIOD_S = 0.1
 _LOG_PERIOD_S = 10.0
 
 
 class ProgressBar:
-    """Reports frames a second and the real-time factor; used as a context manager.
+    """Reports how far a run is, and for how long it will go on; used as a context manager.
 
     Args:
         start_ns: time of the first frame that is asked for.
@@ -126,13 +132,12 @@ class ProgressBar:
     def __init__(self, start_ns: int, end_ns: int) -> None:
         self._start_ns = start_ns
         self._length_ns = max(end_ns - start_ns, 1)
-        self._terminal = sys.stderr.isatty()
-        self._period_s = _TERMINAL_PERIOD_S if self._terminal else _LOG_PERIOD_S
-        self._began = self._shown = time.monotonic()
+        self._shown = _Bars() if sys.stderr.isatty() else _Lines()
+        self._began = time.monotonic()
         self._frames = 0
-        self._line = ""
 
     def __enter__(self) -> Self:
+        self._shown.start()
         return self
 
     def __exit__(
@@ -141,46 +146,114 @@ class ProgressBar:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._terminal and self._line:
-            sys.stderr.write("\r" + self._line + "\n")
-            sys.stderr.flush()
+        self._shown.stop(complete=kind is None)
 
     def advance(self, stamp_ns: int, initialized: bool) -> None:
-        """Count a frame, and refresh the line if it is due."""
+        """Count a frame."""
         self._frames += 1
-        now = time.monotonic()
-        self._line = self._text(stamp_ns - self._start_ns, now - self._began, initialized)
-        if now - self._shown < self._period_s:
-            return
-        self._shown = now
-        sys.stderr.write(f"\r{self._line}" if self._terminal else f"{self._line}\n")
-        sys.stderr.flush()
+        done_ns = stamp_ns - self._start_ns
+        elapsed_s = max(time.monotonic() - self._began, 1e-9)
+        self._shown.show(
+            "frames",
+            min(max(done_ns / self._length_ns, 0.0), 1.0),
+            f"{self._frames} frames, {self._frames / elapsed_s:.0f} frames/s, "
+            f"{done_ns * 1e-9 / elapsed_s:.1f} x real time"
+            + ("" if initialized else ", initialising"),
+        )
 
     def adjusting(self, done: int, keyframes: int, steps: int) -> None:
         """Show the progress of the final bundle adjustment."""
+        self._shown.show("final BA", done / keyframes, f"{keyframes} keyframes, step {steps}")
+
+
+class _Lines:
+    """A line every few seconds, for a log."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+        self._began: dict[str, float] = {}
+
+    def start(self) -> None:
+        """Print nothing yet."""
+
+    def show(self, name: str, part: float, text: str) -> None:
+        """Print a line if it is due.
+
+        Args:
+            name: of what is being done.
+            part: of it that is done.
+            text: what else there is to say.
+        """
         now = time.monotonic()
-        if now - self._shown < self._period_s:
+        began = self._began.setdefault(name, now)
+        if now - self._last < _LOG_PERIOD_S:
             return
-        self._shown = now
-        bar = _bar(done / keyframes) if self._terminal else ""
-        text = f"{bar}final BA: {done} of {keyframes} keyframes done, step {steps}"
-        sys.stderr.write(f"\r{text:<90}" if self._terminal else f"{text}\n")
+        self._last = now
+        left = f", {(now - began) * (1.0 - part) / part:.0f} s left" if part > 0.0 else ""
+        typer.echo(f"{name} {part:4.0%} {text}{left}", err=True)
+
+    def stop(self, complete: bool) -> None:
+        """Print nothing more."""
+
+
+class _Bars:
+    """A bar for each part of a run, for a terminal, with the time that is left."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskID,
+            TaskProgressColumn,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(_BAR_WIDTH),
+            TaskProgressColumn(),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+            TextColumn("{task.fields[text]}", markup=False),
+            console=Console(stderr=True),
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def start(self) -> None:
+        """Begin to draw."""
+        self._progress.start()
+
+    def show(self, name: str, part: float, text: str) -> None:
+        """Move a bar; arguments as for `_Lines.show`."""
+        if name not in self._tasks:
+            self._freeze()
+            self._tasks[name] = self._progress.add_task(name, total=1.0, text=text)
+        self._progress.update(self._tasks[name], completed=part, text=text)
+
+    def stop(self, complete: bool) -> None:
+        """Leave the last state on the screen; the last bar is full if all went well."""
+        if complete and self._tasks:
+            self._progress.update(list(self._tasks.values())[-1], completed=1.0)
+        self._freeze()
+        self._progress.stop()
+
+    def _freeze(self) -> None:
+        """Stop the clocks of the bars so far."""
+        for task in self._tasks.values():
+            self._progress.stop_task(task)
+
+
+@contextmanager
+def notice(text: str) -> Iterator[None]:
+    """Say in a terminal what is going on, until there is more to say: imports take a while."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    sys.stderr.write(f"{text} …\r")
+    sys.stderr.flush()
+    try:
+        yield
+    finally:
+        sys.stderr.write("\x1b[2K")
         sys.stderr.flush()
-
-    def _text(self, done_ns: int, elapsed_s: float, initialized: bool) -> str:
-        """The line."""
-        part = min(max(done_ns / self._length_ns, 0.0), 1.0)
-        rate = self._frames / max(elapsed_s, 1e-9)
-        factor = done_ns * 1e-9 / max(elapsed_s, 1e-9)
-        bar = _bar(part) if self._terminal else ""
-        state = "" if initialized else ", initialising"
-        return (
-            f"{bar}{part:4.0%} {self._frames} frames, {rate:.0f} frames/s, "
-            f"{factor:.1f} x real time{state:<14}"
-        ).rstrip() + (" " * 4 if self._terminal else "")
-
-
-def _bar(part: float) -> str:
-    """A bar of which a part is filled."""
-    filled = round(part * _BAR_WIDTH)
-    return f"[{'#' * filled}{'.' * (_BAR_WIDTH - filled)}] "

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets import Sequence
 
 app = typer.Typer(
-    help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode=None
+    help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode="rich"
 )
 
 

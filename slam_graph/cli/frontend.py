@@ -52,7 +52,7 @@ app = typer.Typer(
     cls=_RunByDefault,
     help="Run the front end alone and look at its tracks: `frontend DATA` is `frontend run DATA`.",
     no_args_is_help=True,
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
 )
 
 

@@ -17,6 +17,7 @@ from typing import Annotated
 import typer
 
 from slam_graph.cli import (
+    batch,
     compare,
     data_commands,
     evaluate,
@@ -29,6 +30,7 @@ from slam_graph.cli import (
     view,
 )
 from slam_graph.cli.console import echo_json
+from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
 from slam_graph.errors import SlamGraphError
 from slam_graph.version import __version__
@@ -38,7 +40,7 @@ from slam_graph.version import __version__
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 config_app = typer.Typer(
-    help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode=None
+    help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode="rich"
 )
 
 
@@ -77,11 +79,13 @@ def check(
 app = typer.Typer(
     help="Factor-graph SLAM: a recorded sequence in, a trajectory out.",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
+    epilog=example_text(""),
+    cls=SuggestingGroup,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
 app.command("run")(run.run)
+app.command("batch")(batch.batch)
 app.command("localize")(map.localize)
 app.add_typer(map.app, name="map")
 app.command("ape")(evaluate.ape)
@@ -94,6 +98,7 @@ app.command("view")(view.view)
 app.add_typer(frontend.app, name="frontend")
 app.add_typer(data_commands.app, name="data")
 app.add_typer(config_app, name="config")
+add_examples(app)
 
 
 def _print_version(wanted: bool) -> None:

@@ -114,7 +114,9 @@ def localize(
     )
 
 
-app = typer.Typer(help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    help="Show, export and merge maps.", no_args_is_help=True, rich_markup_mode="rich"
+)
 
 _MapPath = Annotated[
     Path, typer.Argument(metavar="MAP", help="Map file, or the folder of a run with one.")

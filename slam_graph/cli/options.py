@@ -13,21 +13,40 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import typer
 from pydantic import BaseModel
 
+from slam_graph.cli.console import notice
+
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
     from slam_graph.datasets import RecordedSequence
 
 
+_SETTINGS, _RECORDING, _VIEWER = "Settings", "Recording", "Rerun"
+"""Panels of the help."""
+
 ConfigFile = Annotated[
     Path | None,
-    typer.Option("--config", help="YAML file of settings, which replace the defaults."),
+    typer.Option(
+        "--config",
+        help="YAML file of settings, which replace the defaults.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change one setting; may be repeated.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Algorithm = Annotated[
-    str | None, typer.Option("--algorithm", help="Name of an algorithm, or its YAML file.")
+    str | None,
+    typer.Option(
+        "--algorithm",
+        help="Name of an algorithm, or its YAML file.",
+        rich_help_panel=_SETTINGS,
+    ),
 ]
 Data = Annotated[
     str,
@@ -37,13 +56,26 @@ Data = Annotated[
     ),
 ]
 Format = Annotated[
-    str | None, typer.Option("--format", help="Format of the data; detected by default.")
+    str | None,
+    typer.Option(
+        "--format", help="Format of the data; detected by default.", rich_help_panel=_RECORDING
+    ),
 ]
 Calibration = Annotated[
-    Path | None, typer.Option("--calibration", help="Kalibr YAML to use instead of the data's.")
+    Path | None,
+    typer.Option(
+        "--calibration",
+        help="Kalibr YAML to use instead of the data's.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Groundtruth = Annotated[
-    Path | None, typer.Option("--groundtruth", help="True trajectory to use instead of the data's.")
+    Path | None,
+    typer.Option(
+        "--groundtruth",
+        help="True trajectory to use instead of the data's.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Sources = Annotated[
     list[str] | None,
@@ -54,17 +86,29 @@ Sources = Annotated[
         help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
         "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
         "rate=30 instead of stamps.",
+        rich_help_panel=_RECORDING,
     ),
 ]
 Cameras = Annotated[
     str | None,
-    typer.Option("--cameras", metavar="mono|stereo|N", help="Cameras to use; all by default."),
+    typer.Option(
+        "--cameras",
+        metavar="mono|stereo|N",
+        help="Cameras to use; all by default.",
+        rich_help_panel=_RECORDING,
+    ),
 ]
 Start = Annotated[
-    float | None, typer.Option("--start", help="Seconds after the first frame to start at.")
+    float | None,
+    typer.Option(
+        "--start", help="Seconds after the first frame to start at.", rich_help_panel=_RECORDING
+    ),
 ]
 Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds to run; to the end by default.")
+    float | None,
+    typer.Option(
+        "--duration", help="Seconds to run; to the end by default.", rich_help_panel=_RECORDING
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 RerunMode = Literal["off", "save", "spawn", "connect", "serve"]
@@ -78,11 +122,14 @@ Rerun = Annotated[
         "--rerun",
         help="Watch the run in Rerun: save a recording, spawn a window, connect to a viewer that "
         "is open, or serve to a browser.",
+        rich_help_panel=_VIEWER,
     ),
 ]
 RerunImages = Annotated[
     Literal["none", "keyframes", "all"],
-    typer.Option("--rerun-images", help="Of which frames Rerun is given images."),
+    typer.Option(
+        "--rerun-images", help="Of which frames Rerun is given images.", rich_help_panel=_VIEWER
+    ),
 ]
 RerunDetail = Annotated[
     Literal["normal", "graph"],
@@ -90,6 +137,7 @@ RerunDetail = Annotated[
         "--rerun-detail",
         help="graph adds the factor graph of every window, and its information matrix before and "
         "after marginalization.",
+        rich_help_panel=_VIEWER,
     ),
 ]
 RerunAddress = Annotated[
@@ -99,6 +147,7 @@ RerunAddress = Annotated[
         metavar="URL",
         help="Viewer to connect to; rerun+http://127.0.0.1:9876/proxy by default.",
         show_default=False,
+        rich_help_panel=_VIEWER,
     ),
 ]
 Progress = Annotated[
@@ -109,7 +158,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
 
-def _sources_from(texts: list[str] | None) -> dict[str, str]:
+def sources_from(texts: list[str] | None) -> dict[str, str]:
     """Where each sensor is, from texts ``sensor=where``."""
     pairs = [text.partition("=") for text in texts or []]
     for text, (sensor, _, where) in zip(texts or [], pairs, strict=True):
@@ -127,16 +176,17 @@ def open_recording(
     cameras: int | None = None,
 ) -> RecordedSequence:
     """Open the recording that the options name, with its first `cameras` cameras or all."""
-    from slam_graph.datasets import open_dataset
+    with notice(f"opening {data}"):
+        from slam_graph.datasets import open_dataset
 
-    return open_dataset(
-        data,
-        format=format_,
-        cameras=cameras,
-        calibration=calibration,
-        groundtruth=groundtruth,
-        sources=_sources_from(sources),
-    )
+        return open_dataset(
+            data,
+            format=format_,
+            cameras=cameras,
+            calibration=calibration,
+            groundtruth=groundtruth,
+            sources=sources_from(sources),
+        )
 
 
 def run_settings(
@@ -153,10 +203,11 @@ def run_settings(
         parts: whether each part of a run is enabled, by its table; None changes nothing.
         options: top-level settings; None changes nothing.
     """
-    from slam_graph.config import load_config
-
     tables = {name: {"enabled": on} for name, on in parts.items() if on is not None}
-    return load_config(config, overrides or (), **options, **tables)
+    with notice("loading"):
+        from slam_graph.config import load_config
+
+        return load_config(config, overrides or (), **options, **tables)
 
 
 _Policy = TypeVar("_Policy", bound=BaseModel)

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam_graph.cli.console import ProgressBar, collected_log, echo_json, echo_table, number
+from slam_graph.cli.console import (
+    ProgressBar,
+    collected_log,
+    echo_json,
+    echo_table,
+    notice,
+    number,
+)
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -304,8 +311,9 @@ def execute(
     graph_times: SequenceOf[int | float] = (),
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
-    from slam_graph.pipeline import run as run_pipeline
-    from slam_graph.results import ResultFolder
+    with notice("loading"):
+        from slam_graph.pipeline import run as run_pipeline
+        from slam_graph.results import ResultFolder
 
     with ResultFolder.of_run(output, sequence.info().name) as made:
         viewer = watching.viewer(made.folder / "recording.rrd", sequence.info().name, known_map)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from slam_graph.config import load_config
-from slam_graph.errors import ConfigError
 from slam_graph.experiment.comparison_plan import (
     Comparison,
     Progress,
@@ -18,7 +17,7 @@ from slam_graph.experiment.comparison_plan import (
     with_variants,
 )
 from slam_graph.experiment.comparison_report import write_report
-from slam_graph.experiment.executors import DaskCluster, Executor, LocalProcesses
+from slam_graph.experiment.executors import executor_for
 from slam_graph.experiment.tasks import find_sources
 
 _DEFAULT_ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "iekf")
@@ -84,18 +83,10 @@ def compare(
         configs = with_variants(configs)
     inputs = [data] if isinstance(data, (str, Path)) else data
     sources = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth)
-    executor = _executor(workers, scheduler)
+    executor = executor_for(workers, scheduler)
     comparison = run_tasks(sources, configs, seeds, output, executor, progress or _ignore)
     write_report(comparison)
     return comparison
-
-
-def _executor(workers: int | None, scheduler: str | None) -> Executor:
-    if scheduler is None:
-        return LocalProcesses(workers)
-    if workers is not None:
-        raise ConfigError("workers is for this machine; a Dask cluster has its own: give only one")
-    return DaskCluster(scheduler)
 
 
 def _ignore(task: str, failure: str | None, count: int, total: int) -> None:

@@ -120,6 +120,21 @@ class DaskCluster:
                 raise
 
 
+def executor_for(workers: int | None, scheduler: str | None) -> Executor:
+    """Processes on this machine, or a Dask cluster if there is an address of its scheduler.
+
+    Raises:
+        ConfigError: if both are given, or Dask is not installed.
+    """
+    if scheduler is None:
+        return LocalProcesses(workers)
+    if workers is not None:
+        raise ConfigError(
+            "a number of processes is for this machine, a Dask cluster has its own; give only one"
+        )
+    return DaskCluster(scheduler)
+
+
 def _do_in_process(task: str) -> str | None:
     """Do a task in a new process.
 

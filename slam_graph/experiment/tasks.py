@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The tasks of a comparison and their data: record tracks once, run an algorithm on them.
+"""Tasks and their data; those of a comparison: record tracks once, run an algorithm on them.
 
 A task is a JSON object and is done in a process of its own
 (`python -m slam_graph.experiment.tasks TASK`). So peak memory is that of one run, a crash does not
@@ -9,8 +9,6 @@ affect other runs, and a cluster needs no more than a shared folder.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import sys
 from collections.abc import Iterable, Mapping
@@ -22,7 +20,9 @@ from pydantic import Field, TypeAdapter
 from slam_graph.config import RunConfig
 from slam_graph.datasets import Sequence, TrackRecorder, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
+from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
+from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.frontend import build_frontend
 from slam_graph.pipeline import run
 from slam_graph.settings import ConfigTree, Settings
@@ -136,9 +136,6 @@ def _plain(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)
 
 
-HASH_LENGTH = 12
-
-
 class RecordTask(Settings):
     """Runs the front end on a sequence and writes the tracks."""
 
@@ -162,7 +159,7 @@ class RecordTask(Settings):
             mode="json", include={"frontend", "cameras", "start_s", "duration_s"}
         )
         source = self.source.model_dump(mode="json")
-        key = _settings_hash(source, config, self.seed, __version__)
+        key = settings_hash(source, config, self.seed, __version__)
         return self.root / f"{self.source.name}_seed{self.seed}_{key}"
 
     def is_done(self) -> bool:
@@ -212,7 +209,7 @@ class RunTask(Settings):
     @property
     def key(self) -> str:
         """Hash of everything that determines the result, except for the code."""
-        return _settings_hash(self.config.model_dump(mode="json"), self.tracks.name, __version__)
+        return settings_hash(self.config.model_dump(mode="json"), self.tracks.name, __version__)
 
     def is_done(self) -> bool:
         """Whether a result with exactly these settings exists."""
@@ -228,15 +225,9 @@ class RunTask(Settings):
         write_result(self.result, result, {**about, "settings_hash": self.key})
 
 
-Task = RecordTask | RunTask
+Task = RecordTask | RunTask | BatchTask
 
 _ANY_TASK: TypeAdapter[Task] = TypeAdapter(Annotated[Task, Field(discriminator="kind")])
-
-
-def _settings_hash(*values: object) -> str:
-    """A short hash of values that JSON can hold."""
-    text = json.dumps(values, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:HASH_LENGTH]
 
 
 def main() -> None:

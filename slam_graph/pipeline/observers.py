@@ -101,7 +101,7 @@ class Progress(Protocol):
         """Called after each step of the final bundle adjustment.
 
         Args:
-            done: keyframes that are adjusted already.
+            done: keyframes that the work so far amounts to; it never falls.
             keyframes: number of all keyframes.
             steps: number of steps so far.
         """

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -20,9 +20,11 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_problem import (
+    NOISE_ROUNDS,
     AdjustedSegment,
     AdjustmentFigures,
     BundleAdjustment,
@@ -48,9 +50,6 @@ _MIN_KEYFRAMES = 3
 _MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
 MAX_PIXEL_RESIDUAL = 3.0
 """Root mean square of the reprojection residuals in σ beyond which a minimum is refused."""
-
-Report = Callable[[int, int, int], None]
-"""Is given after each step: keyframes that are done, all keyframes, steps so far."""
 
 
 class _UndeterminedError(EstimationError):
@@ -158,7 +157,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             link = states[joint]
             start = _aligned(start, start[anchor], link)
         steps = sum(part.figures.iterations for part in solved)
-        progress = _progress(report, first, len(keyframes), steps)
+        own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
+        progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
         adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
         states = adjusted.states[begin:]
         if link is not None:
@@ -179,13 +179,17 @@ def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingS
 
 
 def _adjusted(
-    start: SegmentStart, task: SmoothingTask, report: Callable[[int], None]
+    start: SegmentStart, task: SmoothingTask, progress: SegmentProgress
 ) -> AdjustedSegment:
     """The minimum of a segment with fused features; if fusion fails, with the original tracks."""
     if task.config.fuse_features:
         try:
-            fused, steps = with_fused_features(start, task, report)
-            solved = BundleAdjustment(fused, task, lambda step: report(steps + step)).solve()
+            fused, steps = with_fused_features(start, task, progress.fusing)
+
+            def report(step: int, passes: int) -> None:
+                progress.solving(steps + step, passes)
+
+            solved = BundleAdjustment(fused, task, report).solve()
             _check(solved)
             figures = solved.figures
             return replace(solved, figures=replace(figures, iterations=figures.iterations + steps))
@@ -193,7 +197,7 @@ def _adjusted(
             raise
         except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
             logger.warning("features are not fused: %s", " ".join(str(error).split())[:200])
-    solved = BundleAdjustment(start, task, report).solve()
+    solved = BundleAdjustment(start, task, progress.solving).solve()
     _check(solved)
     return solved
 
@@ -216,8 +220,8 @@ def _extended_backward(
             break
         states = states_at(causal, known, segment.imu, task.preintegration)
         start = SegmentStart(segment, states, min(_STRIDE, len(known) - 1))
-        progress = _progress(report, 0, len(keyframes), 0)
-        solved = BundleAdjustment(start, task, progress).solve()
+        progress = _progress(report, (0, 0, len(keyframes)), 0, task.config)
+        solved = BundleAdjustment(start, task, progress.solving).solve()
         _check(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
         causal = _concatenated([_trajectory(earlier), causal])
@@ -262,9 +266,19 @@ def _aligned(states: list[NavState], moving: NavState, fixed: NavState) -> list[
     ]
 
 
-def _progress(report: Report, done: int, keyframes: int, steps: int) -> Callable[[int], None]:
-    """A report of the steps of a segment as those of the whole recording."""
-    return lambda step: report(done, keyframes, steps + step)
+def _progress(
+    report: Report, extent: tuple[int, int, int], steps: int, config: FinalBaConfig
+) -> SegmentProgress:
+    """A report of the steps of a segment as those of the whole recording.
+
+    Args:
+        report: of the whole recording.
+        extent: keyframes before the segment, those that it adds, and all.
+        steps: before the segment.
+        config: settings, which decide what is done.
+    """
+    passes = 2 + (NOISE_ROUNDS if config.learn_imu_noise else 0)
+    return SegmentProgress(report, *extent, steps=steps, passes=passes, fuses=config.fuse_features)
 
 
 def _stamp_ns(state: NavState) -> int:

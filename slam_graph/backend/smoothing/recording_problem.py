@@ -61,13 +61,13 @@ _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _MAX_LAMBDA = 1e5
 """Steps end when the damping of Levenberg-Marquardt exceeds this."""
-_NOISE_ROUNDS = 3
+NOISE_ROUNDS = 3
 """The noise of the IMU is estimated this many times at most, each at the minimum with the last."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
-Report = Callable[[int], None]
-"""Is given the number of steps after each."""
+Report = Callable[[int, int], None]
+"""Is given after each step: steps so far, minimisations that are complete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class BundleAdjustment:
     Args:
         start: segment, initial states and anchor.
         task: calibration and settings.
-        report: is given the number of steps after each.
+        report: is given the progress after each step.
 
     Attributes:
         iterations: Levenberg-Marquardt steps so far.
@@ -171,7 +171,7 @@ class BundleAdjustment:
         chosen = longest_tracks(seen, config.features, _MIN_KEYFRAMES)
         self._candidates = seen.subset(chosen)
         self._everything = segment.seen.subset(chosen)
-        self.iterations = 0
+        self.iterations = self._passes = 0
         self._sigma_px = backend.noise.pixel_sigma
         self._values = gtsam.Values()
         for k, state in enumerate(start.states):
@@ -228,7 +228,7 @@ class BundleAdjustment:
         The states that are reported are those under the noise that the causal run learned.
         """
         known = self._covariances()
-        for _ in range(_NOISE_ROUNDS if self._config.learn_imu_noise else 0):
+        for _ in range(NOISE_ROUNDS if self._config.learn_imu_noise else 0):
             assumed = self._factors.noise
             if known is None or not self._factors.learn_noise(
                 self._solved[0], self._values, known.pairs
@@ -354,11 +354,12 @@ class BundleAdjustment:
             self.iterations += 1
             decrease = cost - optimizer.error()
             cost = optimizer.error()
-            self._report(self.iterations)
+            self._report(self.iterations, self._passes)
             if decrease <= tolerance * cost or optimizer.lambda_() > _MAX_LAMBDA:
                 break
         if not math.isfinite(cost):
             raise EstimationError("the cost of the bundle adjustment is not finite")
+        self._passes += 1
         self._values = optimizer.values()
         self._solved = graph, ordering
         return before, cost, inertial.error(self._values)

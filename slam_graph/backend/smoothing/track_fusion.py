@@ -61,14 +61,14 @@ _SETTLED = 0.1
 
 
 def with_fused_features(
-    given: SegmentStart, task: SmoothingTask, report: Callable[[int], None]
+    given: SegmentStart, task: SmoothingTask, report: Callable[[int, int], None]
 ) -> tuple[SegmentStart, int]:
     """Fuse the features of a segment.
 
     Args:
         given: segment, initial states and anchor.
         task: calibration and settings.
-        report: is given the number of steps after each.
+        report: is given after each step: steps so far, rounds that are complete.
 
     Returns:
         The segment with fused features and the states of its keyframes after the last loose bundle
@@ -80,16 +80,16 @@ def with_fused_features(
     segment, states, anchor = given.segment, given.states, given.anchor
     chosen = np.unique([*range(anchor % _THINNING, len(states), _THINNING), 0, len(states) - 1])
     fixed = int(np.searchsorted(chosen, anchor))
-    steps = 0
+    steps = rounds = 0
 
     def adjusted(segment: RecordingSegment, states: list[NavState]) -> list[NavState]:
-        nonlocal steps
+        nonlocal steps, rounds
         before = steps
         thin = replace(segment, keyframes=segment.keyframes[chosen])
         start = SegmentStart(thin, [states[k] for k in chosen], fixed)
-        problem = BundleAdjustment(start, task, lambda n: report(before + n))
+        problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds))
         everywhere = problem.solve_loosely()
-        steps += problem.iterations
+        steps, rounds = steps + problem.iterations, rounds + 1
         return [everywhere[frame] for frame in segment.keyframes]
 
     states, own = adjusted(segment, states), np.arange(len(segment.seen.ids))

@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tasks of a batch: which recordings are meant, what each is called, and its settings."""
+
+from __future__ import annotations
+
+import glob
+import logging
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from slam_graph.config import load_config
+from slam_graph.datasets import DATASETS
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.experiment.batch_task import BatchTask
+from slam_graph.experiment.settings_hash import settings_hash
+from slam_graph.settings import ConfigTree, Settings
+
+logger = logging.getLogger(__name__)
+
+_DEMO = "demo"
+_LISTS = (".yaml", ".yml")
+_IMAGES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp"}
+"""Files of which the names only are looked at, as there are many."""
+
+
+class Entry(Settings):
+    """A recording in the list of a batch."""
+
+    data: str
+    """Path, relative to the list."""
+    name: str | None = Field(default=None, pattern=r"^\w[\w.-]*$")
+    """Name of the folder of results; that of the recording if it is left out."""
+    format: str | None = None
+    calibration: str | None = None
+    groundtruth: str | None = None
+    sources: dict[str, str] = Field(default_factory=dict)
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Settings of this recording, as in a configuration."""
+
+
+class BatchList(Settings):
+    """The file that lists the recordings of a batch."""
+
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Settings of all recordings, as in a configuration."""
+    recordings: list[Entry | str] = Field(min_length=1)
+    """Recordings, or paths of recordings."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A recording that is to be run.
+
+    Attributes:
+        entry: with absolute paths.
+        origin: where a list names it; empty if it was searched.
+        settings: of the whole list.
+    """
+
+    entry: Entry
+    origin: str
+    settings: dict[str, Any]
+
+
+def plan(
+    what: Sequence[str],
+    output: Path,
+    config: str | Path | None,
+    overrides: Sequence[str],
+    options: Mapping[str, Any],
+    common: Mapping[str, Any],
+) -> list[BatchTask]:
+    """A task for each recording.
+
+    Args:
+        what: recordings, folders and patterns that are searched for recordings, and lists.
+        output: folder of the batch, which is not searched.
+        config: YAML file of settings for all, which come before those of a list.
+        overrides: `a.b=value` for all; they come last.
+        options: top-level settings for all, which replace those of a list; None changes nothing.
+        common: `format`, `calibration` and `sources` of recordings that no list names.
+
+    Raises:
+        ConfigError: if a setting is wrong, or two recordings of lists have one name.
+        DataError: if no recording is found.
+    """
+    recordings: list[_Found] = []
+    for text in what:
+        more = list(_read(text, common) if _is_list(text) else _searched(text, output, common))
+        known = {one.entry.data for one in recordings if not one.origin}
+        recordings += [one for one in more if one.origin or one.entry.data not in known]
+        if not more:
+            logger.warning("%s: no recording of a known format here", text)
+    if not recordings:
+        formats = ", ".join(name for name, _ in DATASETS.working())
+        raise DataError(f"{', '.join(what)}: no recording found; known formats: {formats}")
+    given = {name: value for name, value in options.items() if value is not None}
+    tasks = []
+    for one, name in zip(recordings, _names([one.entry for one in recordings]), strict=True):
+        tree = ConfigTree()
+        for layer in (one.settings, one.entry.settings, given):
+            tree.merge(ConfigTree(dict(layer)))
+        try:
+            settings = load_config(config, overrides, **tree.values)
+        except ConfigError as error:
+            raise ConfigError(f"{one.origin}: {error}" if one.origin else str(error)) from error
+        entry = one.entry
+        files = [path for path in (entry.calibration, entry.groundtruth) if path is not None]
+        tasks.append(
+            BatchTask(
+                name=name,
+                state=_state([entry.data, *files]),
+                config=settings,
+                output=output,
+                **entry.model_dump(exclude={"name", "settings"}),
+            )
+        )
+    return tasks
+
+
+def _is_list(text: str) -> bool:
+    return Path(text).suffix in _LISTS
+
+
+# --- lists -------------------------------------------------------------------------------------
+
+
+def _read(text: str, common: Mapping[str, Any]) -> Iterator[_Found]:
+    """The recordings of a list; they need not exist."""
+    path = Path(text)
+    listed = ConfigTree.read(path).validated(BatchList)
+    folder = path.resolve().parent
+    shared = _with_paths(listed.settings, folder)
+    for number, item in enumerate(listed.recordings, start=1):
+        entry = Entry(data=item) if isinstance(item, str) else item
+        changes: dict[str, Any] = {
+            name: _absolute(value, folder)
+            for name in ("data", "calibration", "groundtruth")
+            if (value := getattr(entry, name)) is not None
+        }
+        changes["settings"] = _with_paths(entry.settings, folder)
+        for name in ("format", "calibration", "sources"):
+            changes[name] = changes.get(name) or getattr(entry, name) or common.get(name)
+        known = {name: value for name, value in changes.items() if value is not None}
+        yield _Found(entry.model_copy(update=known), f"{path}: recording {number}", shared)
+
+
+def _absolute(text: str, folder: Path) -> str:
+    """A path of a list; `demo` is a name if nothing is called so there."""
+    path = folder / text
+    return text if text == _DEMO and not path.exists() else str(path)
+
+
+def _with_paths(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Settings in which the file of an algorithm is named from anywhere."""
+    algorithm = settings.get("algorithm")
+    if isinstance(algorithm, str) and Path(algorithm).suffix in _LISTS:
+        return {**settings, "algorithm": str(folder / algorithm)}
+    return settings
+
+
+# --- search ------------------------------------------------------------------------------------
+
+
+def _searched(text: str, output: Path, common: Mapping[str, Any]) -> Iterator[_Found]:
+    """The recordings at a path, below a folder, or at or below what a pattern matches.
+
+    Raises:
+        DataError: if nothing is there.
+    """
+    if text == _DEMO and not Path(text).exists():
+        yield _Found(Entry(data=text), "", {})
+        return
+    paths = [text] if Path(text).exists() else sorted(glob.glob(text, recursive=True))
+    own = {name: value for name, value in common.items() if value}
+    if not paths:
+        raise DataError(f"{text}: no such file or folder")
+    for path in paths:
+        if own.get("format") is not None and Path(path).is_file():
+            places: Iterable[Path] = [Path(path)]
+        else:
+            places = _recordings(Path(path), output.resolve(), own.get("format"), set())
+        for place in places:
+            yield _Found(Entry(data=str(place.resolve()), **own), "", {})
+
+
+def _recordings(path: Path, output: Path, format: str | None, seen: set[Path]) -> Iterator[Path]:
+    """The recordings at a path or below it, in the order of their names.
+
+    What is inside of a recording is not searched, nor are hidden folders and the output. A folder
+    of images counts only where the format is given: pictures are everywhere.
+    """
+    real = path.resolve()
+    if real in seen or real == output:
+        return
+    seen.add(real)
+    if _recognised(path, format):
+        yield path
+    elif path.is_dir():
+        try:
+            inside = sorted(path.iterdir())
+        except OSError:  # a folder that may not be read holds nothing for us
+            return
+        for child in inside:
+            if not child.name.startswith("."):
+                yield from _recordings(child, output, format, seen)
+
+
+def _recognised(path: Path, format: str | None) -> bool:
+    """Whether a path is a recording, of the format if one is given."""
+    if path.is_file() and path.suffix.lower() in _IMAGES:
+        return False
+    try:
+        if format is not None:
+            return DATASETS[format].recognises(path)
+        return any(known.recognises(path) for _, known in DATASETS.working() if not known.fallback)
+    except OSError:
+        return False
+
+
+# --- names and states --------------------------------------------------------------------------
+
+
+def _names(entries: Sequence[Entry]) -> list[str]:
+    """A name for each recording: its own, with as many folders before it as tell it from others.
+
+    Raises:
+        ConfigError: if two names that were given are the same.
+    """
+    given = Counter(entry.name for entry in entries if entry.name)
+    if given and given.most_common(1)[0][1] > 1:
+        raise ConfigError(f"two recordings are called '{given.most_common(1)[0][0]}'; rename one")
+    depths = [1] * len(entries)
+    deepest = max(len(Path(entry.data).parts) for entry in entries)
+    for _ in range(deepest):
+        names = [
+            entry.name or _name(entry.data, depth)
+            for entry, depth in zip(entries, depths, strict=True)
+        ]
+        count = Counter(names)
+        if max(count.values()) == 1:
+            return names
+        depths = [depth + (count[name] > 1) for depth, name in zip(depths, names, strict=True)]
+    return [f"{name}_{k}" if count[name] > 1 else name for k, name in enumerate(names, start=1)]
+
+
+def _name(data: str, depth: int) -> str:
+    """The last parts of a path, as the name of a folder."""
+    path = Path(data)
+    parts = (path.parent / (path.stem if path.is_file() else path.name)).parts[-depth:]
+    return re.sub(r"[^\w.-]+", "_", "_".join(part.strip("/") for part in parts)).lstrip(".")
+
+
+def _state(paths: Iterable[str]) -> str:
+    """A hash of the names, sizes and times of the files at some paths; of images the names only."""
+    files = sorted(str(file) for path in paths for file in _files(Path(path)))
+    return settings_hash([(file, *_size_and_time(file)) for file in files])
+
+
+def _files(path: Path) -> Iterator[Path]:
+    """The files at a path or below it."""
+    if path.is_file():
+        yield path
+    for folder, _, names in os.walk(path):
+        yield from (Path(folder, name) for name in names)
+
+
+def _size_and_time(file: str) -> tuple[int, ...]:
+    if os.path.splitext(file)[1].lower() in _IMAGES or not os.path.exists(file):
+        return ()
+    status = os.stat(file)
+    return status.st_size, status.st_mtime_ns
