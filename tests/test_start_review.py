@@ -104,7 +104,7 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
 
     What vibration adds to the covariance begins anew with the world.
     """
-    monkeypatch.setattr(start_review, "contradict", lambda one, other: True)
+    monkeypatch.setattr(start_review, "contradict", lambda *_: True)
     monkeypatch.setattr(DynamicsNoise, "_is_vibrating", lambda *_: True)
     sequence = simulate(trajectory="figure8", duration_s=9.0, seed=5, **MOVING)
     estimator, history, _ = flown(sequence, MOTION)
@@ -116,7 +116,7 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
 
 def test_so_it_does_where_frames_wait_for_the_imu(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a time offset that the start has found, a frame may lead to several states or none."""
-    monkeypatch.setattr(start_review, "contradict", lambda one, other: True)
+    monkeypatch.setattr(start_review, "contradict", lambda *_: True)
     sequence = simulate(trajectory="figure8", duration_s=10.0, seed=5, **MOVING)
     estimator, history, _ = flown(sequence, MOTION[:1], late_ns=40_000_000)
     counts = estimator.diagnostics.counts
@@ -154,3 +154,22 @@ def test_a_start_from_standstill_that_moves_off_slowly_is_reviewed(data_dir: Pat
     error = ape(sequence.groundtruth(), late, alignment="sim3")
     assert abs(error.similarity.scale - 1.0) < 0.01
     assert error.statistics.rmse < 0.01
+
+
+def test_images_that_are_lost_later_do_not_bring_the_start_in_doubt() -> None:
+    """Without features the velocity becomes unknown, long after the start was confirmed."""
+    sequence = simulate(trajectory="figure8", duration_s=16.0, seed=5, **CAMERA)
+    config = load_config(algorithm="msckf", overrides=["backend.noise.imu_scale=10"])
+    estimator = Estimator(sequence.rig, config.algorithm, config.backend)
+    sigmas = []
+    for packet in sequence.packets():
+        frame = packet.frame
+        assert isinstance(frame, FeatureFrame)
+        if 9.0 < frame.stamp_ns * 1e-9 < 12.0:
+            frame = frame.without(frame.cameras[0].ids)
+        estimator.add_imu(packet.imu)
+        state = estimator.add_frame(frame)
+        if state is not None and state.covariance is not None and frame.stamp_ns > 9 * SECOND_NS:
+            sigmas.append(float(np.sqrt(np.max(np.diag(state.covariance)[6:9]))))
+    assert max(sigmas) > start_review._UNKNOWN_VELOCITY
+    assert estimator.diagnostics.counts["start_corrected"] == 0

@@ -99,8 +99,10 @@ def localize(
         )
         watching = Watching(rerun, rerun_images, rerun_detail, rerun_address)
         result, folder, files = execute(sequence, settings, output, watching, progress, log, known)
-    report(result, folder, files, as_json)
-    keep_serving(rerun)
+    try:
+        report(result, folder, files, as_json)
+    finally:
+        keep_serving(rerun)
     if result.localization is None or result.localization.located.any():
         return
     if result.localization.counts["queries"] == 0:

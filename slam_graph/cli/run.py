@@ -273,8 +273,10 @@ def run(
             log,
             graph_times=[_time(text) for text in save_graph or ()],
         )
-    report(result, folder, files, as_json)
-    keep_serving(rerun)
+    try:
+        report(result, folder, files, as_json)
+    finally:
+        keep_serving(rerun)
 
 
 def _time(text: str) -> int | float:

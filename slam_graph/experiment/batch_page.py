@@ -55,7 +55,7 @@ document.querySelectorAll('th').forEach((head, column) => head.onclick = () => {
   head.dataset.up = up ? '1' : '0';
   const key = row => row.cells[column].dataset.key;
   [...body.rows].sort((a, b) => {
-    const x = key(a), y = key(b), p = parseFloat(x), q = parseFloat(y);
+    const x = key(a), y = key(b), p = Number(x), q = Number(y);
     if (x === '' || y === '') return (x === '') - (y === '');
     const order = isNaN(p) || isNaN(q) ? x.localeCompare(y) : p - q;
     return up ? order : -order;

@@ -183,12 +183,17 @@ def _searched(text: str, output: Path, common: Mapping[str, Any]) -> Iterator[_F
     own = {name: value for name, value in common.items() if value}
     if not paths:
         raise DataError(f"{text}: no such file or folder")
+    seen: set[Path] = set()  # what a pattern with ** matches again
+    found: set[Path] = set()
     for path in paths:
+        if found & {*Path(path).resolve().parents, Path(path).resolve()}:
+            continue
         if own.get("format") is not None and Path(path).is_file():
             places: Iterable[Path] = [Path(path)]
         else:
-            places = _recordings(Path(path), output.resolve(), own.get("format"), set())
+            places = _recordings(Path(path), output.resolve(), own.get("format"), seen)
         for place in places:
+            found.add(place.resolve())
             yield _Found(Entry(data=str(place.resolve()), **own), "", {})
 
 

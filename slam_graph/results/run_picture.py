@@ -251,7 +251,7 @@ def _title(metrics: Mapping[str, Any]) -> str:
         f"{metrics['dataset']['name']}  ·  {metrics['algorithm']}, "
         f"{cameras} camera{'' if cameras == 1 else 's'}{ending}"
     ]
-    mode = "none" if metrics["extent"]["start_was_given"] else "yaw"
+    mode = "none" if metrics["extent"].get("start_was_given", False) else "yaw"
     tables = {
         CAUSAL: metrics["accuracy"],
         SMOOTHED: (metrics["final_ba"] or {}).get("accuracy"),

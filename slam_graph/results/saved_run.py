@@ -227,7 +227,7 @@ class SavedRun(RunSummary):
             self.points,
             self.metrics["extent"]["start_ns"],
         )
-        return view if self.metrics["extent"]["start_was_given"] else view.aligned()
+        return view if self.start_was_given else view.aligned()
 
     @cached_property
     def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:

@@ -120,7 +120,7 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
         ):
             if image is None:
                 continue
-            name = f"{mounted.name or f'cam{camera}'}/{frame.stamp_ns}.png"
+            name = f"cam{camera}/{frame.stamp_ns}.png"
             _write(folder / name, image)
             pose = world_T_body.compose(mounted.body_T_camera)
             if camera:

@@ -172,7 +172,14 @@ class Shown:
     map_path: FloatArray | None = None
 
 
-GROWING = ("path/causal", "path/smoothed", "map/points", "keyframes")
+GROWING = (
+    "path/causal",
+    "path/smoothed",
+    "path/loop_closed",
+    "path/groundtruth",
+    "map/points",
+    "keyframes",
+)
 """What accumulates in the world of a run."""
 
 

@@ -69,7 +69,10 @@ class RerunRecording:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:
+            self._stream.discard()
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""

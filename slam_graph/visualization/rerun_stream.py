@@ -123,11 +123,20 @@ class RerunStream:
         self._raw.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Send what is left; a saved file appears under its name."""
+        """Send what is left; a saved file appears under its name. A server goes on serving."""
         self._raw.flush()
+        if self.url is not None:  # to disconnect would end it
+            return
         self._raw.disconnect()
         if self._path is not None and self._partial is not None:
             os.replace(self._partial, self._path)
+            self._partial = None
+
+    def discard(self) -> None:
+        """End without what was sent: no file appears."""
+        self._raw.disconnect()
+        if self._partial is not None:
+            self._partial.unlink(missing_ok=True)
             self._partial = None
 
     def _time(self, stamps_ns: Any) -> Mapping[str, Any]:

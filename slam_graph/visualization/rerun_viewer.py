@@ -244,5 +244,8 @@ class _LogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send a line."""
-        text = self._stream.rr.TextLog(self.format(record), level=record.levelname)
-        self._stream.log("log", text)
+        try:
+            text = self._stream.rr.TextLog(self.format(record), level=record.levelname)
+            self._stream.log("log", text)
+        except Exception:  # a viewer that fails must not end what logs
+            self.handleError(record)

@@ -6,9 +6,9 @@ The batch problem of a start in motion over frames after it gives velocity and d
 a second time. If these contradict the estimate, the start was wrong, and the estimator goes on from
 the new solution. After a start without a metre scale this waits until the scale is known.
 
-A start from standstill whose velocity became unknown before images said anything, as with one
-camera that moves off slowly, is always replaced by the solution of what follows: a filter's one
-step from so far away ends beside the minimum, and is sure of it.
+A start from standstill is compared where its velocity became unknown before images said anything,
+as with one camera that moves off slowly: a filter's one step from so far away ends beside the
+minimum, and is sure of it. There also a small contradiction counts.
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ _LEAST_VELOCITY, _LEAST_TILT_RAD = 0.1, np.deg2rad(2.0)
 frames, in a dark second for example, so that χ² alone doubts a velocity that is known to 1 mm/s."""
 _GIVE_UP_NS = 5_000_000_000
 """A start whose scale is known is compared within this time or not at all."""
+_KNOWN_AFTER_M = 0.5
+"""A start from standstill that has come so far with a known velocity is one that images confirm."""
 _UNKNOWN_VELOCITY = 0.1
-"""Standard deviation of a velocity, in m/s, from which a start from standstill is solved again."""
+"""Standard deviation of a velocity, in m/s, from which a start from standstill is reviewed."""
 
 
 class StartReview:
@@ -55,6 +57,7 @@ class StartReview:
         """
         self.done = False
         self._begun_ns = self._doubtful_ns = stamp_ns
+        self._first: NavState | None = None
         self._from_standstill = self._trusted = scale_sigma is None
         self._without_scale = scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA
         self._initializer = Initializer(context, "motion", "wait")
@@ -79,23 +82,26 @@ class StartReview:
         if self._from_standstill and _velocity_sigma(state) > _UNKNOWN_VELOCITY:
             self._trusted, self._doubtful_ns = False, stamp_ns
         if self._trusted:
+            self._first = state if self._first is None else self._first
+            way = state.world_T_body.translation() - self._first.world_T_body.translation()
+            self.done = bool(np.linalg.norm(way) > _KNOWN_AFTER_M)
             return None
         self.done = not self._without_scale and stamp_ns - self._doubtful_ns > _GIVE_UP_NS
         window = None if self.done else self._initializer.try_to_start(stamp_ns, frame)
         if window is None:
             return None
         self.done = True
-        if not self._from_standstill and not contradict(state, window.current(window.prior)):
+        if not contradict(state, window.current(window.prior), not self._from_standstill):
             return None
-        reason = "what follows the start contradicts it"
-        if self._from_standstill:
-            reason = "the velocity was lost after standstill, before images showed it"
         seconds = (stamp_ns - self._begun_ns) * 1e-9
-        self._diagnostics.warn("start_corrected", f"{reason}; solved again {seconds:.1f} s later")
+        self._diagnostics.warn(
+            "start_corrected",
+            f"what follows the start contradicts it; solved again {seconds:.1f} s later",
+        )
         return window
 
 
-def contradict(one: NavState, other: NavState) -> bool:
+def contradict(one: NavState, other: NavState, by_much: bool = True) -> bool:
     """Whether velocity or direction of gravity of two estimates differ clearly and by much.
 
     Both are compared in the body frame, as worlds may differ in yaw and position.
@@ -103,6 +109,7 @@ def contradict(one: NavState, other: NavState) -> bool:
     Args:
         one: with its covariance.
         other: the same, of the same time.
+        by_much: whether small differences count for nothing.
     """
     (x, P), (y, Q) = _in_body(one), _in_body(other)
     difference, S = x - y, P + Q
@@ -113,7 +120,7 @@ def contradict(one: NavState, other: NavState) -> bool:
         tilt @ np.linalg.solve(tilt_S, tilt),
     ]
     lengths = [np.linalg.norm(difference[:3]), np.linalg.norm(tilt)]
-    far = np.greater(lengths, [_LEAST_VELOCITY, _LEAST_TILT_RAD])
+    far = np.greater(lengths, [_LEAST_VELOCITY, _LEAST_TILT_RAD]) | (not by_much)
     return bool(np.any(far & (squares > threshold(np.array([3, 2]), _CONFIDENCE))))
 
 
