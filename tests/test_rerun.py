@@ -24,6 +24,9 @@ from slam_graph.errors import DataError
 from slam_graph.pose_graph import optimize_pose_graph
 from slam_graph.results import RunResult
 from slam_graph.visualization import RerunRecording
+from slam_graph.visualization.rerun_blueprints import GROWING
+from slam_graph.visualization.rerun_progress import StepSeries
+from slam_graph.visualization.rerun_series import PLOTS
 
 DURATION_S = 6.0
 TIMELINES = {"frame", "sensor_time"}
@@ -36,7 +39,13 @@ OF_A_RUN = {
     *("/state/velocity", "/state/gyro_bias", "/state/gyro_bias/bounds", "/state/accel_bias"),
     *("/state/accel_bias/bounds", "/imu/gyro", "/imu/accel", "/error/position"),
     *("/error/position/bounds", "/error/orientation", "/consistency/nees", "/consistency/nis"),
-    *("/work/milliseconds", "/work/backend", "/work/counts", "/work/rejected", "/work/cost"),
+    *(
+        "/backend/milliseconds",
+        "/backend/stages",
+        "/backend/counts",
+        "/backend/rejected",
+        "/backend/cost",
+    ),
     *("/window/graph/variables", "/window/graph/projections", "/window/graph/prior"),
     *("/window/before/matrix", "/window/after/matrix"),
 }
@@ -142,7 +151,12 @@ def test_a_result_that_was_not_watched_is_shown_from_its_files(
     result.save(tmp_path / "run")
     found = viewed(tmp_path, tmp_path / "run")
     paths = {f"/world/path/{name}" for name in ("causal", "smoothed", "groundtruth")}
-    plots = {"/state/velocity", "/state/gyro_bias/bounds", "/error/position", "/work/milliseconds"}
+    plots = {
+        "/state/velocity",
+        "/state/gyro_bias/bounds",
+        "/error/position",
+        "/backend/milliseconds",
+    }
     assert found.entities >= paths | plots | {"/world/map/points", "/world/body", "/legend"}
     assert found.timelines == TIMELINES
     assert found.rows["/world/path/causal"] == len(result.trajectory) - 1
@@ -323,3 +337,8 @@ def test_without_a_driver_the_error_says_so(
     said = refused(graph_file, "--screenshot", tmp_path / "picture.png")
     assert "Vulkan driver" in said
     assert not (tmp_path / "picture.png").exists()
+
+
+def test_every_series_of_a_step_has_a_plot_and_every_path_accumulates() -> None:
+    assert set(PLOTS) >= StepSeries.PLOTS
+    assert {"path/causal", "path/smoothed", "path/loop_closed", "path/groundtruth"} <= set(GROWING)

@@ -91,7 +91,7 @@ class StepSeries:
             "state": ("velocity", "gyro_bias", "accel_bias"),
             "imu": ("gyro", "accel"),
             "consistency": ("nis",),
-            "work": ("milliseconds", "backend", "counts", "rejected", "cost"),
+            "backend": ("milliseconds", "stages", "counts", "rejected", "cost"),
         }.items()
         for name in names
     )
@@ -106,18 +106,18 @@ class StepSeries:
         ms, counts = frame.milliseconds, frame.counts
         nan = float("nan")
         stages = [ms.get(stage, nan) for stage in ("read", "frontend", "backend")]
-        add("work/milliseconds", number, stamp_ns, stages)
+        add("backend/milliseconds", number, stamp_ns, stages)
         parts = ("propagation", "cost", "gauss_newton", "marginalization")
-        add("work/backend", number, stamp_ns, [ms.get(f"backend.{p}", nan) for p in parts])
+        add("backend/stages", number, stamp_ns, [ms.get(f"backend.{p}", nan) for p in parts])
         seen = [len(camera) for camera in frame.features.cameras]
         past = 0 if estimator.window is None else len(estimator.window.past)
         numbers = [seen[0], sum(seen[1:]), len(frame.landmark_ids), past]
-        add("work/counts", number, stamp_ns, np.array(numbers, np.float64))
+        add("backend/counts", number, stamp_ns, np.array(numbers, np.float64))
         innovations = estimator.innovations
         rejected = [counts.get("rejected_ransac", 0.0), float(innovations.rejected)]
-        add("work/rejected", number, stamp_ns, [*rejected, counts.get("rejected_stereo", 0.0)])
+        add("backend/rejected", number, stamp_ns, [*rejected, counts.get("rejected_stereo", 0.0)])
         if estimator.costs:
-            add("work/cost", number, stamp_ns, estimator.costs[:8])
+            add("backend/cost", number, stamp_ns, estimator.costs[:8])
         if innovations.passed_dof:
             self._add_nis(number, stamp_ns, estimator)
         if frame.state is not None:

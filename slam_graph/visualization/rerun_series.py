@@ -89,27 +89,29 @@ ERROR_PLOTS = (
     ),
 )
 WORK_PLOTS = (
-    Plot("work/milliseconds", "time [ms]", ("read", "front end", "back end"), (GREY, SKY, ORANGE)),
     Plot(
-        "work/backend",
+        "backend/milliseconds", "time [ms]", ("read", "front end", "back end"), (GREY, SKY, ORANGE)
+    ),
+    Plot(
+        "backend/stages",
         "back end [ms]",
         ("propagation", "cost", "Gauss-Newton", "marginalization"),
         (SKY, GREEN, ORANGE, VERMILLION),
     ),
     Plot(
-        "work/counts",
+        "backend/counts",
         "features and poses",
         ("tracked", "other cameras", "estimated", "poses in state"),
         (SKY, GREEN, ORANGE, YELLOW),
     ),
     Plot(
-        "work/rejected",
+        "backend/rejected",
         "rejected features",
         ("RANSAC", "gate", "stereo"),
         (YELLOW, VERMILLION, SKY),
     ),
     Plot(
-        "work/cost",
+        "backend/cost",
         "cost",
         ("before", *(f"after step {k}" for k in range(1, _MAX_STEPS))),
         (VERMILLION, *CYCLE[:3], *CYCLE[3:5], CYCLE[6], CYCLE[7])[:_MAX_STEPS],

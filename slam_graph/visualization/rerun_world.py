@@ -86,8 +86,8 @@ def _show_timing(
     series: SeriesLog, stamps_ns: IntArray, timing: Mapping[str, FloatArray]
 ) -> frozenset[str]:
     plots = {
-        "work/milliseconds": ("read", "frontend", "backend"),
-        "work/backend": (
+        "backend/milliseconds": ("read", "frontend", "backend"),
+        "backend/stages": (
             *("backend.propagation", "backend.cost"),
             *("backend.gauss_newton", "backend.marginalization"),
         ),
