@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from slam_graph.backend.backend_config import NoiseConfig
-from slam_graph.backend.cost.adaptive_imu_noise import RESPONSE_TIME_S, DensityScale, DynamicsNoise
+from slam_graph.backend.cost.adaptive_imu_noise import (
+    ACCEL_SCALE_SIGMA,
+    GYRO_SCALE_SIGMA,
+    RESPONSE_TIME_S,
+    DensityScale,
+    DynamicsNoise,
+    MotionChange,
+)
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
 from slam_graph.pipeline.run_recording import run
@@ -88,6 +95,33 @@ def test_vibration_raises_the_noise_at_once_and_motion_does_not(rate_hz: float) 
     gyro, accel_factor = found[2.5]
     assert gyro == 1.0
     assert accel_factor > 3.0
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+def test_errors_of_scale_and_alignment_change_the_biases_as_the_motion_changes(
+    adaptive: bool,
+) -> None:
+    """A sensor measures (I + M) ω; over an interval M Δω has the covariance of the random walk."""
+    rng = np.random.default_rng(3)
+    stamps_ns = np.arange(0, 60_000_000, 5_000_000)
+    before, samples = (
+        ImuData(stamps_ns + offset_ns, np.tile(gyro, (12, 1)), np.tile(accel, (12, 1)))
+        for offset_ns, gyro, accel in (
+            (0, [0.1, 2.0, -0.5], [0.0, 1.0, 9.8]),
+            (55_000_000, [1.5, -1.0, 0.2], [3.0, -2.0, 8.0]),
+        )
+    )
+    elapsed_s = 0.055
+    imu = ImuNoise(gyro_random_walk=1e-9, accel_random_walk=1e-9)
+    config = NoiseConfig.model_validate({"adaptive": {"enabled": adaptive}})
+    params = DynamicsNoise(imu, config).params(change=MotionChange.between(before, samples))
+    for covariance, sigma, change in (
+        (params.getBiasOmegaCovariance(), GYRO_SCALE_SIGMA, samples.gyro[0] - before.gyro[0]),
+        (params.getBiasAccCovariance(), ACCEL_SCALE_SIGMA, samples.accel[0] - before.accel[0]),
+    ):
+        drawn = np.cov((rng.normal(0.0, sigma, (20_000, 3, 3)) @ change).T)
+        expected = drawn if adaptive else np.full((3, 3), 0.0)
+        assert covariance * elapsed_s == pytest.approx(expected, abs=0.04 * drawn.max())
 
 
 def mean_nees(noise_scale: float, adaptive: bool) -> float:

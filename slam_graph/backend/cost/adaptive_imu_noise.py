@@ -16,12 +16,15 @@ scale and alignment of a real IMU change with the motion, slower than white nois
 bias at rest. What was learned of a random walk is kept for longer, as it shows in some motions.
 
 All of this takes seconds, in which a start has gone wrong. Vibration shows at once: samples are
-then many times noisier than the calibration says.
+then many times noisier than the calibration says. And what a calibration leaves of the errors of
+scale and alignment adds to the biases in proportion to angular rate and specific force. So the
+biases change as these do, and their random walks are larger where the motion changes.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -29,7 +32,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.geometry import NavState
-from slam_graph.sensors import ImuBuffer, ImuNoise
+from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
 
 PERSISTENCE_TIME_S = 0.5
 """Time constant of the mean correction, which shows whether corrections keep their direction."""
@@ -53,6 +56,8 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 """Standard deviation of the third difference of white noise of 1."""
 _NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a normal variable, in units of its standard deviation."""
+GYRO_SCALE_SIGMA, ACCEL_SCALE_SIGMA = 2.5e-4, 1e-3
+"""Standard deviations of scale and alignment after calibration, relative."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0
@@ -60,6 +65,32 @@ _MAX_SQUARE = 4.0
 _ROTATION, _VELOCITY = slice(0, 3), slice(6, 9)
 _ACCEL_BIAS, _GYRO_BIAS = slice(9, 12), slice(12, 15)
 """Rows of a state's covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionChange:
+    """How the motion changes from one frame interval to the next, as if it were a random walk.
+
+    Attributes:
+        rate: change of the mean angular rate over the square root of the time, rad/s/√s.
+        force: that of the mean specific force, m/s²/√s.
+    """
+
+    rate: float = 0.0
+    force: float = 0.0
+
+    @staticmethod
+    def between(before: ImuData | None, samples: ImuData) -> MotionChange:
+        """That from the samples of one interval, if there is one, to those of the next."""
+        if before is None:
+            return MotionChange()
+        root_s = math.sqrt(float(samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9)
+        rate = np.linalg.norm(samples.gyro.mean(axis=0) - before.gyro.mean(axis=0))
+        force = np.linalg.norm(samples.accel.mean(axis=0) - before.accel.mean(axis=0))
+        return MotionChange(float(rate) / root_s, float(force) / root_s)
+
+
+_STEADY = MotionChange()
 
 
 class DensityScale:
@@ -122,20 +153,22 @@ class DynamicsNoise:
         self.vibrates = False
 
     def params(
-        self, scale: float = 1.0, least_factor: float = 1.0
+        self, scale: float = 1.0, least_factor: float = 1.0, change: MotionChange = _STEADY
     ) -> gtsam.PreintegrationCombinedParams:
         """Current parameters.
 
         Args:
             scale: on all densities.
             least_factor: least factor on white noise.
+            change: of the motion since the interval before.
         """
         scale *= self._config.imu_scale
-        imu = replace(
-            self._imu,
-            gyro_random_walk=self._imu.gyro_random_walk * self._gyro_walk.factor,
-            accel_random_walk=self._imu.accel_random_walk * self._accel_walk.factor,
-        )
+        gyro_walk = self._imu.gyro_random_walk * self._gyro_walk.factor
+        accel_walk = self._imu.accel_random_walk * self._accel_walk.factor
+        if self._config.adaptive.enabled:
+            gyro_walk = math.hypot(gyro_walk, GYRO_SCALE_SIGMA * change.rate)
+            accel_walk = math.hypot(accel_walk, ACCEL_SCALE_SIGMA * change.force)
+        imu = replace(self._imu, gyro_random_walk=gyro_walk, accel_random_walk=accel_walk)
         gyro, accel = (max(factor, least_factor) for factor in self.factors)
         return imu.preintegration_params(self._config.gravity, scale, gyro, accel)
 

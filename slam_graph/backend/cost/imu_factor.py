@@ -17,13 +17,13 @@ from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise
+from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise, MotionChange
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.sensors import ImuBuffer, ImuNoise
+from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
 
 IMU_GAP_SCALE = 1000.0
 """Factor on the noise densities between two frames where samples are missing: the IMU then hardly
@@ -88,6 +88,7 @@ class Propagation:
         self._last: NavState | None = None
         self._predicted: NavState | None = None
         self._still = False
+        self._samples: ImuData | None = None
 
     def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
         """Make a new frame the current one.
@@ -103,7 +104,8 @@ class Propagation:
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.estimate.atConstantBias(B(i))
-        pim = samples.preintegrated(bias, self._params(imu, window.stamp_ns, stamp_ns))
+        pim = samples.preintegrated(bias, self._params(imu, samples))
+        self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
         window.state.insert_imu_state(j, predicted)
         window.past.append(i)
@@ -151,12 +153,11 @@ class Propagation:
                 self._vibration.correct(self._predicted.covariance, state.covariance)
         self._last = state
 
-    def _params(
-        self, imu: ImuBuffer, start_ns: int, end_ns: int
-    ) -> gtsam.PreintegrationCombinedParams:
+    def _params(self, imu: ImuBuffer, samples: ImuData) -> gtsam.PreintegrationCombinedParams:
         """Parameters of the preintegration; where samples are missing, with much larger noise."""
-        gap_s = imu.largest_gap_s(start_ns, end_ns)
+        gap_s = imu.largest_gap_s(*samples.stamps_ns[[0, -1]].tolist())
+        change = MotionChange.between(self._samples, samples)
         if gap_s <= self.config.noise.max_imu_gap_s:
-            return self.noise.params()
+            return self.noise.params(change=change)
         self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
-        return self.noise.params(IMU_GAP_SCALE)
+        return self.noise.params(IMU_GAP_SCALE, change=change)

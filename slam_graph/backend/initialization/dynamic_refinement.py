@@ -21,6 +21,7 @@ from gtsam.symbol_shorthand import L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import PriorConfig, UnknownScale
+from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import ReducedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
@@ -193,8 +194,11 @@ class DynamicRefinement:
             state.insert_imu_state(k, nav)
         start = guess.states[0]
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
-        params = context.propagation.noise.params(least_factor=_WHITE_NOISE_FACTOR)
-        for k, samples in enumerate(frames.imu_between(context.imu)):
+        noise = context.propagation.noise
+        blocks = frames.imu_between(context.imu)
+        for k, (before, samples) in enumerate(zip([None, *blocks], blocks, strict=False)):
+            change = MotionChange.between(before, samples)
+            params = noise.params(least_factor=_WHITE_NOISE_FACTOR, change=change)
             factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
         first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
         first = fix_gauge(first, MOTION_PRIOR)
