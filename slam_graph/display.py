@@ -8,7 +8,7 @@ from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from slam_graph.errors import SlamGraphError
 
@@ -17,6 +17,8 @@ __all__ = ["Displayed"]
 _PICTURES = "slam_graph.visualization"
 """The package that draws. It is loaded when a picture is asked for: a trajectory is defined long
 before what can be drawn of it, and matplotlib is slow to import."""
+
+_Module = Literal["notebook_figures", "pose_graph_picture", "bundle_picture", "inline_viewer"]
 
 _DPI = 72
 _CELL = "text-align:left;vertical-align:top;padding:1px 10px 1px 0"
@@ -54,14 +56,6 @@ class Displayed:
         return f"<div><b>{title}</b><table>{rows}</table>{picture}</div>"
 
     @staticmethod
-    def _drawn(name: str, *arguments: Any, **options: Any) -> Any:
-        """What a function of `slam_graph/visualization/` draws.
-
-        Args:
-            name: `module.function`.
-            arguments: of the function.
-            options: of the function, by name.
-        """
-        module, _, function = name.partition(".")
-        draw = getattr(import_module(f"{_PICTURES}.{module}"), function)
-        return draw(*arguments, **options)
+    def _drawn_by(module: _Module) -> Any:
+        """A module of `slam_graph/visualization/`, for its functions that draw."""
+        return import_module(f"{_PICTURES}.{module}")
