@@ -34,7 +34,7 @@ class Displayed:
         raise NotImplementedError
 
     def _sketch(self) -> Any:
-        """A small picture (matplotlib figure with `png`), or None."""
+        """A small picture (matplotlib figure with `light_png`), or None."""
         return None
 
     def _repr_html_(self) -> str:
@@ -50,7 +50,7 @@ class Displayed:
             sketch = None
         picture = ""
         if sketch is not None:
-            data = b64encode(sketch.png(_DPI)).decode("ascii")
+            data = b64encode(sketch.light_png(_DPI)).decode("ascii")
             picture = f'<img alt="" style="max-width:100%" src="data:image/png;base64,{data}">'
         title = escape(type(self).__name__)
         return f"<div><b>{title}</b><table>{rows}</table>{picture}</div>"

@@ -5,13 +5,15 @@
 import importlib
 import re
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+import nbclient
+import nbformat
 import numpy as np
 import pytest
+from limits import HANG_S
 from pose_graphs import laps
 
 import slam_graph as sg
@@ -22,6 +24,7 @@ from slam_graph.pose_graph import certify
 
 PACKAGE = Path(sg.__file__).parent
 PNG = b"\x89PNG"
+VIEWER = "application/vnd.jupyter.widget-view+json"
 
 
 @pytest.fixture(scope="module")
@@ -159,8 +162,13 @@ def test_the_viewer_of_a_notebook_is_asked_for_by_name(
         result.show()
 
 
-def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult) -> None:
+def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult, tmp_path: Path) -> None:
+    """A cell that shows a saved result has the viewer as its output, and warns of nothing."""
     pytest.importorskip("rerun_notebook")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        result.show(400, 300)
+    result.save(tmp_path)
+    source = f"import slam_graph as sg\nsg.load_result({str(tmp_path)!r}).show(400, 300)"
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    nbclient.NotebookClient(notebook, timeout=HANG_S).execute()
+    outputs = notebook.cells[0].outputs
+    assert not [out for out in outputs if out.get("name") == "stderr"]
+    assert [out for out in outputs if VIEWER in out.get("data", {})]

@@ -32,6 +32,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     _run(root / "run")
     graph, _ = laps(2, noise=0.01)
     _optimized(root)
+    sg.simulate(trajectory="figure8", duration_s=1.0).save(root / "flight")
     (root / "laps.g2o").write_text("".join(optimize_pose_graph(graph).g2o_lines()))
     (root / "laps.txt").write_text((root / "laps.g2o").read_text())
     sg.save_map(World().map(), root / "place.slam")
@@ -126,6 +127,12 @@ READ: dict[str, tuple[Callable[[Path], None], ...]] = {
     "graph/edges.csv": TABLE,
     "bundle/optimized.txt": ALL,
     "comparison/runs/flight/msckf.npz": (*ALL, _other_arrays),
+    "flight/meta.yaml": (*ALL, _no_mapping),
+    "flight/calibration.yaml": (*ALL, _no_mapping),
+    "flight/imu.bin": ALL,
+    "flight/frames.bin": ALL,
+    "flight/features.bin": ALL,
+    "flight/groundtruth.npz": ALL,
     "laps.g2o": ALL,
     "laps.txt": (_cut,),  # else nothing tells that it was a graph
     "place.slam": ALL,
@@ -177,7 +184,7 @@ def test_a_damaged_file_is_named(
 
 
 @pytest.mark.parametrize(
-    "name", ["run", "graph", "bundle", "comparison", "laps.g2o", "laps.txt", "place.slam"]
+    "name", ["run", "graph", "bundle", "comparison", "flight", "laps.g2o", "laps.txt", "place.slam"]
 )
 def test_all_of_it_can_be_shown_while_it_is_whole(whole: Path, tmp_path: Path, name: str) -> None:
     assert view(whole / name, "--output", tmp_path / "view.rrd")[0] == 0
