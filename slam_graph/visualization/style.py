@@ -119,7 +119,7 @@ class Picture(Figure):
         return buffer.getvalue()
 
     def light_png(self, dpi: int = _NOTEBOOK_DPI) -> bytes:
-        """The picture as a PNG file with a palette, a third as large: a notebook is to stay light."""
+        """The picture as a PNG file with a palette, which keeps a notebook light."""
         whole = Image.open(io.BytesIO(self.png(dpi))).convert("RGB")
         reduced = whole.quantize(_COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
         buffer = io.BytesIO()
