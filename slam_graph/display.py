@@ -8,7 +8,7 @@ from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from slam_graph.errors import SlamGraphError
 
@@ -17,6 +17,8 @@ __all__ = ["Displayed"]
 _PICTURES = "slam_graph.visualization"
 """The package that draws. It is loaded when a picture is asked for: a trajectory is defined long
 before what can be drawn of it, and matplotlib is slow to import."""
+
+_Module = Literal["notebook_figures", "pose_graph_picture", "bundle_picture", "inline_viewer"]
 
 _DPI = 72
 _CELL = "text-align:left;vertical-align:top;padding:1px 10px 1px 0"
@@ -32,7 +34,7 @@ class Displayed:
         raise NotImplementedError
 
     def _sketch(self) -> Any:
-        """A small picture (matplotlib figure with `png`), or None."""
+        """A small picture (matplotlib figure with `light_png`), or None."""
         return None
 
     def _repr_html_(self) -> str:
@@ -48,20 +50,12 @@ class Displayed:
             sketch = None
         picture = ""
         if sketch is not None:
-            data = b64encode(sketch.png(_DPI)).decode("ascii")
+            data = b64encode(sketch.light_png(_DPI)).decode("ascii")
             picture = f'<img alt="" style="max-width:100%" src="data:image/png;base64,{data}">'
         title = escape(type(self).__name__)
         return f"<div><b>{title}</b><table>{rows}</table>{picture}</div>"
 
     @staticmethod
-    def _drawn(name: str, *arguments: Any, **options: Any) -> Any:
-        """What a function of `slam_graph/visualization/` draws.
-
-        Args:
-            name: `module.function`.
-            arguments: of the function.
-            options: of the function, by name.
-        """
-        module, _, function = name.partition(".")
-        draw = getattr(import_module(f"{_PICTURES}.{module}"), function)
-        return draw(*arguments, **options)
+    def _drawn_by(module: _Module) -> Any:
+        """A module of `slam_graph/visualization/`, for its functions that draw."""
+        return import_module(f"{_PICTURES}.{module}")

@@ -3,6 +3,7 @@
 """A batch: recordings are found, run in processes of their own, resumed and summarized."""
 
 import csv
+import itertools
 import json
 import os
 import re
@@ -11,18 +12,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from limits import HANG_S
+from recordings_loose import write_image_folder
 
 import slam_graph as sg
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.experiment.batch_plan import plan
-from slam_graph.experiment.batch_task import BatchTask, remove_remains
+from slam_graph.experiment import executors
+from slam_graph.experiment.batch_plan import Entry, _names, plan
+from slam_graph.experiment.batch_task import MARK, BatchTask, remove_remains
 
+CONFIG = sg.load_config()
 FAST = ["final_ba.enabled=false"]
 
 
@@ -149,6 +154,82 @@ def test_an_interruption_keeps_what_is_done_and_writes_the_summary(tmp_path: Pat
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["flight_0"]
 
 
+def test_an_interruption_stops_all_runs_that_go_on(tmp_path: Path) -> None:
+    """Three at once: one has ended, two leave nothing, and the next call does these two."""
+    for seed in range(3):
+        flight(tmp_path / "data" / f"flight_{seed}", seed, 20.0 if seed else 1.0)
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        command(tmp_path / "data", "--output", out, "--jobs", "3", "--no-final-ba"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    )
+    workers = [worker_of(out, f"flight_{seed}") for seed in (1, 2)]
+    assert wait_for(lambda: (out / "flight_0" / MARK).is_file())
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=HANG_S)
+    assert process.returncode == 130
+    assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+    with (out / "summary.csv").open(newline="") as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["ok", "not_done", "not_done"]
+    assert [path.name for path in out.iterdir() if path.is_dir()] == ["flight_0"]
+    assert sg.load_result(out / "flight_0").status == "ok"
+    left = tasks(tmp_path / "data", out, overrides=FAST)
+    assert [task.is_done() for task in left] == [True, False, False]
+
+
+WAITS_FOR_OTHERS = """
+import pathlib, signal, sys, time
+folder, name, count = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+def told(*_):
+    (folder / f"{name}.told").touch()
+    while len(list(folder.glob("*.told"))) < count:
+        time.sleep(0.01)
+    (folder / f"{name}.ended").touch()
+    sys.exit(1)
+signal.signal(signal.SIGINT, told)
+(folder / f"{name}.began").touch()
+time.sleep(600)
+"""
+"""A process that ends upon SIGINT when all others have been told, too."""
+
+
+def test_all_processes_are_told_before_one_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = itertools.count()
+
+    def start(_: str) -> subprocess.Popen[str]:
+        arguments = [sys.executable, "-c", WAITS_FOR_OTHERS, str(tmp_path), str(next(numbers)), "3"]
+        return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+
+    monkeypatch.setattr(executors, "_start", start)
+
+    def began() -> bool:
+        return len(list(tmp_path.glob("*.began"))) == 3
+
+    def interrupted(*_: object) -> Iterator[None]:
+        assert wait_for(began)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(executors, "as_completed", interrupted)
+    names = [tmp_path / f"recording_{number}" for number in range(3)]
+    some = [BatchTask(name=n.name, data=str(n), config=CONFIG, output=tmp_path) for n in names]
+    with pytest.raises(KeyboardInterrupt):
+        list(executors.LocalProcesses(3).do(some))
+    assert len(list(tmp_path.glob("*.ended"))) == 3, "none had to be killed"
+
+
+def wait_for(holds: Callable[[], bool]) -> bool:
+    """Whether something holds before the time is over."""
+    deadline = time.monotonic() + HANG_S
+    while time.monotonic() < deadline and not holds():
+        time.sleep(0.01)
+    return holds()
+
+
 def test_other_settings_and_changed_recordings_are_run_again(tmp_path: Path) -> None:
     recording = flight(tmp_path / "data" / "flight")
     options: dict[str, Any] = {"output": tmp_path / "out", "overrides": FAST, "jobs": 1}
@@ -188,6 +269,76 @@ recordings:
     replaced = tasks(tmp_path / "list.yaml", tmp_path, algorithm="ekf", overrides=["duration_s=2"])
     assert {task.config.algorithm.name for task in replaced} == {"ekf"}
     assert {task.config.duration_s for task in replaced} == {2}
+
+
+def names_of(*data: str, order: int = 1) -> dict[str, list[str]]:
+    """The names that recordings of a list are given, by their paths."""
+    found: dict[str, list[str]] = {}
+    entries = [Entry(data=path) for path in data][::order]
+    for entry, name in zip(entries, _names(entries), strict=True):
+        found.setdefault(entry.data, []).append(name)
+    return {path: sorted(names) for path, names in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (("/d/a", "/d/a", "/d/a_1"), {"/d/a": ["a", "a_2"], "/d/a_1": ["a_1"]}),
+        (("/d/a", "/d/a", "/d/a_2"), {"/d/a": ["a", "a_3"], "/d/a_2": ["a_2"]}),
+        (("/d/a", "/e/a", "/d/a_1"), {"/d/a": ["d_a"], "/e/a": ["e_a"], "/d/a_1": ["a_1"]}),
+        (("/d/a", "/e/a", "/d_a"), {"/d/a": ["d_a_2"], "/e/a": ["e_a"], "/d_a": ["d_a"]}),
+        (("/d/a b", "/d/a_b"), {"/d/a b": ["a_b"], "/d/a_b": ["a_b_2"]}),
+    ],
+)
+def test_recordings_have_folders_of_their_own(
+    data: tuple[str, ...], expected: dict[str, list[str]]
+) -> None:
+    """Whatever they are called, and in whatever order they come."""
+    assert names_of(*data) == names_of(*data, order=-1) == expected
+    assert len({name for names in expected.values() for name in names}) == len(data)
+
+
+def test_a_name_that_is_given_stays_with_its_recording() -> None:
+    entries = [Entry(data="/d/a"), Entry(data="/e/b", name="a"), Entry(data="/d/a")]
+    assert _names(entries) == ["a_2", "a", "a_3"]
+
+
+def test_sources_of_a_list_are_relative_to_it(flights: Path, tmp_path: Path) -> None:
+    """Files are; topics and rates are no files. What is in a file is part of the task."""
+    (tmp_path / "list.yaml").write_text(
+        f"""
+recordings:
+  - data: {flights / "monday" / "first"}
+    sources: {{stamps: times.csv, imu: below/imu.csv, cam0: /cam0/image_raw, rate: "0.5"}}
+"""
+    )
+    (task,) = tasks(tmp_path / "list.yaml", tmp_path / "out")
+    assert task.sources == {
+        "stamps": str(tmp_path / "times.csv"),
+        "imu": str(tmp_path / "below" / "imu.csv"),
+        "cam0": "/cam0/image_raw",
+        "rate": "0.5",
+    }
+    keys = [task.key]
+    for content in ("1\n", "1\n2\n"):
+        (tmp_path / "times.csv").write_text(content)
+        keys += [task.key for task in tasks(tmp_path / "list.yaml", tmp_path / "out")]
+    assert len(set(keys)) == 3, "it is run again when the file appears, and when it changes"
+
+
+def test_a_list_is_run_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of images whose times and IMU are beside the list."""
+    pictures = write_image_folder(tmp_path / "lists" / "pictures")
+    for old, new in (("timestamps.csv", "times.csv"), ("imu.csv", "inertial.csv")):
+        (pictures / old).rename(tmp_path / "lists" / new)
+    (tmp_path / "lists" / "list.yaml").write_text(
+        "recordings: [{data: pictures, sources: {stamps: times.csv, imu: inertial.csv}}]"
+    )
+    monkeypatch.chdir(tmp_path)
+    done = sg.batch("lists/list.yaml", output="out", overrides=FAST, jobs=1)
+    assert done.failures == {}
+    assert [row["status"] for row in done.rows] == ["not_initialized"], "it has 8 frames"
+    assert sg.batch(tmp_path / "lists" / "list.yaml", output="out", overrides=FAST).skipped == 1
 
 
 @pytest.mark.parametrize(

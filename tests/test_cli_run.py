@@ -106,6 +106,7 @@ def test_a_run_that_fails_its_job_is_exit_code_3_and_written(
         (("--set", "backend.initialization.mode=groundtruth"), "no ground truth to start from"),
         (("--set", "backend.initialization.mode=given"), "no start state comes with the data"),
         (("--cameras", "stereo"), "2 cameras"),
+        (("--start", "1000", "--rerun", "save"), "cannot start at 1000 s"),  # nor is a recording
     ],
 )
 def test_what_the_data_cannot_give_is_exit_code_1(

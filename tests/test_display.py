@@ -5,21 +5,26 @@
 import importlib
 import re
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
+import nbclient
+import nbformat
 import numpy as np
 import pytest
+from limits import HANG_S
 from pose_graphs import laps
 
 import slam_graph as sg
-from slam_graph.display import Displayed
+from slam_graph.display import Displayed, _Module
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.geometry.trajectory import Trajectory
+from slam_graph.pose_graph import certify
 
 PACKAGE = Path(sg.__file__).parent
 PNG = b"\x89PNG"
+VIEWER = "application/vnd.jupyter.widget-view+json"
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +76,24 @@ def test_what_has_places_shows_a_picture(result: sg.RunResult, gtsam_data: Path)
     assert "image/png" not in html_of(replace(solution.graph, estimates=None))
 
 
+def test_a_certificate_says_whether_it_holds() -> None:
+    graph = laps(2, noise=0.01)[0]
+    solution = sg.optimize_pose_graph(graph)
+    shown = certify(graph, solution.poses)
+    assert repr(shown).startswith("Certificate(certified: objective ")
+    assert len(repr(shown)) < 120
+    assert "this is the global optimum" in html_of(shown)
+
+
 def test_every_picture_that_is_asked_for_can_be_drawn() -> None:
     asked = {
         name
         for path in PACKAGE.rglob("*.py")
-        for name in re.findall(r'_drawn\(\s*"([\w.]+)"', path.read_text(encoding="utf-8"))
+        for name in re.findall(r'_drawn_by\("(\w+)"\)\s*\.(\w+)\(', path.read_text("utf-8"))
     }
-    assert len(asked) >= 5
-    for name in asked:
-        module, function = name.split(".")
+    assert len(asked) >= 7
+    assert {module for module, _ in asked} == set(get_args(_Module))
+    for module, function in asked:
         assert callable(
             getattr(importlib.import_module(f"{PACKAGE.name}.visualization.{module}"), function)
         )
@@ -148,8 +162,13 @@ def test_the_viewer_of_a_notebook_is_asked_for_by_name(
         result.show()
 
 
-def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult) -> None:
+def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult, tmp_path: Path) -> None:
+    """A cell that shows a saved result has the viewer as its output, and warns of nothing."""
     pytest.importorskip("rerun_notebook")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        result.show(400, 300)
+    result.save(tmp_path)
+    source = f"import slam_graph as sg\nsg.load_result({str(tmp_path)!r}).show(400, 300)"
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    nbclient.NotebookClient(notebook, timeout=HANG_S).execute()
+    outputs = notebook.cells[0].outputs
+    assert not [out for out in outputs if out.get("name") == "stderr"]
+    assert [out for out in outputs if VIEWER in out.get("data", {})]

@@ -4,6 +4,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -60,6 +61,24 @@ def test_bars_and_boxes_of_any_number_of_samples(runs: int) -> None:
         Panel("", ""),
     ]
     assert panel_figure("runs", panels).png(40)[:4] == PNG
+
+
+def test_a_picture_for_a_notebook_has_a_palette_and_looks_the_same() -> None:
+    """No pixel is far off: thin lines keep their colours beside many shades."""
+    x = np.linspace(0.0, 1.0, 200)
+    curves = {name: (x, np.sin(5 * x + k)) for k, name in enumerate(("msckf", "swf", "okvis"))}
+    shades = np.random.default_rng(0).uniform(size=(300, 2))
+    figure = panel_figure("runs", [Panel("x", "y", curves, dots=shades)])
+    light = figure._repr_png_()
+    assert light[25] == 3, "a palette"
+    assert len(light) < 0.6 * len(figure.png(100))
+    whole, reduced = (
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(float)
+        for data in (figure.png(100), light)
+    )
+    apart = np.abs(whole - reduced).max(axis=2)
+    assert apart.mean() < 1.0
+    assert np.percentile(apart, 99.9) < 32
 
 
 @pytest.mark.parametrize("points", [1, 3, 500])

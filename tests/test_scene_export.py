@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -13,6 +14,8 @@ from typer.testing import CliRunner
 import slam_graph as sg
 from slam_graph.cli.main import app
 from slam_graph.errors import ConfigError, DataError
+from slam_graph.results.scene import Scene, SceneImage
+from slam_graph.results.scene_files import write_colmap
 
 
 @pytest.fixture(scope="module")
@@ -78,11 +81,55 @@ def test_the_model_of_colmap_projects_to_what_was_observed(scene: Path, result: 
     assert np.median(errors) < 1.0
 
 
+def references(model: Path) -> tuple[set[tuple[int, int, int]], set[tuple[int, int, int]]]:
+    """(image, observation, point) as the images have them, and as the points have them."""
+    images, points = rows(model / "images.txt"), rows(model / "points3D.txt")
+    of_images = {
+        (int(head[0]), row, int(point))
+        for head, seen in zip(images[::2], images[1::2], strict=True)
+        for row, point in enumerate(seen[2::3])
+        if int(point) != -1
+    }
+    of_points = {
+        (int(image), int(row), int(point[0]))
+        for point in points
+        for image, row in zip(point[8::2], point[9::2], strict=True)
+    }
+    return of_images, of_points
+
+
+def test_images_and_points_refer_to_each_other(scene: Path, tmp_path: Path) -> None:
+    """Also where the place of a point is not known: COLMAP has -1 for such an observation."""
+    of_images, of_points = references(scene / "sparse" / "0")
+    assert len(of_images) > 100
+    assert of_images == of_points
+    camera = sg.simulate(duration_s=0.1, cameras=1).rig.cameras
+    pixels = np.arange(8.0).reshape(4, 2)
+    pose = gtsam.Pose3()
+    seen = [SceneImage(f"{k}.png", 0, pose, pixels, np.array([2, 0, 3, 1])) for k in range(2)]
+    points = np.array([[0, 0, 2], [np.nan, 0, 2], [1, 0, 2], [0, np.inf, 2]], np.float64)
+    made = Scene(camera, seen, points, np.full(4, 128))
+    write_colmap(tmp_path, made)
+    of_images, of_points = references(tmp_path)
+    assert of_images == of_points == {(n, row, p) for n in (1, 2) for row, p in ((0, 3), (1, 1))}
+    assert [len(line) for line in rows(tmp_path / "images.txt")[1::2]] == [12, 12]
+
+
 def test_nerfstudio_has_the_same_cameras(scene: Path) -> None:
+    """Poses, intrinsics and files."""
     table = json.loads((scene / "transforms.json").read_text())
     heads = rows(scene / "sparse" / "0" / "images.txt")[::2]
     assert [f["file_path"] for f in table["frames"]] == [f"images/{head[9]}" for head in heads]
+    ((_, model, width, height, *values),) = rows(scene / "sparse" / "0" / "cameras.txt")
+    intrinsics = dict(
+        zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), values, strict=True)
+    )
+    assert table["camera_model"] == model == "OPENCV"
     for frame, head in zip(table["frames"], heads, strict=True):
+        assert cv2.imread(str(scene / frame["file_path"])).shape[:2] == (frame["h"], frame["w"])
+        assert (frame["w"], frame["h"]) == (int(width), int(height))
+        for name, value in intrinsics.items():
+            np.testing.assert_allclose(frame[name], float(value), rtol=1e-10, atol=1e-12)
         pose = np.array(frame["transform_matrix"])
         qw, qx, qy, qz, *t = map(float, head[1:8])
         R = cv2.Rodrigues(pose[:3, :3] @ np.diag([1.0, -1.0, -1.0]))[0]

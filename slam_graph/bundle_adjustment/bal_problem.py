@@ -119,8 +119,8 @@ class BalProblem(Displayed):
         """The estimates of the file from three sides, as a figure."""
         title = f"{self.name}  ·  {self.cameras} cameras, {self.points} points"
         estimates = self.estimates
-        return self._drawn(
-            "bundle_picture.bundle_figure", title, estimates.points, estimates.centres(), {}
+        return self._drawn_by("bundle_picture").bundle_figure(
+            title, estimates.points, estimates.centres(), {}
         )
 
     def _sketch(self) -> Any:

@@ -86,8 +86,7 @@ class BalSolution(Displayed):
     def plot(self) -> Any:
         """The scene from three sides, and a histogram of the reprojection errors, as a figure."""
         part, adjusted = self.part.problem, self.adjusted
-        return self._drawn(
-            "bundle_picture.bundle_figure",
+        return self._drawn_by("bundle_picture").bundle_figure(
             f"{self.problem.name}  ·  {part.cameras} cameras, {part.points} points, "
             f"{len(part.camera)} observations",
             adjusted.points,

@@ -318,8 +318,11 @@ def execute(
         from slam_graph.results import ResultFolder
 
     with ResultFolder.of_run(output, sequence.info().name) as made:
-        viewer = watching.viewer(made.folder / "recording.rrd", sequence.info().name, known_map)
-        with _progress(sequence, settings, progress) as bar:
+        recording = made.folder / "recording.rrd"
+        with (
+            watching.viewer(recording, sequence.info().name, known_map) as viewer,
+            _progress(sequence, settings, progress) as bar,
+        ):
             result = run_pipeline(
                 sequence,
                 settings,
@@ -329,8 +332,8 @@ def execute(
                 graph_times=graph_times,
             )
         made.files += result.save(made.folder)
-        if watching.mode == "save":
-            made.path("recording.rrd")
+        if recording.is_file():
+            made.path(recording.name)
         made.text("run.log", log)
     return result, made.folder, made.files
 

@@ -70,6 +70,8 @@ def view(
     if mode == "save" and output is None:
         raise ConfigError("--rerun save needs --output FILE.rrd")
     pixels = _size(size)
+    if screenshot is not None:
+        _check_picture(screenshot)
     existing = _recording_of(what)
     if existing is not None:
         _show_existing(existing, mode, output, screenshot, pixels)
@@ -88,6 +90,16 @@ def view(
     for written in (output, screenshot):
         if written is not None:
             typer.echo(str(written))
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse a picture that cannot be written, before any work."""
+    from slam_graph.errors import ConfigError
+    from slam_graph.visualization import RerunRecording
+
+    if path.suffix.lower() != ".png":
+        raise ConfigError(f"--screenshot {path}: a picture ends with .png")
+    RerunRecording.check_picture(path)
 
 
 def _size(text: str) -> tuple[int, int]:

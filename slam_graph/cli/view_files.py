@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import csv
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import is_zipfile
+from zipfile import BadZipFile, is_zipfile
 
 if TYPE_CHECKING:
     from slam_graph.arrays import FloatArray
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from slam_graph.visualization import RerunRecording
 
 _Show = Callable[["RerunRecording"], None]
+_ERRORS = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
+_DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
+"""What NumPy raises for a file that is no archive of arrays, or lacks one."""
 _GRAPH_SUFFIXES = {".g2o", ".graph", ".toro"}
 
 
@@ -52,8 +56,13 @@ def of_file(path: Path) -> _Show | None:
 
 def _begins_like_graph(path: Path) -> bool:
     """Whether the first line is one of a pose graph."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return file.readline().startswith(("VERTEX", "EDGE", "ODOMETRY", "LANDMARK"))
+    from slam_graph.errors import DataError
+
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return file.readline().startswith(("VERTEX", "EDGE", "ODOMETRY", "LANDMARK"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _graph(path: Path) -> _Show:
@@ -74,13 +83,20 @@ def _optimized_graph(folder: Path) -> _Show:
     from slam_graph.errors import DataError
     from slam_graph.pose_graph import PoseGraphSolution, read_pose_graph
 
-    graph = read_pose_graph(folder / "optimized.g2o")
+    path, edges = folder / "optimized.g2o", folder / "edges.csv"
+    graph = read_pose_graph(path)
+    if graph.estimates is None:
+        raise DataError(f"{path}: has no poses; it is no graph that was optimised")
     try:
-        table = np.loadtxt(folder / "edges.csv", delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{folder / 'edges.csv'}: cannot be read ({error})") from error
-    weights = table[:, 3] if len(table) == len(graph.edges) else None
-    assert graph.estimates is not None
+        with edges.open(encoding="utf-8", newline="") as file:
+            weights = np.array([float(row["weight"]) for row in csv.DictReader(file)])
+    except OSError as error:
+        raise DataError(f"{edges}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
+        raise DataError(f"{edges}: not the edges of a graph ({error})") from error
+    if len(weights) != len(graph.edges):
+        count = len(graph.edges)
+        raise DataError(f"{edges}: has {len(weights)} edges, {path.name} beside it {count}")
     odometry = replace(graph, estimates=None, name=folder.resolve().parent.name)
     solution = PoseGraphSolution.of(odometry, graph.estimates, weights)
     return lambda recording: recording.show_pose_graph(solution)
@@ -103,41 +119,18 @@ def _map(path: Path) -> _Show:
 
 def _run(folder: Path, known_map: Path | None) -> _Show:
     """A run from its files."""
-    from slam_graph.errors import SlamGraphError
     from slam_graph.results import load_map, load_result
 
     saved = load_result(folder)
     known = None if known_map is None else load_map(known_map)
     log = folder / "run.log"
-    lines = log.read_text(encoding="utf-8").splitlines() if log.is_file() else []
-    try:
-        rig = saved.rig
-    except SlamGraphError:  # paths and points can be shown without the cameras
-        rig = None
-
-    def show(recording: RerunRecording) -> None:
-        timing = _timing(folder / "timing.csv")
-        recording.show_run(saved, saved.points, timing, rig, lines, known)
-
-    return show
-
-
-def _timing(path: Path) -> dict[str, FloatArray]:
-    """The columns of `timing.csv` by the names of the stages; empty cells are NaN."""
-    import numpy as np
-
-    if not path.is_file():
-        return {}
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(file))
-    if len(rows) < 2:
-        return {}
-    columns = zip(*rows[1:], strict=True)
-    found: dict[str, FloatArray] = {}
-    for title, cells in zip(rows[0], columns, strict=True):
-        kind = np.int64 if title == "stamp_ns" else np.float64
-        found[title.removesuffix("_ms")] = np.array([cell or "nan" for cell in cells]).astype(kind)
-    return found
+    # the log is for reading: what is damaged in it is seen, and costs nothing else
+    lines = log.read_text("utf-8", errors="replace").splitlines() if log.is_file() else []
+    # paths and points can be shown without the cameras
+    rig = saved.rig if (folder / "calibration.yaml").is_file() else None
+    return lambda recording: recording.show_run(
+        saved, saved.points, saved.timing, rig, lines, known
+    )
 
 
 def runs_compared(folders: list[Path]) -> _Show:
@@ -149,7 +142,8 @@ def runs_compared(folders: list[Path]) -> _Show:
 
     saved = [load_result(folder) for folder in folders]
     truth = saved[0].groundtruth
-    start_ns = min(int(run.trajectory.stamps_ns[0]) for run in saved if len(run.trajectory))
+    starts_ns = [int(run.trajectory.stamps_ns[0]) for run in saved if len(run.trajectory)]
+    start_ns = min(starts_ns, default=0)
     runs: dict[str, dict[str, FloatArray]] = {}
     for number, run in enumerate(saved, start=1):
         name = str(run.metrics["algorithm"])
@@ -186,20 +180,22 @@ def _comparison(folder: Path) -> _Show | None:
     """A comparison by `slam-graph compare`: all algorithms on the first data, with one seed."""
     import numpy as np
 
+    from slam_graph.errors import DataError
+
     files = sorted((folder / "runs").glob("*/*.npz"))
     runs: dict[str, dict[str, FloatArray]] = {}
     true_path: FloatArray | None = None
     for file in files:
         if file.parent != files[0].parent:
             continue
-        with np.load(file, allow_pickle=False) as series:
-            if "time_s" not in series or "translation_m_yaw" not in series:
-                continue  # without a truth, or without motion
-            true_path = series.get("true_path", true_path)
-            runs[file.stem] = {
-                "path": series.get("path", np.zeros((0, 3))),
-                "time_s": series["time_s"],
-                "position error [m]": series["translation_m_yaw"],
-                "orientation error [deg]": series["rotation_deg_yaw"],
-            }
+        try:
+            with file.open("rb") as data, np.load(data, allow_pickle=False) as series:
+                if "time_s" not in series or "translation_m_yaw" not in series:
+                    continue  # without a truth, or without motion
+                columns = np.stack([series[name] for name in _ERRORS])
+                path, true_path = series["path"].reshape(-1, 3), series["true_path"]
+        except (*_DAMAGED, BadZipFile, zlib.error) as error:
+            raise DataError(f"{file}: not the series of a run ({error})") from error
+        titles = ("time_s", "position error [m]", "orientation error [deg]")
+        runs[file.stem] = {"path": path, **dict(zip(titles, columns, strict=True))}
     return (lambda recording: recording.show_comparison(runs, true_path)) if runs else None

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -35,8 +36,12 @@ class Watching:
     detail: Literal["normal", "graph"] = "normal"
     address: str | None = None
 
-    def viewer(self, path: Path, name: str, known_map: SlamMap | None = None) -> Any:
-        """The viewer that was asked for, or None.
+    @contextmanager
+    def viewer(self, path: Path, name: str, known_map: SlamMap | None = None) -> Iterator[Any]:
+        """The viewer that was asked for, or None, for the time of a run.
+
+        The run closes it. If it ended before it was shown, nothing of the viewer is left: no part
+        of a file, and no server.
 
         Args:
             path: of the file, if the run is saved.
@@ -47,8 +52,13 @@ class Watching:
             DataError: if it cannot be shown or reached.
         """
         if self.mode == "off":
-            return None
-        return self.recording(path, name).viewer(self.images, self.detail, known_map)
+            yield None
+            return
+        recording = self.recording(path, name)
+        try:
+            yield recording.viewer(self.images, self.detail, known_map)
+        finally:
+            recording.discard()
 
     def show(self, folder: Path, name: str, log: Callable[[RerunRecording], None]) -> list[Path]:
         """Show a result, if that was asked for.

@@ -206,12 +206,12 @@ class RecordedSequence(Displayed, ABC):
         """IMU and true path (if there is one) of the whole recording, as a figure."""
         imu = self.imu() if self.has_imu else None
         truth = self.groundtruth() if self.has_groundtruth else None
-        return self._drawn("notebook_figures.recording_figure", self.name, imu, truth)
+        return self._drawn_by("notebook_figures").recording_figure(self.name, imu, truth)
 
     def _sketch(self) -> Any:
         if not self.has_groundtruth:
             return None
-        return self._drawn("notebook_figures.path_figure", {"ground truth": self.groundtruth()})
+        return self._drawn_by("notebook_figures").path_figure({"ground truth": self.groundtruth()})
 
     @abstractmethod
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:

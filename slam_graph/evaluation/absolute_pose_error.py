@@ -111,8 +111,8 @@ class ErrorSeries(Displayed):
         """The errors over time, and the share of them below each value, as a figure."""
         label = f"error [{self.unit}]" if self.unit else "error"
         rmse = self.statistics.rmse
-        return self._drawn(
-            "notebook_figures.error_figure", self.stamps_ns, self.values, label, rmse
+        return self._drawn_by("notebook_figures").error_figure(
+            self.stamps_ns, self.values, label, rmse
         )
 
     def _sketch(self) -> Any:

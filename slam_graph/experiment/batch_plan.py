@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import glob
+import itertools
 import logging
 import os
 import re
@@ -114,6 +115,7 @@ def plan(
             raise ConfigError(f"{one.origin}: {error}" if one.origin else str(error)) from error
         entry = one.entry
         files = [path for path in (entry.calibration, entry.groundtruth) if path is not None]
+        files += [path for path in entry.sources.values() if Path(path).is_file()]
         tasks.append(
             BatchTask(
                 name=name,
@@ -147,6 +149,7 @@ def _read(text: str, common: Mapping[str, Any]) -> Iterator[_Found]:
             if (value := getattr(entry, name)) is not None
         }
         changes["settings"] = _with_paths(entry.settings, folder)
+        changes["sources"] = absolute_sources(entry.sources, folder)
         for name in ("format", "calibration", "sources"):
             changes[name] = changes.get(name) or getattr(entry, name) or common.get(name)
         known = {name: value for name, value in changes.items() if value is not None}
@@ -157,6 +160,24 @@ def _absolute(text: str, folder: Path) -> str:
     """A path of a list; `demo` is a name if nothing is called so there."""
     path = folder / text
     return text if text == _DEMO and not path.exists() else str(path)
+
+
+def absolute_sources(sources: Mapping[str, str], folder: Path) -> dict[str, str]:
+    """Where sensors are, with absolute paths of files; topics and rates stay as they are.
+
+    Args:
+        sources: by the names of sensors.
+        folder: that paths are relative to.
+    """
+    return {
+        sensor: str(folder / where) if _is_file(sensor, folder / where) else where
+        for sensor, where in sources.items()
+    }
+
+
+def _is_file(sensor: str, path: Path) -> bool:
+    """Whether a source is a file, which may be missing: no topic has a suffix."""
+    return sensor != "rate" and (path.is_file() or path.suffix != "")
 
 
 def _with_paths(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -237,31 +258,47 @@ def _recognised(path: Path, format: str | None) -> bool:
 def _names(entries: Sequence[Entry]) -> list[str]:
     """A name for each recording: its own, with as many folders before it as tell it from others.
 
+    What folders do not tell apart, as one recording that is listed twice, is numbered in the order
+    of the paths. The names do not depend on the order of the recordings.
+
     Raises:
         ConfigError: if two names that were given are the same.
     """
     given = Counter(entry.name for entry in entries if entry.name)
     if given and given.most_common(1)[0][1] > 1:
         raise ConfigError(f"two recordings are called '{given.most_common(1)[0][0]}'; rename one")
-    depths = [1] * len(entries)
-    deepest = max(len(Path(entry.data).parts) for entry in entries)
-    for _ in range(deepest):
-        names = [
-            entry.name or _name(entry.data, depth)
-            for entry, depth in zip(entries, depths, strict=True)
-        ]
-        count = Counter(names)
-        if max(count.values()) == 1:
-            return names
-        depths = [depth + (count[name] > 1) for depth, name in zip(depths, names, strict=True)]
-    return [f"{name}_{k}" if count[name] > 1 else name for k, name in enumerate(names, start=1)]
+    places = [_place(entry.data) for entry in entries]
+    unnamed = {place for place, entry in zip(places, entries, strict=True) if entry.name is None}
+    endings = Counter(place[-depth:] for place in unnamed for depth in range(1, len(place) + 1))
+    named = zip(entries, places, strict=True)
+    own = [entry.name or _name(place, endings) for entry, place in named]
+    order = sorted(
+        range(len(own)), key=lambda k: (entries[k].name is None, len(places[k]), entries[k].data)
+    )
+    names: dict[int, str] = {}
+    for k in order:  # each name is first of all that of the recording that is called so
+        if own[k] not in names.values():
+            names[k] = own[k]
+    for k in order:
+        if k not in names:
+            taken = set(names.values())
+            numbered = (f"{own[k]}_{number}" for number in itertools.count(2))
+            names[k] = next(name for name in numbered if name not in taken)
+    return [names[k] for k in range(len(own))]
 
 
-def _name(data: str, depth: int) -> str:
-    """The last parts of a path, as the name of a folder."""
+def _place(data: str) -> tuple[str, ...]:
+    """The parts of a path, of a file without its suffix."""
     path = Path(data)
-    parts = (path.parent / (path.stem if path.is_file() else path.name)).parts[-depth:]
-    return re.sub(r"[^\w.-]+", "_", "_".join(part.strip("/") for part in parts)).lstrip(".")
+    return path.with_suffix("").parts if path.is_file() else path.parts
+
+
+def _name(place: tuple[str, ...], endings: Mapping[tuple[str, ...], int]) -> str:
+    """As many of the last parts of a path as no other has, as the name of a folder."""
+    depths = range(1, len(place) + 1)
+    depth = next((depth for depth in depths if endings[place[-depth:]] == 1), len(place))
+    parts = [part.strip("/") for part in place[-depth:]]
+    return re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording"
 
 
 def _state(paths: Iterable[str]) -> str:

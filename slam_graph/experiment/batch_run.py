@@ -13,7 +13,7 @@ from typing import Any
 
 from slam_graph.errors import DataError
 from slam_graph.experiment.batch_page import write_page
-from slam_graph.experiment.batch_plan import plan
+from slam_graph.experiment.batch_plan import absolute_sources, plan
 from slam_graph.experiment.batch_summary import Row, rows_of, write_csv
 from slam_graph.experiment.batch_task import BatchTask, remove_remains, running
 from slam_graph.experiment.comparison_plan import Progress
@@ -103,7 +103,7 @@ def batch(
     common = {
         "format": format,
         "calibration": None if calibration is None else str(Path(calibration).resolve()),
-        "sources": dict(sources or {}),
+        "sources": absolute_sources(sources or {}, Path.cwd()),
     }
     done = Batch(folder, plan(names, folder, config, list(overrides), settings, common))
     _make(folder)

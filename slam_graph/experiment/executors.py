@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
@@ -58,8 +59,7 @@ class LocalProcesses:
             except BaseException:
                 self._stopped = True
                 pool.shutdown(wait=False, cancel_futures=True)
-                for process in list(self._running):
-                    _stop(process)
+                _stop(list(self._running))
                 raise
 
     def _do(self, task: str) -> str | None:
@@ -68,6 +68,8 @@ class LocalProcesses:
         process = _start(task)
         self._running.add(process)
         try:
+            if self._stopped:  # since it was asked for above
+                _stop([process])
             return _wait(process)
         finally:
             self._running.discard(process)
@@ -157,14 +159,21 @@ def _start(task: str) -> subprocess.Popen[str]:
     )
 
 
-def _stop(process: subprocess.Popen[str]) -> None:
-    """End the process of a task with SIGINT, upon which it leaves no incomplete files."""
-    with suppress(ProcessLookupError):
-        process.send_signal(signal.SIGINT)
+def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
+    """End the processes of tasks, all at once, with SIGINT: they leave no incomplete files then.
+
+    What has not ended in time, or when there is another Ctrl-C, is killed.
+    """
+    for process in processes:
+        with suppress(ProcessLookupError):
+            process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + _STOP_TIMEOUT_S
     try:
-        process.wait(_STOP_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
+        for process in processes:
+            process.wait(max(deadline - time.monotonic(), 0.0))
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        for process in processes:
+            process.kill()
 
 
 def _wait(process: subprocess.Popen[str]) -> str | None:

@@ -254,7 +254,7 @@ class Trajectory(Displayed):
             others: further trajectories in the same world, by their names, such as `smoothed` or
                 `ground_truth`.
         """
-        return self._drawn("notebook_figures.trajectory_figure", self, others)
+        return self._drawn_by("notebook_figures").trajectory_figure(self, others)
 
     @property
     def duration_s(self) -> float:
@@ -285,7 +285,7 @@ class Trajectory(Displayed):
         }
 
     def _sketch(self) -> Any:
-        return self._drawn("notebook_figures.path_figure", {"path": self}) if len(self) else None
+        return self._drawn_by("notebook_figures").path_figure({"path": self}) if len(self) else None
 
 
 def _time_text(trajectory: Trajectory, row: int) -> str:

@@ -184,7 +184,7 @@ class SlamMap(Displayed):
             f"{name} ({k})" if alike else name: trajectory
             for k, (name, trajectory) in enumerate(zip(names, self.trajectories(), strict=True))
         }
-        return self._drawn("notebook_figures.map_figure", self.points, paths)
+        return self._drawn_by("notebook_figures").map_figure(self.points, paths)
 
     def _sketch(self) -> Any:
         return self.plot() if len(self) else None

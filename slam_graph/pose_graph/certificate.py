@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import Attempt, TenfoldDamping, levenberg_marquardt
+from slam_graph.display import Displayed
 from slam_graph.errors import EstimationError
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_initialization import (
@@ -62,7 +63,7 @@ _GENERATORS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Certificate:
+class Certificate(Displayed):
     """A bound on the global optimum of SE-Sync's objective F.
 
     Attributes:
@@ -83,6 +84,21 @@ class Certificate:
     moved_m: float
     moved_deg: float
     newton_steps: int
+
+    def __repr__(self) -> str:
+        found = "certified" if self.certified else "not certified"
+        return f"Certificate({found}: objective {self.objective:.6g}, gap {self.gap:.2g})"
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "certified": "yes, this is the global optimum" if self.certified else "no",
+            "objective": f"{self.objective:.8g}",
+            "lower bound": f"{self.bound:.8g}",
+            "smallest eigenvalue": f"{self.smallest_eigenvalue:.3g}",
+            "poses": len(self.poses),
+            "moved": f"{self.moved_m:.3g} m, {self.moved_deg:.3g}° RMS",
+            "Newton steps": self.newton_steps,
+        }
 
     @property
     def gap(self) -> float:

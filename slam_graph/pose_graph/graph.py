@@ -152,8 +152,7 @@ class PoseGraph(Displayed):
         """
         if self.estimates is None:
             raise DataError(f"{self.name}: no initial estimates to draw; optimise it first")
-        return self._drawn(
-            "pose_graph_picture.pose_graph_figure",
+        return self._drawn_by("pose_graph_picture").pose_graph_figure(
             f"{self.name}  ·  {len(self.keys)} poses, {len(self.edges)} edges",
             {"": self.estimates.translations},
             self.edges,

@@ -93,8 +93,7 @@ class PoseGraphSolution(Displayed):
     def plot(self) -> Any:
         """The graph before and after, with its edges, as a figure."""
         graph = self.graph
-        return self._drawn(
-            "pose_graph_picture.pose_graph_figure",
+        return self._drawn_by("pose_graph_picture").pose_graph_figure(
             f"{graph.name}  ·  {len(graph.keys)} poses, {len(graph.edges)} edges, "
             f"cost {self.minimum.cost:.6g}",
             {"before": self.before.translations, "after": self.poses.translations},

@@ -107,7 +107,8 @@ def read_ply(path: Path | str) -> FloatArray:
     lines = header.decode("ascii", errors="replace").splitlines()
     properties = tuple(line for line in lines if line.startswith("property"))
     binary = "format binary_little_endian 1.0" in lines
-    if not separator or not binary or properties != _POSITION_PROPERTIES or len(body) % 24:
+    whole = f"element vertex {len(body) // 24}" in lines and len(body) % 24 == 0
+    if not separator or not binary or properties != _POSITION_PROPERTIES or not whole:
         raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
     return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -163,6 +164,7 @@ TRAJECTORY = "trajectory.tum"
 SMOOTHED = "trajectory_smoothed.tum"
 LOOP_CLOSED = "trajectory_loop.tum"
 LOOPS = "loops.csv"
+LOOP_COLUMNS = ("first_stamp_ns", "second_stamp_ns", "accepted")
 IN_MAP = "trajectory_map.tum"
 GROUNDTRUTH = "groundtruth.tum"
 STATES = "states.csv"
@@ -171,6 +173,7 @@ POINTS = "map.ply"
 CONFIG = "config.yaml"
 RIG = "calibration.yaml"
 METRICS = "metrics.json"
+TIMING = "timing.csv"
 
 VELOCITY = NavState.COMPONENTS[6:9]
 ACCEL_BIAS = NavState.COMPONENTS[9:12]
@@ -200,21 +203,45 @@ def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
     Raises:
         DataError: if the file is missing or another table.
     """
+    table = read_table(path, ("stamp_ns", *_COLUMNS), "the states of a run")
+    return table.pop("stamp_ns"), table
+
+
+def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
+    """Read a CSV file of numbers with titles.
+
+    Args:
+        path: of the file.
+        columns: titles that it must have; it may have others, in any order.
+        what: it is, for the error.
+
+    Returns:
+        Columns (N,) by their titles: those that end with `_ns` are int64, the others float64, NaN
+        where empty.
+
+    Raises:
+        DataError: if the file is missing, or another table.
+    """
     try:
-        header, *lines = path.read_text(encoding="utf-8").splitlines()
-        names = header.split(",")[1:]
-        missing = [name for name in _COLUMNS if name not in names]
+        with path.open(encoding="utf-8", newline="") as file:
+            titles, *rows = csv.reader(file)
+        missing = [name for name in columns if name not in titles]
         if missing:
             raise ValueError(f"no column '{missing[0]}'")
-        cells = [line.split(",") for line in lines]
-        stamps = np.array([int(row[0]) for row in cells], dtype=np.int64)
-        values = [[float(cell) if cell else math.nan for cell in row[1:]] for row in cells]
-        table = np.array(values, dtype=np.float64).reshape(len(stamps), len(names))
+        if any(len(row) != len(titles) for row in rows):
+            raise ValueError("a row has not as many cells as there are titles")
+        cells = list(zip(*rows, strict=True)) or [()] * len(titles)
+        return {
+            title: np.array([int(cell) for cell in column], np.int64)
+            if title.endswith("_ns")
+            else np.array([float(cell or "nan") for cell in column], np.float64)
+            for title, column in zip(titles, cells, strict=True)
+        }
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise DataError(f"{path}: not the states of a run ({error})") from error
-    return stamps, dict(zip(names, table.T, strict=True))
+    except (ValueError, OverflowError, csv.Error) as error:
+        reason = "it is empty" if path.stat().st_size == 0 else error
+        raise DataError(f"{path}: not {what} ({reason})") from error
 
 
 def read_tum(path: Path) -> Trajectory:

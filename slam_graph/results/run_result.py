@@ -324,7 +324,7 @@ class RunResult(RunSummary):
         if self.groundtruth is not None:
             files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)
-        files.text("timing.csv", self.logs.timing.csv_lines())
+        files.text(names.TIMING, self.logs.timing.csv_lines())
         files.text(names.CONFIG, [self.config.as_yaml()])
         files.text(names.RIG, [kalibr_text(self.rig)])
         files.json(names.METRICS, self.metrics)

@@ -85,7 +85,7 @@ class RunSummary(Displayed):
         view = self._view()
         paths = {name: estimate.trajectory for name, estimate in view.estimates.items()}
         paths |= dict(view.paths)
-        self._drawn("inline_viewer.show_inline", paths, view.truth, view.points, (width, height))
+        self._drawn_by("inline_viewer").show_inline(paths, view.truth, view.points, (width, height))
 
     def export(
         self,

@@ -31,6 +31,10 @@ from slam_graph.results.run_picture import (
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
 
+_METRICS = ("dataset", "algorithm", "status", "message", "extent", "accuracy")
+_EXTENT = ("start_ns", "frames", "estimated_frames", "coverage")
+"""Keys of `metrics.json` that every version wrote."""
+
 
 def load_result(folder: Path | str) -> SavedRun:
     """Read back what `RunResult.save` or `slam-graph run` wrote.
@@ -85,6 +89,13 @@ class SavedRun(RunSummary):
             raise DataError(f"{path}: cannot be read ({error.strerror})") from error
         except ValueError as error:
             raise DataError(f"{path}: not JSON ({error})") from error
+        try:
+            missing = [key for key in _METRICS if key not in table]
+            missing += [f"extent.{key}" for key in _EXTENT if key not in table["extent"]]
+        except (TypeError, KeyError):
+            missing = ["extent"]
+        if missing:
+            raise DataError(f"{path}: not the metrics of a run (no '{missing[0]}')")
         return table
 
     @property
@@ -115,17 +126,18 @@ class SavedRun(RunSummary):
     @cached_property
     def trajectory(self) -> Trajectory:
         """The causal estimate, with velocities and biases."""
-        return self._with_states(names.read_tum(self.folder / names.TRAJECTORY), names.STATES)
+        return self._with_states(names.TRAJECTORY, names.STATES)
 
-    def _with_states(self, poses: Trajectory, file: str) -> Trajectory:
-        """Poses with the velocities and biases of a file of states.
+    def _with_states(self, path: str, file: str) -> Trajectory:
+        """The poses of a file with the velocities and biases of a file of states.
 
         Raises:
             DataError: if the two are not of the same times.
         """
+        poses = names.read_tum(self.folder / path)
         stamps, states = names.read_states(self.folder / file)
         if not np.array_equal(stamps, poses.stamps_ns):
-            raise DataError(f"{self.folder}: {file} and the trajectory differ in time")
+            raise DataError(f"{self.folder}: {file} and {path} differ in time")
         return replace(
             poses,
             velocities=_columns(states, names.VELOCITY),
@@ -141,10 +153,10 @@ class SavedRun(RunSummary):
     @cached_property
     def smoothed(self) -> Trajectory | None:
         """The trajectory of the final bundle adjustment, if there is one."""
-        poses = _trajectory(self.folder, names.SMOOTHED)
-        if poses is None or not (self.folder / names.SMOOTHED_STATES).is_file():
-            return poses
-        return self._with_states(poses, names.SMOOTHED_STATES)
+        both = (names.SMOOTHED, names.SMOOTHED_STATES)
+        if not all((self.folder / name).is_file() for name in both):  # or of an earlier version
+            return _trajectory(self.folder, names.SMOOTHED)
+        return self._with_states(names.SMOOTHED, names.SMOOTHED_STATES)
 
     @cached_property
     def smoothed_sigmas(self) -> FloatArray | None:
@@ -168,11 +180,18 @@ class SavedRun(RunSummary):
         path = self.folder / names.LOOPS
         if not path.is_file():
             return np.zeros((0, 2), np.int64)
-        try:
-            rows = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, ndmin=2).reshape(-1, 5)
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: not a table of loop closures ({error})") from error
-        return np.asarray(rows[rows[:, 4] == 1, :2])
+        table = names.read_table(path, names.LOOP_COLUMNS, "a table of loop closures")
+        ends = np.column_stack([table[column] for column in names.LOOP_COLUMNS[:2]])
+        return np.asarray(ends[table["accepted"] == 1])
+
+    @property
+    def timing(self) -> dict[str, Any]:
+        """(F,) milliseconds of each frame by the names of the stages, and `stamp_ns`."""
+        path = self.folder / names.TIMING
+        if not path.is_file():
+            return {}
+        table = names.read_table(path, ["stamp_ns"], "the times of a run")
+        return {title.removesuffix("_ms"): column for title, column in table.items()}
 
     @property
     def start_was_given(self) -> bool:

@@ -16,7 +16,7 @@ import cv2
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
@@ -88,6 +88,11 @@ class Scene:
     images: list[SceneImage]
     points: FloatArray
     grey: IntArray
+
+    @property
+    def known(self) -> BoolArray:
+        """(P,) whether the place of each point is known; a file holds no others."""
+        return np.asarray(np.isfinite(self.points).all(axis=1))
 
 
 def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:

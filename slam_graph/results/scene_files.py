@@ -21,6 +21,9 @@ SCENE_FORMATS = ("colmap", "nerfstudio")
 _MODELS = {"none": "PINHOLE", "radtan": "OPENCV", "equidistant": "OPENCV_FISHEYE"}
 """Names of the camera models in both formats; their coefficients are in the same order there."""
 
+_NO_POINT = -1
+"""In place of the number of a point, for an observation of which there is none."""
+
 _DISTORTION = {
     "PINHOLE": (),
     "OPENCV": ("k1", "k2", "p1", "p2"),
@@ -134,13 +137,15 @@ def _camera_lines(scene: Scene) -> Iterator[str]:
 def _image_lines(scene: Scene) -> Iterator[str]:
     yield "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
     yield "# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    known = scene.known
     for number, image in enumerate(scene.images, 1):
         pose = image.world_T_camera.inverse()
         q: Any = pose.rotation().toQuaternion()  # an Eigen type that the stubs do not know
         values = (q.w(), q.x(), q.y(), q.z(), *pose.translation())
         numbers = " ".join(f"{value:.12g}" for value in values)
         yield f"{number} {numbers} {image.camera + 1} {image.name}\n"
-        rows = zip(image.pixels + COLMAP_OFFSET_PX, image.points + 1, strict=True)
+        ids = np.where(known[image.points], image.points + 1, _NO_POINT)
+        rows = zip(image.pixels + COLMAP_OFFSET_PX, ids, strict=True)
         yield " ".join(f"{u:.4f} {v:.4f} {point}" for (u, v), point in rows) + "\n"
 
 
@@ -153,16 +158,17 @@ def _point_lines(scene: Scene) -> Iterator[str]:
             continue
         camera = scene.cameras[image.camera].camera
         in_camera = image.world_T_camera.inverse().matrix()
-        seen = scene.points[image.points] @ in_camera[:3, :3].T + in_camera[:3, 3]
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):  # of points that are not known
+            seen = scene.points[image.points] @ in_camera[:3, :3].T + in_camera[:3, 3]
             distances = np.linalg.norm(camera.project(seen) - image.pixels, axis=1)
         errors[image.points] += np.nan_to_num(distances)
         for row, point in enumerate(image.points.tolist()):
             tracks[point].append(f"{number} {row}")
     yield "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
-    rows = zip(scene.points.tolist(), scene.grey.tolist(), errors, tracks, strict=True)
-    for number, ((x, y, z), grey, error, track) in enumerate(rows, 1):
-        if not np.isfinite([x, y, z]).all():
+    lists = (scene.points.tolist(), scene.grey.tolist(), scene.known.tolist())
+    rows = zip(*lists, errors, tracks, strict=True)
+    for number, ((x, y, z), grey, known, error, track) in enumerate(rows, 1):
+        if not known:
             continue
         mean = error / max(len(track), 1)
         line = f"{number} {x:.9g} {y:.9g} {z:.9g} {grey} {grey} {grey} {mean:.4g}"
@@ -171,7 +177,7 @@ def _point_lines(scene: Scene) -> Iterator[str]:
 
 def _write_cloud(path: Path, scene: Scene) -> None:
     """The points as a PLY file with float coordinates and colours."""
-    kept = np.isfinite(scene.points).all(axis=1)
+    kept = scene.known
     vertices = np.empty(int(kept.sum()), [("place", "<f4", 3), ("colour", "u1", 3)])
     vertices["place"] = scene.points[kept]
     vertices["colour"] = scene.grey[kept, None]

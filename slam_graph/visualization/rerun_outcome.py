@@ -237,7 +237,7 @@ class OutcomeLog:
         if closed is None:
             return
         self.path("path/loop_closed", closed, LOOP)
-        if len(loops_ns) == 0:
+        if len(loops_ns) == 0 or len(closed) == 0:
             return
         rows = np.clip(np.searchsorted(closed.stamps_ns, loops_ns), 0, len(closed) - 1)
         lines = self._stream.rr.LineStrips3D(closed.positions[rows], colors=LOOP, radii=-1.2)

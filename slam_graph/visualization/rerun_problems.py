@@ -47,8 +47,7 @@ def show_pose_graph(stream: RerunStream, solution: PoseGraphSolution) -> None:
         places = poses.in_space().translations
         colours = scaled(logs[name], float(min(low, high - 1.0)), float(high))
         _log_edges(stream, name, places, graph.edges, colours, loops, weights < 0.5)
-        values = np.column_stack([np.where(loops, np.nan, logs[name]), logs[name]])
-        _log_residuals(stream, name, values, loops)
+        _log_residuals(stream, name, logs[name], loops)
     eyes = [_eye(poses.in_space().translations) for poses in (solution.before, solution.poses)]
     text = _summary(solution, {name: float(values.sum()) for name, values in chi2.items()})
     stream.log("summary", stream.rr.TextDocument(text, media_type="text/markdown"), static=True)
@@ -79,7 +78,7 @@ def _log_edges(
 
 
 def _log_residuals(stream: RerunStream, name: str, values: FloatArray, loops: BoolArray) -> None:
-    """log10 χ² of each edge over its number."""
+    """log10 χ² (M,) of each edge over its number."""
     rr = stream.rr
     colour = SKY if name == "before" else VERMILLION
     numbers = np.arange(len(values))
@@ -90,7 +89,7 @@ def _log_residuals(stream: RerunStream, name: str, values: FloatArray, loops: Bo
         size = 1.2 if kind == "odometry" else 2.2
         style = rr.SeriesPoints(colors=colour, names=label, markers=shape, marker_sizes=size)
         stream.log(entity, style, static=True)
-        columns = rr.Scalars.columns(scalars=values[rows, 1])
+        columns = rr.Scalars.columns(scalars=values[rows])
         if rows.any():
             stream.send_along(entity, rr.TimeColumn(EDGE, sequence=numbers[rows]), columns)
 
@@ -186,7 +185,7 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
     text = _bundle_summary(solution, rms)
     stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
     after = solution.adjusted
-    eye = _scene_eye(after.centres(), -after.rotations[:, 1].mean(axis=0), after.points)
+    eye = _scene_eye(after.centres(), after.points)
     stream.arrange(_bundle_layout(eye, list(scenes)))
 
 
@@ -197,7 +196,7 @@ def _worst_of_points(point: IntArray, count: int, errors: FloatArray) -> FloatAr
     return worst
 
 
-def _scene_eye(centres: FloatArray, _: FloatArray, points: FloatArray) -> Eye:
+def _scene_eye(centres: FloatArray, points: FloatArray) -> Eye:
     """From behind the cameras, so that they and most points are in view."""
     low, high = np.percentile(points, (10.0, 90.0), axis=0)
     low, high = (

@@ -22,6 +22,7 @@ from slam_graph.visualization.rerun_outcome import FinishedRun
 from slam_graph.visualization.rerun_problems import show_bundle, show_pose_graph
 from slam_graph.visualization.rerun_screenshot import (
     open_recording,
+    require_picture,
     save_screenshot,
     serve_recording,
     stop,
@@ -77,6 +78,10 @@ class RerunRecording:
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
         self._stream.close()
+
+    def discard(self) -> None:
+        """End without what was sent; does nothing to a recording that is closed."""
+        self._stream.discard()
 
     def viewer(
         self,
@@ -137,8 +142,8 @@ class RerunRecording:
         """Several runs over one another.
 
         Args:
-            runs: for each name `path` (N, 3) in m, `time_s` (N,), and errors (N,) by the titles of
-                their plots.
+            runs: for each name `path` (S, 3) of all states in m, `time_s` (N,), and errors (N,) at
+                these times by the titles of their plots.
             true_path: (M, 3) in the same world, if there is one.
         """
         compared = [
@@ -156,6 +161,11 @@ class RerunRecording:
     def screenshot(recording: Path, picture: Path, size: tuple[int, int] = (1600, 1000)) -> None:
         """A picture of how a saved recording opens; see `save_screenshot` for arguments."""
         save_screenshot(recording, picture, size)
+
+    @staticmethod
+    def check_picture(picture: Path) -> None:
+        """Make sure that a screenshot can be written; see `require_picture` for errors."""
+        require_picture(picture)
 
     @staticmethod
     def open(recording: Path) -> None:

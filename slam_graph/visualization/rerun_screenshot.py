@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -42,10 +43,8 @@ def save_screenshot(recording: Path, picture: Path, size: tuple[int, int] = (160
     Raises:
         DataError: if the recording cannot be read, or there is no driver to draw with.
     """
-    if not recording.is_file():
-        raise DataError(f"{recording}: no such file")
-    if picture.suffix.lower() != ".png":
-        raise DataError(f"{picture}: cannot be written; screenshots are .png")
+    require_readable(recording)
+    require_picture(picture)
     port = free_port()
     command = [*_viewer_command(), "--headless", "--window-size", f"{size[0]}x{size[1]}"]
     command += ["--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen", str(recording)]
@@ -69,20 +68,58 @@ def save_screenshot(recording: Path, picture: Path, size: tuple[int, int] = (160
     good, data = cv2.imencode(".png", smaller, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert good
     try:
-        picture.parent.mkdir(parents=True, exist_ok=True)
         picture.write_bytes(data.tobytes())
     except OSError as error:
         raise DataError(f"{picture}: cannot be written ({error.strerror})") from error
+
+
+def require_picture(picture: Path) -> None:
+    """Make sure that a picture can be written, before the work is done; its folder is made.
+
+    Raises:
+        DataError: if it has another suffix than `.png`, or cannot be written there.
+    """
+    if picture.suffix.lower() != ".png":
+        raise DataError(f"{picture}: cannot be written; screenshots are .png")
+    try:
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=picture.parent):
+            pass
+    except OSError as error:
+        raise DataError(f"{picture}: cannot be written ({error.strerror})") from error
+    if picture.is_dir():
+        raise DataError(f"{picture}: is a folder; name a file")
+    if picture.exists() and not os.access(picture, os.W_OK):
+        raise DataError(f"{picture}: cannot be replaced; it is write-protected")
+
+
+def require_readable(recording: Path) -> None:
+    """Make sure that a recording can be read to its end: the viewer would show what it can.
+
+    Raises:
+        DataError: if there is no such file, or it is damaged.
+    """
+    from rerun.chunk import RrdReader
+
+    if not recording.is_file():
+        raise DataError(f"{recording}: no such file")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a recording without an index can be shown
+            for _ in RrdReader(recording).stream():
+                pass
+    except (RuntimeError, OSError, ValueError) as error:
+        reason = " ".join(str(error).split()).rpartition(f"{recording}: ")[2]
+        raise DataError(f"{recording}: damaged, or no recording of Rerun ({reason})") from error
 
 
 def open_recording(recording: Path) -> None:
     """Open a recording in a window, and go on.
 
     Raises:
-        DataError: if there is no such file, or no display.
+        DataError: if there is no such file, it is damaged, or there is no display.
     """
-    if not recording.is_file():
-        raise DataError(f"{recording}: no such file")
+    require_readable(recording)
     if not has_display():
         raise DataError(
             f"{recording}: cannot be shown here: there is no display; use --rerun serve for a "
@@ -98,10 +135,9 @@ def serve_recording(recording: Path) -> tuple[subprocess.Popen[bytes], str]:
         The server, and the address to open.
 
     Raises:
-        DataError: if there is no such file.
+        DataError: if there is no such file, or it is damaged.
     """
-    if not recording.is_file():
-        raise DataError(f"{recording}: no such file")
+    require_readable(recording)
     port, web_port = free_port(), free_port()
     command = [*_viewer_command(), "--serve-web", "--port", str(port), "--bind", "127.0.0.1"]
     command += ["--web-viewer-port", str(web_port), str(recording)]

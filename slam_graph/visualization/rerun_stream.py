@@ -58,6 +58,7 @@ class RerunStream:
 
         self.rr: Any = rerun
         self.url: str | None = None
+        self._closed = False
         # a file is written in large pieces: small ones have more frame than content
         batches = rerun.ChunkBatcherConfig(flush_tick=_TICK_S, flush_num_bytes=_CHUNK_BYTES)
         self.saves = mode == "save"
@@ -125,6 +126,7 @@ class RerunStream:
     def close(self) -> None:
         """Send what is left; a saved file appears under its name. A server goes on serving."""
         self._raw.flush()
+        self._closed = True
         if self.url is not None:  # to disconnect would end it
             return
         self._raw.disconnect()
@@ -133,7 +135,9 @@ class RerunStream:
             self._partial = None
 
     def discard(self) -> None:
-        """End without what was sent: no file appears."""
+        """End without what was sent: no file appears. A stream that is closed stays as it is."""
+        if self._closed:
+            return
         self._raw.disconnect()
         if self._partial is not None:
             self._partial.unlink(missing_ok=True)

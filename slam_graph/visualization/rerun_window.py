@@ -3,9 +3,9 @@
 """The factor graph of a window and its information matrix, before and after marginalization.
 
 Circles are variables, lines are factors: a projection joins a landmark and a pose, the dynamics
-join the states of two frames, and the prior, a square, is joined to all that it knows something of.
-What is red leaves in this step. A matrix shows |Λᵢⱼ| / √(Λᵢᵢ Λⱼⱼ) on a logarithmic scale; what is
-exactly zero is left dark, so that marginalization is seen to fill it.
+join the states of two frames, and the prior, the purple circle below, is joined to all that it
+knows something of. What is red leaves in this step. A matrix shows |Λᵢⱼ| / √(Λᵢᵢ Λⱼⱼ) on a
+logarithmic scale; what is exactly zero is left dark, so that marginalization is seen to fill it.
 """
 
 from __future__ import annotations

@@ -149,9 +149,9 @@ class ComparedRun:
 
     Attributes:
         name: of the algorithm or the folder.
-        path: (N, 3) positions in the world of the truth, or of the first run, m.
-        time_s: (N,) since the first frame.
-        errors: (N,) by the title of a plot.
+        path: (S, 3) positions of all states in the world of the truth, or of the first run, m.
+        time_s: (N,) since the first frame, of the states that have a true pose.
+        errors: (N,) at these times, by the title of a plot.
     """
 
     name: str

@@ -108,7 +108,7 @@ def _save(path: Path, fields: dict[str, Any]) -> None:
 
 def _load(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as data, np.load(data, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except Exception as error:  # a damaged zip fails in many ways
         raise DataError(f"{path}: cannot be read ({error}); record it again") from None
