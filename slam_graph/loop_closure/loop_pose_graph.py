@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
@@ -218,10 +218,11 @@ def _sigma(
     squares: FloatArray, variances: FloatArray, seconds: FloatArray, freedom: int, configured: float
 ) -> float:
     """σ of a random walk that explains squared errors beyond their own variances."""
+    median = 2.0 * gammaincinv(0.5 * freedom, 0.5)  # of chi-squared
 
     def excess(log_sigma: float) -> float:
         whole = variances + np.exp(2.0 * log_sigma) * seconds
-        return float(np.median(squares / whole) - chi2.median(freedom))
+        return float(np.median(squares / whole) - median)
 
     low, high = np.log(_MIN_DRIFT * configured), np.log(_MAX_DRIFT * configured)
     if excess(low) <= 0.0:

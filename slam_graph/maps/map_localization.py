@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray
 from slam_graph.loop_closure import Keyframe, LoopClosureConfig
@@ -32,7 +32,7 @@ from slam_graph.sensors import Rig
 
 CONFIDENCE = 0.999
 """χ² quantile of consistent matches: so high because a rejected true match costs little."""
-CONSISTENT_CHI2 = float(chi2.ppf(CONFIDENCE, 6))
+CONSISTENT_CHI2 = float(2.0 * gammaincinv(3.0, CONFIDENCE))
 """Largest squared Mahalanobis distance of a consistent match."""
 TILT_SIGMA = 5e-3
 """Standard deviation of roll and pitch of the run, rad."""

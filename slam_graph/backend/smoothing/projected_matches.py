@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
@@ -73,12 +73,12 @@ def consistent_matches(
     count, chance = len(offsets), min(limit**2 * chance, 1.0)
     lengths = np.linalg.norm(offsets, axis=1)
     undrifted = lengths < limit
-    alarms = tests * binom.sf(np.sum(undrifted) - 1, count, chance)
+    alarms = tests * bdtrc(np.sum(undrifted) - 1, count, chance)
     consistent, residuals = _largest_set(J, offsets, limit, rng)
     if alarms < _MAX_FALSE_ALARMS and np.sum(undrifted) >= np.sum(consistent):
         return undrifted, lengths
     # two matches were sampled to fit
-    drifted = tests * math.comb(count, 2) * binom.sf(np.sum(consistent) - 3, count - 2, chance)
+    drifted = tests * math.comb(count, 2) * bdtrc(np.sum(consistent) - 3, count - 2, chance)
     if drifted < _MAX_FALSE_ALARMS:
         return consistent, residuals
     return undrifted & (alarms < _MAX_FALSE_ALARMS), lengths
