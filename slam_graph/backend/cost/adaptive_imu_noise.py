@@ -89,6 +89,14 @@ class MotionChange:
         force = np.linalg.norm(samples.accel.mean(axis=0) - before.accel.mean(axis=0))
         return MotionChange(float(rate) / root_s, float(force) / root_s)
 
+    def added_to(self, imu: ImuNoise) -> ImuNoise:
+        """Noise whose random walks have errors of scale and alignment in them."""
+        return replace(
+            imu,
+            gyro_random_walk=math.hypot(imu.gyro_random_walk, GYRO_SCALE_SIGMA * self.rate),
+            accel_random_walk=math.hypot(imu.accel_random_walk, ACCEL_SCALE_SIGMA * self.force),
+        )
+
 
 _STEADY = MotionChange()
 
@@ -163,12 +171,13 @@ class DynamicsNoise:
             change: of the motion since the interval before.
         """
         scale *= self._config.imu_scale
-        gyro_walk = self._imu.gyro_random_walk * self._gyro_walk.factor
-        accel_walk = self._imu.accel_random_walk * self._accel_walk.factor
+        imu = replace(
+            self._imu,
+            gyro_random_walk=self._imu.gyro_random_walk * self._gyro_walk.factor,
+            accel_random_walk=self._imu.accel_random_walk * self._accel_walk.factor,
+        )
         if self._config.adaptive.enabled:
-            gyro_walk = math.hypot(gyro_walk, GYRO_SCALE_SIGMA * change.rate)
-            accel_walk = math.hypot(accel_walk, ACCEL_SCALE_SIGMA * change.force)
-        imu = replace(self._imu, gyro_random_walk=gyro_walk, accel_random_walk=accel_walk)
+            imu = change.added_to(imu)
         gyro, accel = (max(factor, least_factor) for factor in self.factors)
         return imu.preintegration_params(self._config.gravity, scale, gyro, accel)
 

@@ -26,6 +26,7 @@ from gtsam.symbol_shorthand import B, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
@@ -254,12 +255,17 @@ class RecordingFactors:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
         factors: list[gtsam.NonlinearFactor] = []
         imu, noise = self._segment.imu, self._backend.noise
-        imu_noise = self.noise.walks(self._rig.imu)
+        calibrated, before = self.noise.walks(self._rig.imu), None
         stamps_ns = self._segment.keyframe_stamps_ns.tolist()
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
             start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
+            samples = imu.between(start_ns, end_ns)
+            imu_noise = calibrated
+            if noise.adaptive.enabled:
+                imu_noise = MotionChange.between(before, samples).added_to(calibrated)
             params = imu_noise.preintegration_params(noise.gravity, *self._noise_factors(k))
-            pim = imu.between(start_ns, end_ns).preintegrated(values.atConstantBias(B(k)), params)
+            pim = samples.preintegrated(values.atConstantBias(B(k)), params)
+            before = samples
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():
                 factors += zero_velocity_factors(k, k + 1)
