@@ -182,9 +182,11 @@ def _compared(run: SavedRun, first: SavedRun, start_ns: int) -> dict[str, FloatA
     }
 
 
-def _comparison(folder: Path) -> _Show | None:
+def _comparison(folder: Path) -> _Show:
     """A comparison by `slam-graph compare`: all algorithms on the first data, with one seed."""
     import numpy as np
+
+    from slam_graph.errors import DataError
 
     files = sorted((folder / "runs").glob("*/*.npz"))
     runs: dict[str, dict[str, FloatArray]] = {}
@@ -193,13 +195,15 @@ def _comparison(folder: Path) -> _Show | None:
         if file.parent != files[0].parent:
             continue
         with np.load(file, allow_pickle=False) as series:
-            if "time_s" not in series or "translation_m_yaw" not in series:
-                continue  # without a truth, or without motion
+            run = {"path": series.get("path", np.zeros((0, 3))), "time_s": np.zeros(0)}
+            if "time_s" in series and "translation_m_yaw" in series:
+                run["time_s"] = series["time_s"]
+                run["position error [m]"] = series["translation_m_yaw"]
+                run["orientation error [deg]"] = series["rotation_deg_yaw"]
+            elif len(run["path"]) == 0:
+                continue  # without motion
             true_path = series.get("true_path", true_path)
-            runs[file.stem] = {
-                "path": series.get("path", np.zeros((0, 3))),
-                "time_s": series["time_s"],
-                "position error [m]": series["translation_m_yaw"],
-                "orientation error [deg]": series["rotation_deg_yaw"],
-            }
-    return (lambda recording: recording.show_comparison(runs, true_path)) if runs else None
+            runs[file.stem] = run
+    if not runs:
+        raise DataError(f"{folder}: nothing to show: no run has a path")
+    return lambda recording: recording.show_comparison(runs, true_path)

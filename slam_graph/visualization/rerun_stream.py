@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import sys
+import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -68,6 +70,7 @@ class RerunStream:
             switch(False, recording=self._raw)
         self._path = self._partial = path if mode == "save" else None
         self._absolute: bool | None = None
+        self._layout: Any = None
         if mode == "save":
             self._save(path)
         elif mode == "spawn":
@@ -119,11 +122,17 @@ class RerunStream:
         self._raw.send_columns(entity, indexes=[times], columns=columns)
 
     def arrange(self, blueprint: Any) -> None:
-        """Send the layout of the viewer."""
-        self._raw.send_blueprint(blueprint)
+        """Send the layout of the viewer; a file gets the last one only, as each is 0.2 MB."""
+        if self.saves:
+            self._layout = blueprint
+        else:
+            self._raw.send_blueprint(blueprint)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name. A server goes on serving."""
+        if self._layout is not None:
+            self._raw.send_blueprint(self._layout)
+            self._layout = None
         self._raw.flush()
         if self.url is not None:  # to disconnect would end it
             return
@@ -163,8 +172,11 @@ class RerunStream:
                 "cannot open a Rerun window: there is no display (DISPLAY and WAYLAND_DISPLAY are "
                 "not set); use --rerun save, or --rerun serve for a browser"
             )
+        # the viewer of this installation, which need not be on the path
+        places = [sysconfig.get_path("scripts"), os.environ.get("PATH", "")]
+        viewer = shutil.which("rerun", path=os.pathsep.join(places))
         try:
-            self._raw.spawn()
+            self.rr.spawn(executable_path=viewer, recording=self._raw)
         except (RuntimeError, OSError) as error:
             first = str(error).splitlines()[0]
             raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -15,9 +16,9 @@ from slam_graph.backend import Estimator
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
-from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
+from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
-from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
@@ -106,7 +107,8 @@ class RerunViewer:
         self,
         outcome_plots: frozenset[str] = frozenset(),
         eye: Eye | None = None,
-        in_map: Trajectory | None = None,
+        map_path: FloatArray | None = None,
+        spans: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Send the layout."""
         plots = outcome_plots | StepSeries.PLOTS
@@ -117,7 +119,8 @@ class RerunViewer:
             log=True,
             window=self._detail == "graph",
             in_map=self._known_map is not None,
-            map_path=None if in_map is None or not len(in_map) else in_map.positions,
+            map_path=map_path,
+            spans=spans or {},
         )
         self._stream.arrange(odometry(shown, eye))
 
@@ -167,7 +170,8 @@ class RerunViewer:
         plots = self._outcome.show(result)
         best = result.smoothed or result.trajectory
         points = np.concatenate([*self._heights, np.zeros((0, 3))])
-        self._arrange(plots, Eye.on(best.positions, points), result.in_map)
+        eye, spans = Eye.on(best.positions, points, around=RIG_M), self._series.spans
+        self._arrange(plots, eye, places_in_map(result, self._known_map), spans)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
