@@ -183,8 +183,7 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         )
         counts, _ = np.histogram(errors[name], edges)
         colour = SKY if name == "before" else VERMILLION
-        middles, widths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-        bars = rr.BarChart(counts, abscissa=middles, widths=widths, color=colour)
+        bars = rr.BarChart(counts, abscissa=edges[:-1], widths=np.diff(edges), color=colour)
         stream.log(f"errors/{name}", bars, static=True)
     rms = {name: float(np.sqrt(np.mean(errors[name] ** 2))) for name in scenes}
     text = _bundle_summary(solution, rms)

@@ -24,11 +24,12 @@ from slam_graph.visualization.rerun_blueprints import (
     space,
     whole,
     whole_axis,
+    with_ticks,
 )
 from slam_graph.visualization.rerun_images import CameraViews
 from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
-from slam_graph.visualization.rerun_palette import CYCLE, TRUTH
+from slam_graph.visualization.rerun_palette import CYCLE, CYCLE_NAMES, TRUTH
 from slam_graph.visualization.rerun_series import SeriesLog
 from slam_graph.visualization.rerun_stream import RerunStream
 
@@ -180,7 +181,7 @@ def show_comparison(
 
     rr, titles, places = stream.rr, dict[str, str](), list[FloatArray]()
     stream.log("paths", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    rows = []
+    rows, largest = [], dict[str, float]()
     for number, run in enumerate(runs):
         colour, name = CYCLE[number % len(CYCLE)], rr.escape_entity_path_part(run.name)
         places.append(run.path)
@@ -189,10 +190,10 @@ def show_comparison(
             colors=colour,
             radii=-1.2,
             labels=[run.name],
-            show_labels=not run.errors,  # with errors their plots have a legend
+            show_labels=False,
         )
         stream.log(f"paths/{name}", line, static=True)
-        row = [run.name]
+        row = [run.name, CYCLE_NAMES[number % len(CYCLE)]]
         for index, (title, values) in enumerate(run.errors.items()):
             entity = titles.setdefault(title, f"errors/{index}")
             style = rr.SeriesLines(colors=colour, names=run.name, widths=1.5)
@@ -201,6 +202,7 @@ def show_comparison(
             times = rr.TimeColumn(_SINCE_START, duration=run.time_s)
             stream.send_along(f"{entity}/{name}", times, columns)
             row.append(f"{np.sqrt(np.mean(values**2)):.4g}")
+            largest[title] = max(largest.get(title, 0.0), float(np.max(values, initial=0.0)))
         rows.append("| " + " | ".join(row) + " |")
     if true_path is not None:
         line = rr.LineStrips3D(
@@ -208,10 +210,9 @@ def show_comparison(
         )
         stream.log("paths/ground_truth", line, static=True)
         places.append(true_path)
-    # with one column Rerun shows no table
-    head = "| RMSE | " + " | ".join(titles or ["–"]) + " |\n"
-    head += "|---" * (1 + max(len(titles), 1)) + "|\n"
-    grey = "" if true_path is None else "\n\nLight grey: ground truth."
+    head = "| RMSE | " + " | ".join(["colour", *titles]) + " |\n" + "|---" * (2 + len(titles))
+    head += "|\n"
+    grey = "" if true_path is None else "\n\nThin, light grey: ground truth."
     text = "# Comparison\n\n" + head + "\n".join(rows) + grey
     stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
     plots: list[Any] = [
@@ -220,6 +221,7 @@ def show_comparison(
             origin=f"/{entity}",
             plot_legend=rrb.Corner2D.LeftTop,
             axis_x=whole_axis(),
+            axis_y=rrb.ScalarAxis(range=with_ticks(0.0, largest[title])),
         )
         for title, entity in titles.items()
     ]
