@@ -31,6 +31,8 @@ from slam_graph.visualization.rerun_series import PLOTS
 
 DURATION_S = 6.0
 TIMELINES = {"frame", "sensor_time"}
+NOBODY = "rerun+http://127.0.0.1:9/proxy"
+"""An address at which no viewer listens."""
 
 OF_A_RUN = {
     *("/world/path/causal", "/world/path/smoothed", "/world/path/groundtruth", "/world/gravity"),
@@ -282,7 +284,9 @@ def test_a_window_is_opened_by_the_viewer_that_is_installed_beside(
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr("rerun.spawn", lambda **arguments: opened.update(arguments))
-    RerunRecording("spawn", "name")
+    monkeypatch.setattr("slam_graph.visualization.rerun_stream.DEFAULT_ADDRESS", NOBODY)
+    with pytest.raises(DataError, match="the viewer did not start"):
+        RerunRecording("spawn", "name")
     assert Path(opened["executable_path"]).is_file()
 
 
@@ -293,7 +297,7 @@ def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(DataError, match="no display"):
         RerunRecording("spawn", "name")
     with pytest.raises(DataError, match="no Rerun viewer can be reached"):
-        RerunRecording("connect", "name", address="rerun+http://127.0.0.1:9/proxy")
+        RerunRecording("connect", "name", address=NOBODY)
     with pytest.raises(DataError, match="no address of a viewer"):
         RerunRecording("connect", "name", address="localhost")
     with pytest.raises(DataError, match="cannot be written"):

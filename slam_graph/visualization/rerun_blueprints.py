@@ -133,6 +133,13 @@ def growing(entities: Iterable[str]) -> Any:
     return {entity: [rrb.VisibleTimeRanges(ranges)] for entity in entities}
 
 
+def _dark() -> Any:
+    """The background for colours that are light, also where the viewer itself is light."""
+    import rerun.blueprint as rrb
+
+    return rrb.Background(color=_BACKGROUND, kind=rrb.BackgroundKind.SolidColor)
+
+
 def space(
     name: str,
     origin: str,
@@ -149,7 +156,7 @@ def space(
         origin=origin,
         contents=list(contents),
         overrides=growing(grown),
-        background=rrb.Background(color=_BACKGROUND, kind=rrb.BackgroundKind.SolidColor),
+        background=_dark(),
         line_grid=rrb.LineGrid3D(visible=True, color=_GRID, stroke_width=0.7),
         eye_controls=_controls(eye, tracked),
     )
@@ -297,7 +304,7 @@ def _camera(name: str, entity: str) -> Any:
         ),
     ]
     overrides: Any = {f"{entity}/tails": [rrb.VisibleTimeRanges(tails)]}
-    return rrb.Spatial2DView(name=name, origin=entity, overrides=overrides)
+    return rrb.Spatial2DView(name=name, origin=entity, overrides=overrides, background=_dark())
 
 
 def _plots(shown: Shown) -> list[Any]:
@@ -331,7 +338,10 @@ def window() -> Any:
 
     return rrb.Vertical(
         rrb.Spatial2DView(
-            name="Factor graph of the window", origin="/window/graph", visual_bounds=bounds
+            name="Factor graph of the window",
+            origin="/window/graph",
+            visual_bounds=bounds,
+            background=_dark(),
         ),
         rrb.Horizontal(
             rrb.Spatial2DView(name="Information before marginalization", origin="/window/before"),

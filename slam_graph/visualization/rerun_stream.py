@@ -177,6 +177,13 @@ class RerunStream:
         viewer = shutil.which("rerun", path=os.pathsep.join(places))
         try:
             self.rr.spawn(executable_path=viewer, recording=self._raw)
+            # of a viewer that ends at once, as on a display that is gone, Rerun only warns
+            require_viewer(DEFAULT_ADDRESS)
+        except DataError as error:
+            raise DataError(
+                "cannot open a Rerun window: the viewer did not start; use --rerun save, or "
+                "--rerun serve for a browser"
+            ) from error
         except (RuntimeError, OSError) as error:
             first = str(error).splitlines()[0]
             raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error
