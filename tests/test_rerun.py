@@ -3,6 +3,7 @@
 """Recordings for Rerun, read back by Rerun: what is promised is in them, at its times."""
 
 import logging
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -288,6 +289,18 @@ def test_a_window_is_opened_by_the_viewer_that_is_installed_beside(
     with pytest.raises(DataError, match="the viewer did not start"):
         RerunRecording("spawn", "name")
     assert Path(opened["executable_path"]).is_file()
+
+
+def test_a_window_that_does_not_open_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tmp_path / "a.rrd"
+    recording.touch()
+    ends = [sys.executable, "-c", "raise SystemExit(1)"]
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("slam_graph.visualization.rerun_screenshot._viewer_command", lambda: ends)
+    with pytest.raises(DataError, match="no window could be opened"):
+        RerunRecording.open(recording)
 
 
 def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
