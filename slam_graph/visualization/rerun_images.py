@@ -146,14 +146,15 @@ class CameraViews:
             fates[np.isin(camera.ids, rejected)] = _GATED
             entity = self._entity(index)
             places = _on_screen(camera.pixels, shrink)
-            marks = rr.Points2D.from_fields(positions=places, class_ids=fates)
-            self._stream.log(f"{entity}/features", marks)
+            named = f"{entity}/features"
+            self._stream.log_rows(named, rr.Points2D, positions=places, class_ids=fates)
             if self._frames % self._stride == 0 and index < self._detailed:
                 pieces, ages = tails.pieces()
                 rows = self._visible(pieces, _UNSEEN_TAIL)
                 colours = scaled(ages[rows], 0.0, FULL_AGE)
-                lines = rr.LineStrips2D.from_fields(strips=pieces[rows], colors=colours)
-                self._stream.log(f"{entity}/tails", lines)
+                strips = pieces[rows]
+                named = f"{entity}/tails"
+                self._stream.log_rows(named, rr.LineStrips2D, strips=strips, colors=colours)
         self._frames += 1
         for index, outliers in enumerate(features.outliers):
             if not len(outliers) and index not in self._rejecting:
@@ -190,9 +191,9 @@ class CameraViews:
             ways = _on_screen(np.stack([seen, ends], axis=1), shrink)
             entity = f"{self._entity(index)}/residuals"
             ways = ways[self._visible(ways, _UNSEEN_RESIDUAL)]
-            self._stream.log(entity, rr.LineStrips2D.from_fields(strips=ways))
-            marks = rr.Points2D.from_fields(positions=_on_screen(predicted, shrink))
-            self._stream.log(f"{entity}/reprojected", marks)
+            self._stream.log_rows(entity, rr.LineStrips2D, strips=ways)
+            marks = _on_screen(predicted, shrink)
+            self._stream.log_rows(f"{entity}/reprojected", rr.Points2D, positions=marks)
 
     def _visible(self, ways: FloatArray, least: float) -> NDArray[np.bool_]:
         """(M,) which of some ways (M, 2, 2) are worth sending."""

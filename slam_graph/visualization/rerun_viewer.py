@@ -201,8 +201,8 @@ class RerunViewer:
         if window is not None:
             colours[np.isin(ids, window.state_features)] = GREEN
         colours[np.isin(ids, frame.rejected)] = VERMILLION
-        cloud = self._stream.rr.Points3D.from_fields(positions=points, colors=colours)
-        self._stream.log(f"{self._world}/features", cloud)
+        named, kind = f"{self._world}/features", self._stream.rr.Points3D
+        self._stream.log_rows(named, kind, positions=points, colors=colours)
         self._show_map(~np.isin(self._ids, ids))
         self._ids, self._points = ids, points
 
@@ -214,8 +214,8 @@ class RerunViewer:
         self._heights.append(left)
         heights = np.concatenate([part[:, 2] for part in self._heights])
         colours = scaled(left[:, 2], *robust_range(heights))
-        cloud = self._stream.rr.Points3D.from_fields(positions=left, colors=colours)
-        self._stream.log(f"{self._world}/map/points", cloud)
+        named, kind = f"{self._world}/map/points", self._stream.rr.Points3D
+        self._stream.log_rows(named, kind, positions=left, colors=colours)
 
     def _show_window(self, estimator: Estimator) -> None:
         """The past poses in the state, and new keyframes."""
@@ -227,10 +227,12 @@ class RerunViewer:
         poses = np.array([values.atPose3(X(number)).translation() for number in past])
         held = np.array([number in window.keyframes for number in past], np.bool_)
         colours = np.where(held[:, None], np.array(PURPLE), np.full(3, 255)).astype(np.uint8)
-        cloud = rr.Points3D.from_fields(
-            positions=poses.reshape(-1, 3), colors=colours.reshape(-1, 3)
+        self._stream.log_rows(
+            f"{self._world}/window",
+            rr.Points3D,
+            positions=poses.reshape(-1, 3),
+            colors=colours.reshape(-1, 3),
         )
-        self._stream.log(f"{self._world}/window", cloud)
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
             places = [values.atPose3(X(number)).translation() for number in new]
