@@ -32,7 +32,7 @@ from slam_graph.visualization.rerun_stream import RerunStream
 PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
-POINT_RADIUS, END_RADIUS = -1.3, -5.0
+POINT_RADIUS, END_RADIUS = -1.3, -4.0
 """Of points of maps, and of the ends of loop closures, in pixels of the screen."""
 
 _TRUTH_POINTS = 2000
