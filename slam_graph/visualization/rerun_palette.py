@@ -33,6 +33,9 @@ AXES = (VERMILLION, GREEN, SKY)
 CYCLE = (ORANGE, SKY, GREEN, PURPLE, YELLOW, VERMILLION, BLUE, LIGHT_GREY)
 """Colours of things of which there is any number."""
 
+CYCLE_NAMES = ("orange", "light blue", "green", "purple", "yellow", "red", "blue", "light grey")
+"""What these are called."""
+
 _VIRIDIS: Colours = np.ascontiguousarray(
     cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8
 )

@@ -12,7 +12,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.bundle_adjustment import BalSolution
 from slam_graph.pose_graph import PoseGraphSolution
-from slam_graph.visualization.rerun_blueprints import Eye, space, whole, whole_axis
+from slam_graph.visualization.rerun_blueprints import SQUARE, Eye, space, whole, whole_axis
 from slam_graph.visualization.rerun_palette import (
     LIGHT_GREY,
     SKY,
@@ -25,7 +25,7 @@ EDGE = "edge"
 """Timeline of pose graphs: the number of the edge."""
 
 _LEAST_CHI2 = 1e-3
-_BINS = 60
+_FEWEST_BINS, _BINS = 10, 60
 _ERROR_PERCENTILE = 98.0
 _VIEWED_PERCENT = (2.0, 98.0)
 _MANY_POINTS = 2000
@@ -110,7 +110,7 @@ def _summary(solution: PoseGraphSolution, chi2: dict[str, float]) -> str:
 | χ² after | {chi2["after"]:.6g} |
 
 **Edges** are coloured by the logarithm of χ², on one scale for both: dark blue fits, yellow does
-not. Red: rejected as an outlier. Below is log10 χ² of every edge by its number.
+not. Red: rejected as an outlier.
 """
 
 
@@ -143,7 +143,9 @@ def _eye(places: FloatArray) -> Eye | None:
     low, high = np.percentile(places, _VIEWED_PERCENT, axis=0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     if high[2] - low[2] > 0.02 * size:
-        return Eye.on(np.stack([low, high]))
+        near = 0.2 * size
+        inside = np.all((places >= low - near) & (places <= high + near), axis=1)
+        return Eye.on(places[inside], aspect=SQUARE)
     centre = (low + high) / 2
     above = centre + np.array([0.0, -0.05 * size, 0.95 * size])
     return Eye(tuple(above.tolist()), tuple(centre.tolist()))
@@ -157,7 +159,8 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         scenes["after"] = solution.adjusted
     errors = solution.errors_px
     last = float(np.percentile(errors["before"], _ERROR_PERCENTILE))
-    edges = np.linspace(0.0, max(last, 1e-6), _BINS + 1)
+    bins = int(np.clip(np.sqrt(len(errors["before"])), _FEWEST_BINS, _BINS))
+    edges = np.linspace(0.0, max(last, 1e-6), bins + 1)
     rr = stream.rr
     worst = {name: _worst_of_points(part.point, part.points, errors[name]) for name in scenes}
     high = float(np.percentile(worst["before"], 90.0))
@@ -179,7 +182,7 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         )
         counts, _ = np.histogram(errors[name], edges)
         colour = SKY if name == "before" else VERMILLION
-        bars = rr.BarChart(counts, abscissa=(edges[1:] + edges[:-1]) / 2, color=colour)
+        bars = rr.BarChart(counts, abscissa=edges[:-1], widths=np.diff(edges), color=colour)
         stream.log(f"errors/{name}", bars, static=True)
     rms = {name: float(np.sqrt(np.mean(errors[name] ** 2))) for name in scenes}
     text = _bundle_summary(solution, rms)
@@ -231,7 +234,12 @@ def _bundle_layout(eye: Eye, stages: list[str]) -> Any:
     import rerun.blueprint as rrb
 
     charts = [
-        rrb.BarChartView(name=f"Errors {name} [px]", origin=f"/errors/{name}") for name in stages
+        rrb.BarChartView(
+            name=f"Errors {name} [px]",
+            origin=f"/errors/{name}",
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for name in stages
     ]
     text = rrb.TextDocumentView(name="Summary", origin="/summary")
     views = [space(name.title(), f"/{name}", eye=eye) for name in stages]

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -15,9 +16,9 @@ from slam_graph.backend import Estimator
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
-from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
+from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
-from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
@@ -106,7 +107,8 @@ class RerunViewer:
         self,
         outcome_plots: frozenset[str] = frozenset(),
         eye: Eye | None = None,
-        in_map: Trajectory | None = None,
+        map_path: FloatArray | None = None,
+        spans: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Send the layout."""
         plots = outcome_plots | StepSeries.PLOTS
@@ -117,7 +119,8 @@ class RerunViewer:
             log=True,
             window=self._detail == "graph",
             in_map=self._known_map is not None,
-            map_path=None if in_map is None or not len(in_map) else in_map.positions,
+            map_path=map_path,
+            spans=spans or {},
         )
         self._stream.arrange(odometry(shown, eye))
 
@@ -167,7 +170,8 @@ class RerunViewer:
         plots = self._outcome.show(result)
         best = result.smoothed or result.trajectory
         points = np.concatenate([*self._heights, np.zeros((0, 3))])
-        self._arrange(plots, Eye.on(best.positions, points), result.in_map)
+        eye, spans = Eye.on(best.positions, points, around=RIG_M), self._series.spans
+        self._arrange(plots, eye, places_in_map(result, self._known_map), spans)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
@@ -197,8 +201,8 @@ class RerunViewer:
         if window is not None:
             colours[np.isin(ids, window.state_features)] = GREEN
         colours[np.isin(ids, frame.rejected)] = VERMILLION
-        cloud = self._stream.rr.Points3D.from_fields(positions=points, colors=colours)
-        self._stream.log(f"{self._world}/features", cloud)
+        named, kind = f"{self._world}/features", self._stream.rr.Points3D
+        self._stream.log_rows(named, kind, positions=points, colors=colours)
         self._show_map(~np.isin(self._ids, ids))
         self._ids, self._points = ids, points
 
@@ -210,8 +214,8 @@ class RerunViewer:
         self._heights.append(left)
         heights = np.concatenate([part[:, 2] for part in self._heights])
         colours = scaled(left[:, 2], *robust_range(heights))
-        cloud = self._stream.rr.Points3D.from_fields(positions=left, colors=colours)
-        self._stream.log(f"{self._world}/map/points", cloud)
+        named, kind = f"{self._world}/map/points", self._stream.rr.Points3D
+        self._stream.log_rows(named, kind, positions=left, colors=colours)
 
     def _show_window(self, estimator: Estimator) -> None:
         """The past poses in the state, and new keyframes."""
@@ -223,10 +227,12 @@ class RerunViewer:
         poses = np.array([values.atPose3(X(number)).translation() for number in past])
         held = np.array([number in window.keyframes for number in past], np.bool_)
         colours = np.where(held[:, None], np.array(PURPLE), np.full(3, 255)).astype(np.uint8)
-        cloud = rr.Points3D.from_fields(
-            positions=poses.reshape(-1, 3), colors=colours.reshape(-1, 3)
+        self._stream.log_rows(
+            f"{self._world}/window",
+            rr.Points3D,
+            positions=poses.reshape(-1, 3),
+            colors=colours.reshape(-1, 3),
         )
-        self._stream.log(f"{self._world}/window", cloud)
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
             places = [values.atPose3(X(number)).translation() for number in new]

@@ -16,17 +16,20 @@ from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
 from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
+    RIG_M,
+    SQUARE,
     Eye,
     Shown,
     odometry,
     space,
     whole,
     whole_axis,
+    with_ticks,
 )
 from slam_graph.visualization.rerun_images import CameraViews
-from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
-from slam_graph.visualization.rerun_palette import CYCLE, TRUTH
+from slam_graph.visualization.rerun_palette import CYCLE, CYCLE_NAMES, TRUTH
 from slam_graph.visualization.rerun_series import SeriesLog
 from slam_graph.visualization.rerun_stream import RerunStream
 
@@ -76,10 +79,14 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
             level = next((word for word in ("ERROR", "WARNING") if f" {word} " in line), "INFO")
             stream.log("log", stream.rr.TextLog(line.rstrip(), level=level))
     best = run.smoothed or run.trajectory
-    inside = run.in_map
-    place = None if inside is None else inside.positions
-    shown = Shown(plots=plots, log=bool(lines), in_map=inside is not None, map_path=place)
-    stream.arrange(odometry(shown, Eye.on(best.positions, details.points)))
+    shown = Shown(
+        plots=plots,
+        log=bool(lines),
+        in_map=run.in_map is not None,
+        map_path=places_in_map(run, details.known_map),
+        spans=series.spans,
+    )
+    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, SQUARE, RIG_M)))
 
 
 def _show_timing(
@@ -137,9 +144,9 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         outcome.path("path/groundtruth", truth, TRUTH)
         columns = rr.Transform3D.columns(translation=truth.positions, quaternion=truth.quaternions)
         stream.send_columns("world/body", outcome.frames(truth.stamps_ns), truth.stamps_ns, columns)
-        eye = Eye.on(truth.positions)
+        eye = Eye.on(truth.positions, around=RIG_M)
     plots = frozenset({"imu/gyro", "imu/accel"})
-    shown = Shown(cameras=len(sequence.rig.cameras), plots=plots)
+    shown = Shown(cameras=len(sequence.rig.cameras), plots=plots, title="Recording")
     stream.arrange(odometry(shown, eye))
 
 
@@ -174,15 +181,19 @@ def show_comparison(
 
     rr, titles, places = stream.rr, dict[str, str](), list[FloatArray]()
     stream.log("paths", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    rows = []
+    rows, largest = [], dict[str, float]()
     for number, run in enumerate(runs):
         colour, name = CYCLE[number % len(CYCLE)], rr.escape_entity_path_part(run.name)
         places.append(run.path)
         line = rr.LineStrips3D(
-            [run.path], colors=colour, radii=-1.2, labels=[run.name], show_labels=False
+            [run.path],
+            colors=colour,
+            radii=-1.2,
+            labels=[run.name],
+            show_labels=False,
         )
         stream.log(f"paths/{name}", line, static=True)
-        row = [run.name]
+        row = [run.name, CYCLE_NAMES[number % len(CYCLE)]]
         for index, (title, values) in enumerate(run.errors.items()):
             entity = titles.setdefault(title, f"errors/{index}")
             style = rr.SeriesLines(colors=colour, names=run.name, widths=1.5)
@@ -191,6 +202,7 @@ def show_comparison(
             times = rr.TimeColumn(_SINCE_START, duration=run.time_s)
             stream.send_along(f"{entity}/{name}", times, columns)
             row.append(f"{np.sqrt(np.mean(values**2)):.4g}")
+            largest[title] = max(largest.get(title, 0.0), float(np.max(values, initial=0.0)))
         rows.append("| " + " | ".join(row) + " |")
     if true_path is not None:
         line = rr.LineStrips3D(
@@ -198,8 +210,10 @@ def show_comparison(
         )
         stream.log("paths/ground_truth", line, static=True)
         places.append(true_path)
-    head = "| RMSE | " + " | ".join(titles) + " |\n" + "|---" * (1 + len(titles)) + "|\n"
-    text = "# Comparison\n\n" + head + "\n".join(rows)
+    head = "| RMSE | " + " | ".join(["colour", *titles]) + " |\n" + "|---" * (2 + len(titles))
+    head += "|\n"
+    grey = "" if true_path is None else "\n\nThin, light grey: ground truth."
+    text = "# Comparison\n\n" + head + "\n".join(rows) + grey
     stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
     plots: list[Any] = [
         rrb.TimeSeriesView(
@@ -207,11 +221,12 @@ def show_comparison(
             origin=f"/{entity}",
             plot_legend=rrb.Corner2D.LeftTop,
             axis_x=whole_axis(),
+            axis_y=rrb.ScalarAxis(range=with_ticks(0.0, largest[title])),
         )
         for title, entity in titles.items()
     ]
     plots.append(rrb.TextDocumentView(name="Summary", origin="/summary"))
-    eye = Eye.on(np.concatenate([*places, np.zeros((0, 3))]))
+    eye = Eye.on(np.concatenate([*places, np.zeros((0, 3))]), aspect=SQUARE)
     stream.arrange(
         whole(
             rrb.Horizontal(
