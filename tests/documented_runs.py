@@ -5,7 +5,9 @@
 What differs from a user's machine, so that all pages take two minutes:
 
 - recordings are short (`documented_stock.py`), `demo` too; simulations last `TRACKS_S`, those of
-  images `IMAGES_S`; comparisons last `COMPARED_S` and have at most `SEEDS` seeds;
+  images `IMAGES_S`, those with descriptors, of which maps are made, `MAPPED_S`; comparisons last
+  `COMPARED_S`, those of simulations and of front ends `BRIEFLY_S`, and have at most `SEEDS` seeds;
+- pictures of matplotlib are made, but not rendered, which takes as long as a short run;
 - `slam-graph` is called in this process, and so are the tasks of `batch` and `compare`;
 - a window of Rerun is not opened: what would go there is kept in memory;
 - the Dask cluster runs in this process, under another address.
@@ -23,6 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from documented import HELP, Step, blocks, steps
 from documented_stock import TRACKS_S, Stock
@@ -40,9 +44,12 @@ from slam_graph.frontend import DETECTORS
 from slam_graph.plugins import Registry
 from slam_graph.visualization import RerunRecording
 from slam_graph.visualization.rerun_stream import RerunStream
+from slam_graph.visualization.style import Picture
 
 IMAGES_S = 0.2
 COMPARED_S = 1.5
+BRIEFLY_S = 0.5
+MAPPED_S = 4.0
 SEEDS = 2
 
 SKIPPED = {
@@ -60,8 +67,9 @@ SKIPPED = {
 
 EXITS = {
     r"run path/to/2011_09_26/": 3,  # the images of this made-up drive are noise
+    r"run walk.mp4 .*phone.yaml": 3,  # its unknown mounting is found in turns longer than this
 }
-"""Commands that end with another code than 0, and do not print an error on their page."""
+"""Commands whose made-up recording does not start (3): they read it, and say what they lack."""
 
 
 def is_skipped(step: Step) -> bool:
@@ -98,12 +106,9 @@ class Session:
         return "neither ours nor in the list of what is skipped"
 
     def _python(self, step: Step) -> str:
-        text = re.sub(
-            r"\bduration_s=(\d+)", lambda m: f"duration_s={min(float(m[1]), TRACKS_S)}", step.text
-        )
         try:
             with redirect_stdout(io.StringIO()):
-                exec(compile(text, step.place, "exec"), self.names)
+                exec(compile(_short_python(step.text), step.place, "exec"), self.names)
         except Exception as error:
             return f"{type(error).__name__}: {error}"
         results = [value for value in self.names.values() if isinstance(value, sg.RunResult)]
@@ -127,20 +132,39 @@ class Session:
 
 
 def shortened(words: list[str]) -> list[str]:
-    """A command with simulations that are short, and few seeds."""
-    limits = {"--seeds": SEEDS, "--duration": TRACKS_S}
-    if words[0] == "simulate" and "images" in words:
-        limits["--duration"] = IMAGES_S
-    if words[0] == "compare":
-        limits["--duration"] = COMPARED_S
+    """A command whose simulation or comparison is short, with few seeds."""
     made = list(words)
-    for option, most in limits.items():
-        if option in words:
-            at = made.index(option) + 1
-            made[at] = str(min(float(made[at]), most) if option == "--duration" else min(int(made[at]), int(most)))
-    if words[0] in ("simulate", "compare") and "--duration" not in words:
-        made += ["--duration", str(limits["--duration"])]
+    if "--seeds" in made:
+        at = made.index("--seeds") + 1
+        made[at] = str(min(int(made[at]), SEEDS))
+    longest = _longest_s(words)
+    if longest is not None:
+        if "--duration" in made:
+            at = made.index("--duration") + 1
+            made[at : at + 1] = [str(min(float(made[at]), longest))]
+        else:
+            made += ["--duration", str(longest)]
     return made
+
+
+def _longest_s(words: list[str]) -> float | None:
+    """The longest duration of a command; None if its recording is short."""
+    if words[0] == "simulate":
+        if "tracks.descriptors=true" in words:
+            return MAPPED_S
+        return IMAGES_S if "images" in words else TRACKS_S
+    if "compare" in words[:2]:
+        cheap = words[0] == "compare" and not any("sim:" in word for word in words)
+        return COMPARED_S if cheap else BRIEFLY_S
+    return None
+
+
+def _short_python(text: str) -> str:
+    """A block of Python in which durations are short; repetitions with seeds are a comparison."""
+    longest = BRIEFLY_S if "seeds=" in text else TRACKS_S
+    return re.sub(
+        r"\bduration_s=(\d+)", lambda found: f"duration_s={min(float(found[1]), longest)}", text
+    )
 
 
 def _redirected(words: list[str]) -> tuple[list[str], str]:
@@ -163,6 +187,8 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
     def to_memory(stream: Any) -> None:
         stream._raw.memory_recording()
 
+    empty = bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1])
+    monkeypatch.setattr(Picture, "png", lambda picture: empty)
     monkeypatch.setattr(dataset_registry, "wheel_tracks", lambda: demo)
     monkeypatch.setattr(executors, "_start", lambda text: text)
     monkeypatch.setattr(executors, "_wait", do)
@@ -188,10 +214,7 @@ def check_page(page: str, stock: Stock, folder: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(folder)
     session = Session(folder, {"__name__": "page", **stock.names(page)})
     with dask_cluster(any("--scheduler" in text for text in shown)) as session.scheduler:
-        import os as _os; faults = []
-        for step in todo:
-            a = sum(_os.times()[:4]); faults.append((step, session.fault(step)))
-            print(f"@ {sum(_os.times()[:4]) - a:5.1f} s {step.place} {step.text.splitlines()[0] if not step.is_python else 'PYTHON'}")
+        faults = [(step, session.fault(step)) for step in todo]
     report = [f"{step.place}: {step.text}\n    {fault}" for step, fault in faults if fault]
     assert not report, "\n".join(["", *report])
 

@@ -23,26 +23,23 @@ from recordings_public import as_tum_vi, write_kitti_odometry, write_kitti_raw, 
 from recordings_ros import bag_writer, write_calibration_of
 
 import slam_graph as sg
-from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
+from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.pose_graph import PoseGraph, optimize_pose_graph
 from slam_graph.sensors import Camera, CameraFrame, ImuNoise, Rig, RigCamera
-from slam_graph.simulation import SimulatedSequence
-from slam_graph.simulation.simulator import euroc_rig
 
 TRACKS_S = 3.0
 """Length of recordings of tracks, and of `demo`: it starts after one second."""
 
-_IMAGES_S = (2.5, 5.5)
-"""The part of MH_01 that is used: the rig moves enough to start within half a second."""
+_IMAGES_S = (8.0, 11.6)
+"""The part of MH_01 that is used: the rig moves by more than a metre after its start."""
 
 _EVERY = 2
 """Of MH_01 every second frame is used: 10 in a second."""
 
-_SCALE = 4
-"""The video of the phone is rendered this much smaller and enlarged."""
-
-_WALK_S = 4.0
+_VIDEO = (1920, 1080)
+"""Size of the video, that of `phone.yaml`."""
 
 _ALIASES = (
     ("/imu0", "/left/image_raw", "/right/image_raw"),
@@ -98,8 +95,8 @@ class Stock:
             "imu.csv": self._imu_table,
             "walk.csv": self._frame_times,
             "walk.tum": lambda to: self._walk().groundtruth().save(to),
-            "walk_gyro.csv": lambda to: self._of_phone(to, 0),
-            "walk_accel.csv": lambda to: self._of_phone(to, 1),
+            "walk_gyro.csv": lambda to: self._of_phone(to, slice(0, 3)),
+            "walk_accel.csv": lambda to: self._of_phone(to, slice(3, 6)),
             "images/": self._folder_of_images,
             "sphere2500.g2o": lambda to: _write_graph(to, laps(3, 0.01)[0]),
             "graph.g2o": lambda to: _write_graph(to, laps(3, 0.01)[0]),
@@ -123,6 +120,8 @@ class Stock:
 
     def fill(self, folder: Path, commands: str) -> None:
         """Link to everything that commands name and do not simulate themselves."""
+        if _is_named("list.yaml", commands):
+            commands += self("list.yaml").read_text(encoding="utf-8")
         for name in self._makers:
             if _is_named(name, commands) and f"simulate {name} " not in commands:
                 link = folder / name.rstrip("/")
@@ -200,14 +199,19 @@ class Stock:
     def _recordings(self, to: Path) -> None:
         to.mkdir()
         for name in ("MH_01_easy", "MH_02_easy"):
-            self._tracks(to / name, seed=int(name[4]))
+            self._tracks(to / name, int(name[4]), TRACKS_S / 3)
 
-    def _tracks(self, to: Path, seed: int = 0) -> None:
+    def _tracks(self, to: Path, seed: int = 0, duration_s: float = TRACKS_S) -> None:
         overrides = ["tracks.descriptors=true", "world_seed=7", f"seed={seed}"]
-        sg.simulate(trajectory="rooms", duration_s=TRACKS_S, overrides=overrides).save(to)
+        sg.simulate(trajectory="rooms", duration_s=duration_s, overrides=overrides).save(to)
 
     def _map(self, to: Path) -> None:
-        made = sg.run(self(to.stem), sg.load_config(None, ["map.enabled=true"])).slam_map
+        """Of one of two flights through the place of `monday`."""
+        seed = 3 if to.stem == "monday" else 4
+        flight = to.with_suffix("")
+        flight = flight.with_name(f"{flight.name}_mapped")
+        self._tracks(flight, seed, 5.0)
+        made = sg.run(flight, map={"enabled": True}, final_ba={"enabled": False}).slam_map
         assert made is not None
         sg.save_map(made, to)
 
@@ -215,10 +219,14 @@ class Stock:
         """MH_01 as a bag that carries its calibration and its truth."""
         data = sg.open_dataset(self("path/to/MH_01_easy"))
         truth = data.groundtruth()
-        aliases = _ALIASES if kind == "sqlite" else (("/imu0", *map("/cam{}/image_raw".format, (0, 1))),)
+        aliases = (
+            _ALIASES if kind == "sqlite" else (("/imu0", *map("/cam{}/image_raw".format, (0, 1))),)
+        )
         with bag_writer(to, kind) as bag:
             for _, *images in aliases:
-                write_calibration_of(bag, data.rig, [Path(topic).parent.as_posix() for topic in images])
+                write_calibration_of(
+                    bag, data.rig, [Path(topic).parent.as_posix() for topic in images]
+                )
             for packet in data.packets():
                 assert isinstance(packet.frame, CameraFrame)
                 imu, now = packet.imu, packet.frame.stamp_ns
@@ -227,7 +235,9 @@ class Stock:
                         bag.write(imu_topic, bag.imu(stamp_ns, imu.gyro[k], imu.accel[k]), stamp_ns)
                     for c, topic in enumerate(topics):
                         if (image := packet.frame.images[c]) is not None:
-                            message = bag.image(now, image, "mono8", f"cam{c}")
+                            camera = data.rig.cameras[c].camera
+                            taken = _rectified(image, camera) if "rect" in topic else image
+                            message = bag.image(now, taken, "mono8", f"cam{c}")
                             bag.write(topic, message, now)
                 if kind == "mcap" and truth.stamps_ns[0] <= now <= truth.stamps_ns[-1]:
                     pose = truth.at(now)
@@ -243,80 +253,57 @@ class Stock:
     def _chain(self, to: Path) -> None:
         write_kalibr(sg.open_dataset(self("path/to/MH_01_easy")).rig, to)
 
-    def _phone_chain(self, to: Path, scale: int = _SCALE) -> None:
-        """The camera of `phone.yaml` with a known mounting, or the same with smaller images."""
-        phone = read_kalibr(self("phone.yaml"))
-        (mounted,) = phone.cameras
+    def _walk(self) -> RecordedSequence:
+        """The left camera of MH_01."""
+        return sg.open_dataset(self("path/to/MH_01_easy"), cameras=1)
+
+    def _phone_chain(self, to: Path) -> None:
+        """The calibration of `walk.mp4`."""
+        rig = self._walk().rig
+        (mounted,) = rig.cameras
         c = mounted.camera
-        part = scale / _SCALE
-        numbers = (c.fx * part, c.fy * part, (c.cx + 0.5) * part - 0.5, (c.cy + 0.5) * part - 0.5)
-        size = (int(c.width * part), int(c.height * part))
-        camera = Camera(*numbers, c.distortion, c.coefficients, *size)
-        pose = euroc_rig().cameras[0].body_T_camera
-        known = replace(mounted, camera=camera, body_T_camera=pose, rotation_known=True)
-        write_kalibr(replace(phone, cameras=(known,)), to)
+        x, y = np.array(_VIDEO) / (c.width, c.height)
+        numbers = (c.fx * x, c.fy * y, (c.cx + 0.5) * x - 0.5, (c.cy + 0.5) * y - 0.5)
+        camera = Camera(*numbers, c.distortion, c.coefficients, *_VIDEO)
+        write_kalibr(replace(rig, cameras=(replace(mounted, camera=camera),)), to)
 
-    def _walk(self) -> SimulatedSequence:
-        """A flight with the camera of a phone; its images are small, so that it is cheap."""
-        small = self._root / "small.yaml"
-        self._phone_chain(small, scale=1)
-        return sg.simulate(
-            trajectory="random", kind="images", calibration=small, rate_hz=15, duration_s=_WALK_S
-        )
-
-    def _walk_images(self) -> Iterator[np.ndarray]:
-        """The images in the size of the phone's."""
+    def _walk_frames(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Stamps and images, in the size of a phone's."""
         for packet in self._walk().packets():
             assert isinstance(packet.frame, CameraFrame)
             (image,) = packet.frame.images
             assert image is not None
-            yield cv2.resize(image, None, fx=_SCALE, fy=_SCALE, interpolation=cv2.INTER_CUBIC)
+            yield packet.frame.stamp_ns, cv2.resize(image, _VIDEO, interpolation=cv2.INTER_CUBIC)
 
     def _video(self, to: Path) -> None:
-        writer: cv2.VideoWriter | None = None
-        for image in self._walk_images():
-            if writer is None:
-                fourcc = cv2.VideoWriter.fourcc(*"mp4v")
-                size = (image.shape[1], image.shape[0])
-                writer = cv2.VideoWriter(str(to), cv2.CAP_FFMPEG, fourcc, 15.0, size)
-                assert writer.isOpened()
+        fourcc = cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(to), cv2.CAP_FFMPEG, fourcc, 10.0, _VIDEO)
+        assert writer.isOpened()
+        for _, image in self._walk_frames():
             writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-        assert writer is not None
         writer.release()
 
     def _folder_of_images(self, to: Path) -> None:
         to.mkdir()
-        for k, image in zip(range(3), self._walk_images(), strict=False):
+        for k, (_, image) in zip(range(3), self._walk_frames(), strict=False):
             cv2.imwrite(str(to / f"frame{k}.png"), image)
 
     def _frame_times(self, to: Path) -> None:
-        write_lines(to, ["#time", *(str(p.frame.stamp_ns) for p in self._walk_tracks().packets())])
+        write_lines(to, ["#time", *(str(stamp_ns) for stamp_ns, _ in self._walk_frames())])
 
-    def _walk_tracks(self) -> SimulatedSequence:
-        """The same flight without images."""
-        small = self._root / "small.yaml"
-        self._phone_chain(small, scale=1)
-        return sg.simulate(
-            trajectory="random", calibration=small, rate_hz=15, duration_s=_WALK_S
-        )
+    def _imu_rows(self) -> Iterator[tuple[int, list[float]]]:
+        for block in self._walk().imu_blocks():
+            values = np.hstack([block.gyro, block.accel])
+            yield from zip(block.stamps_ns.tolist(), values.tolist(), strict=True)
 
     def _imu_table(self, to: Path) -> None:
-        lines = ["#time,wx,wy,wz,ax,ay,az"]
-        for block in self._walk_tracks().imu_blocks():
-            for stamp_ns, row in zip(
-                block.stamps_ns.tolist(), np.hstack([block.gyro, block.accel]), strict=True
-            ):
-                lines.append(f"{stamp_ns},{','.join(map(repr, row.tolist()))}")
-        write_lines(to, lines)
+        rows = [f"{stamp_ns},{','.join(map(repr, row))}" for stamp_ns, row in self._imu_rows()]
+        write_lines(to, ["#time,wx,wy,wz,ax,ay,az", *rows])
 
-    def _of_phone(self, to: Path, which: int) -> None:
+    def _of_phone(self, to: Path, columns: slice) -> None:
         """A file of the app: x, y, z and the stamp."""
-        lines = []
-        for block in self._walk_tracks().imu_blocks():
-            values = (block.gyro, block.accel)[which]
-            for stamp_ns, row in zip(block.stamps_ns.tolist(), values, strict=True):
-                lines.append(f"{','.join(map(repr, row.tolist()))},{stamp_ns}")
-        write_lines(to, lines)
+        rows = [f"{','.join(map(repr, row[columns]))},{t}" for t, row in self._imu_rows()]
+        write_lines(to, rows)
 
 
 def _cut(real: Path, to: Path) -> None:
@@ -332,9 +319,17 @@ def _cut(real: Path, to: Path) -> None:
         kept = [row for row in rows if first - margin <= int(row.split(",")[0]) <= last + margin]
         (to / sensor.name).mkdir(parents=True)
         write_lines(to / sensor.name / "data.csv", [header, *kept[:: _EVERY if is_camera else 1]])
-        for name in ("data", "sensor.yaml"):
-            if (sensor / name).exists():
-                (to / sensor.name / name).symlink_to(sensor / name)
+        if (sensor / "sensor.yaml").exists():
+            (to / sensor.name / "sensor.yaml").symlink_to(sensor / "sensor.yaml")
+        if is_camera:
+            (to / sensor.name / "data").mkdir()
+            for name in (row.split(",")[1] for row in kept[::_EVERY]):
+                (to / sensor.name / "data" / name).symlink_to(sensor / "data" / name)
+
+
+def _rectified(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """What a driver publishes on a topic of rectified images, with the same focal length."""
+    return cv2.undistort(image, camera.K, np.array(camera.coefficients))
 
 
 def _is_named(name: str, commands: str) -> bool:

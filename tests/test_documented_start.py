@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What README, the first pages and the help tell one to type works as written; see `documented_runs.py`."""
+"""What README, the first pages and the help tell one to type works as written.
+
+See `documented_runs.py`.
+"""
 
 from pathlib import Path
 

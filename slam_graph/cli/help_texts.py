@@ -43,8 +43,12 @@ EXAMPLES = {
         "slam-graph map info results/MH_01_easy",
         "slam-graph map merge monday.slam tuesday.slam --output both.slam",
     ),
-    "ape": ("slam-graph ape path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum --align yaw",),
-    "rpe": ("slam-graph rpe path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum --delta 1 --delta_unit m",),
+    "ape": (
+        "slam-graph ape path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum --align yaw",
+    ),
+    "rpe": (
+        "slam-graph rpe path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum -d 1 -u m",
+    ),
     "view": (
         "slam-graph view results/MH_01_easy",
         "slam-graph view results/MH_01_easy --screenshot picture.png",
@@ -57,7 +61,10 @@ EXAMPLES = {
         "slam-graph compare sim:figure8 --algorithms msckf,swf --seeds 5",
         "slam-graph compare path/to/MH_01_easy --algorithms msckf,okvis,kmsckf.yaml",
     ),
-    "optimize": ("slam-graph optimize sphere2500.g2o", "slam-graph optimize problem-16-22106-pre.txt.bz2"),
+    "optimize": (
+        "slam-graph optimize sphere2500.g2o",
+        "slam-graph optimize problem-16-22106-pre.txt.bz2",
+    ),
     "simulate": (
         "slam-graph simulate flight --duration 30",
         "slam-graph simulate rooms --kind images --trajectory rooms",
