@@ -57,6 +57,9 @@ _ALIASES = (
 )
 """Topics of IMU and images in `flight/`: one recording under the names of several drivers."""
 
+_RECTIFIED = _ALIASES[1][1:]
+"""Rectified topics that are read without a Kalibr file; the ZED is run with that of MH_01."""
+
 
 class Stock:
     """Makes what pages take for granted.
@@ -236,7 +239,7 @@ class Stock:
                     for c, topic in enumerate(topics):
                         if (image := packet.frame.images[c]) is not None:
                             camera = data.rig.cameras[c].camera
-                            taken = _rectified(image, camera) if "rect" in topic else image
+                            taken = _rectified(image, camera) if topic in _RECTIFIED else image
                             message = bag.image(now, taken, "mono8", f"cam{c}")
                             bag.write(topic, message, now)
                 if kind == "mcap" and truth.stamps_ns[0] <= now <= truth.stamps_ns[-1]:
