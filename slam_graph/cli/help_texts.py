@@ -47,7 +47,7 @@ EXAMPLES = {
         "slam-graph ape path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum --align yaw",
     ),
     "rpe": (
-        "slam-graph rpe path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum -d 1 -u m",
+        "slam-graph rpe path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum -d 0.5 -u m",
     ),
     "view": (
         "slam-graph view results/MH_01_easy",
