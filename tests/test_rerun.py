@@ -295,7 +295,8 @@ def test_a_window_that_does_not_open_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = tmp_path / "a.rrd"
-    recording.touch()
+    with RerunRecording("save", "a", recording):
+        pass
     ends = [sys.executable, "-c", "raise SystemExit(1)"]
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("slam_graph.visualization.rerun_screenshot._viewer_command", lambda: ends)

@@ -202,7 +202,7 @@ class OutcomeLog:
         except DataError:
             return
         rr, entity = self._stream.rr, f"{self._world}/path/groundtruth"
-        if not self._truth_sent:
+        if not self._truth_sent and len(truth):
             self._truth_sent = True
             step = -(-len(truth) // _TRUTH_POINTS)
             line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=PATH_RADII[TRUTH])
