@@ -68,9 +68,10 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["final_ba"] and metrics["final_ba"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["final_ba"]["accuracy"], "smoothed"))
-    if metrics["loop_closure"] and metrics["loop_closure"]["accuracy"]:
+    loops = metrics["loop_closure"]
+    if loops and loops["accepted"] and loops["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(metrics["loop_closure"]["accuracy"], "loops closed"))
+        echo_table(_accuracy(loops["accuracy"], "loops closed"))
     if metrics["localization"] and metrics["localization"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["localization"]["accuracy"], "in the map"))

@@ -12,13 +12,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
 from slam_graph.maps import SlamMap
-from slam_graph.results.run_picture import RunView, run_figure
+from slam_graph.results.run_picture import LOOPS_CLOSED, RunView, run_figure
 from slam_graph.results.scene import SceneParts, export_scene
 from slam_graph.results.scene_files import (
     SCENE_FORMATS,
@@ -54,6 +54,11 @@ class RunSummary(Displayed):
 
     @property
     @abstractmethod
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
+
+    @property
+    @abstractmethod
     def points(self) -> FloatArray:
         """(P, 3) last estimates of the features that were in the state, in the world, m."""
 
@@ -64,6 +69,11 @@ class RunSummary(Displayed):
     @abstractmethod
     def _known_map(self) -> SlamMap | None:
         """The map of the run, if there is one."""
+
+    def _paths_of_loops(self) -> dict[str, Trajectory]:
+        """The path after loop closure by its name, if loops were accepted."""
+        path = self.loop_closed
+        return {} if path is None or not len(self.loop_ends_ns) else {LOOPS_CLOSED: path}
 
     def plot(self) -> Picture:
         """The picture of the run: paths, and errors or what smoothing changed, in ±3σ.
@@ -131,6 +141,7 @@ class RunSummary(Displayed):
     def _facts(self) -> dict[str, object]:
         metrics = self.metrics
         data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
+        loops = metrics["loop_closure"] or {}
         cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
         return {
             "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
@@ -140,7 +151,7 @@ class RunSummary(Displayed):
             f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
             "error": _errors(metrics["accuracy"]),
             "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy")),
-            "error, loops closed": _errors((metrics["loop_closure"] or {}).get("accuracy")),
+            "error, loops closed": _errors(loops["accuracy"]) if loops.get("accepted") else None,
             "speed": (
                 None
                 if timing["real_time_factor"] is None
