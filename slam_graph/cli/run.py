@@ -38,9 +38,11 @@ from slam_graph.cli.options import (
     RerunAddress,
     RerunDetail,
     RerunImages,
+    SaveGraph,
     Seed,
     Sources,
     Start,
+    graph_times,
     open_recording,
     run_settings,
 )
@@ -231,16 +233,7 @@ def run(
             show_default=False,
         ),
     ] = None,
-    save_graph: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--save-graph",
-            metavar="STAMP",
-            help="Save the factor graph of the back end at this time, repeatable: seconds after "
-            "the first frame, or a stamp in ns. Files for GTSAM and Graphviz.",
-            show_default=False,
-        ),
-    ] = None,
+    save_graph: SaveGraph = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -272,22 +265,12 @@ def run(
             Watching(rerun, rerun_images, rerun_detail, rerun_address),
             progress,
             log,
-            graph_times=[_time(text) for text in save_graph or ()],
+            graph_times=graph_times(save_graph),
         )
     try:
         report(result, folder, files, as_json)
     finally:
         keep_serving(rerun)
-
-
-def _time(text: str) -> int | float:
-    """Seconds, or a stamp in ns, which a float could not hold."""
-    try:
-        return int(text) if text.isdecimal() else float(text)
-    except ValueError as error:
-        raise typer.BadParameter(
-            f"'{text}' is neither seconds nor a stamp in ns", param_hint="--save-graph"
-        ) from error
 
 
 def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) -> None:
