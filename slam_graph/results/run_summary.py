@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
@@ -32,6 +32,18 @@ if TYPE_CHECKING:
     from slam_graph.visualization import Picture
 
 
+PoseChoice = Literal["best", "causal", "smoothed", "loop"]
+
+_PREFERRED: tuple[PoseChoice, ...] = ("loop", "smoothed", "causal")
+"""The better, the earlier."""
+
+_POSES_OF_MAP: dict[str, PoseChoice] = {
+    "loop_closed": "loop",
+    "smoothed": "smoothed",
+    "causal": "causal",
+}
+
+
 class RunSummary(Displayed):
     """Base of the results of a run."""
 
@@ -41,6 +53,16 @@ class RunSummary(Displayed):
     @abstractmethod
     def rig(self) -> Rig:
         """The sensors that were used, with the calibration from before the run."""
+
+    @property
+    @abstractmethod
+    def trajectory(self) -> Trajectory:
+        """The causal estimate."""
+
+    @property
+    @abstractmethod
+    def smoothed(self) -> Trajectory | None:
+        """The trajectory of the final bundle adjustment, if there is one."""
 
     @property
     @abstractmethod
@@ -103,11 +125,12 @@ class RunSummary(Displayed):
         recording: Sequence,
         formats: Iterable[str] = SCENE_FORMATS,
         spacing_m: float = 0.1,
+        which: PoseChoice = "best",
     ) -> list[Path]:
         """Write keyframes with their images, and points, for COLMAP or nerfstudio.
 
         Keyframes are chosen by motion. Of a run that saved a map its keyframes are among them, the
-        points are those of the map, and observations of the first camera are known.
+        points are those of the map, and the images have observations of them.
 
         Args:
             folder: is given `images/`, and for `colmap` a model in `sparse/0/`, for `nerfstudio`
@@ -115,20 +138,21 @@ class RunSummary(Displayed):
             recording: that was run, for its images.
             formats: `colmap`, `nerfstudio`, or both.
             spacing_m: between keyframes; a turn of 0.1 rad makes one too.
+            which: poses of the images, as for `exported_poses`.
 
         Returns:
             The files, without the images.
 
         Raises:
-            DataError: if a format is unknown, there are no images, or the formats lack the camera
-                model.
+            DataError: if a format is unknown, there are no images, the formats lack the camera
+                model, or the run has no such poses.
         """
         folder, formats = Path(folder), list(formats)
         for name in formats:
             if name not in SCENE_FORMATS:
                 raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
         require_models(self.rig)
-        trajectory = self.loop_closed or self.best_trajectory
+        trajectory = self.exported_poses(which)[1]
         parts = SceneParts(self.rig, trajectory, self.points, self._known_map(), spacing_m)
         scene = export_scene(parts, recording, folder / "images")
         files = []
@@ -137,6 +161,32 @@ class RunSummary(Displayed):
         if "nerfstudio" in formats:
             files += write_nerfstudio(folder, scene)
         return files
+
+    def exported_poses(self, which: PoseChoice = "best") -> tuple[str, Trajectory]:
+        """The poses of images that are exported: what they are called, and the trajectory.
+
+        Args:
+            which: `causal`, `smoothed`, `loop` (after loop closure), or `best`: those of the map if
+                the run saved one, else the last of these that there is.
+
+        Raises:
+            DataError: if the run has no such poses, or the points of its map do not fit them.
+        """
+        found = {"loop": next(iter(self._paths_of_loops().values()), None)}
+        found |= {"smoothed": self.smoothed, "causal": self.trajectory}
+        known = self._known_map()
+        own = _POSES_OF_MAP.get(known.recordings[0].poses) if known is not None else None
+        if which == "best":
+            which = own or next(name for name in _PREFERRED if found[name] is not None)
+        elif own is not None and which != own:
+            raise DataError(
+                f"the map of the run was made of its poses '{own}', and its points do not fit "
+                f"'{which}': give --which {own}, or export a run without --save-map"
+            )
+        trajectory = found[which]
+        if trajectory is None:
+            raise DataError(f"the run has no trajectory of the kind '{which}'")
+        return which, trajectory
 
     def _facts(self) -> dict[str, object]:
         metrics = self.metrics
