@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from contextlib import closing
 from dataclasses import replace
 
 import cv2
@@ -52,9 +51,9 @@ def require_places(sequence: Sequence, asked: RunInput, known_map: SlamMap | Non
     if not wanted or asked.info.content != "tracks":
         return
     counts = sequence.diagnostics.counts.copy()
-    with closing(sequence.packets(asked.start_ns, asked.end_ns)) as packets:
-        seen = (p.frame.cameras[0] for p in packets if isinstance(p.frame, FeatureFrame))
-        first = next((features for features in seen if len(features)), None)
+    packets = sequence.packets(asked.start_ns, asked.end_ns)
+    seen = (p.frame.cameras[0] for p in packets if isinstance(p.frame, FeatureFrame))
+    first = next((features for features in seen if len(features)), None)
     sequence.diagnostics.counts = counts  # the run reads the same packets again
     if first is not None and first.descriptors is None:
         purpose = "make a map" if known_map is None else "be located in a map"

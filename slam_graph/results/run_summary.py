@@ -175,9 +175,10 @@ class RunSummary(Displayed):
         found = {"loop": next(iter(self._paths_of_loops().values()), None)}
         found |= {"smoothed": self.smoothed, "causal": self.trajectory}
         known = self._known_map()
-        own = _POSES_OF_MAP.get(known.recordings[0].poses) if known is not None else None
+        own = None if known is None else _POSES_OF_MAP.get(known.recordings[0].poses)
         if which == "best":
-            which = own or next(name for name in _PREFERRED if found[name] is not None)
+            there: list[PoseChoice] = [name for name in _PREFERRED if found[name] is not None]
+            which = there[0] if own is None else own
         elif own is not None and which != own:
             raise DataError(
                 f"the map of the run was made of its poses '{own}', and its points do not fit "
