@@ -11,7 +11,9 @@ same four numbers, and false ones by anything. The offset of a match is linear i
 
 and the largest consistent set is found by RANSAC over pairs of matches.
 
-Candidate matches of features: the point of one is projected to where another is seen.
+Candidate matches of features: the point of one is projected to where another is seen, and is as far
+away. Where many points are projected into one image some are near any observation; few of them have
+its depth, too.
 """
 
 from __future__ import annotations
@@ -35,10 +37,10 @@ _REFINEMENTS = 3
 
 
 def drift_jacobian(by_point: FloatArray, arms: FloatArray) -> FloatArray:
-    """(P, 2, 4) Jacobians of pixels by a shift and yaw of the points.
+    """(P, m, 4) Jacobians of offsets by a shift and yaw of the points.
 
     Args:
-        by_point: (P, 2, 3) Jacobians of the pixels by the points in the world.
+        by_point: (P, m, 3) Jacobians of the offsets by the points in the world.
         arms: (P, 3) from the centre of rotation to the points, in the world.
     """
     turned = np.stack([-arms[:, 1], arms[:, 0], np.zeros(len(arms))], axis=1)
@@ -100,7 +102,7 @@ def _largest_set(
 
 
 def _least_squares(J: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Least-squares drifts (S, 4) of sets of matches with J (S, P, 2, 4) and offsets (S, P, 2)."""
+    """Least-squares drifts (S, 4) of sets of matches with J (S, P, m, 4) and offsets (S, P, m)."""
     J, offsets = J.reshape(len(J), -1, 4), offsets.reshape(len(J), -1, 1)
     transposed = J.transpose(0, 2, 1)
     normal = transposed @ J + np.diag(_DRIFT_SIGMAS**-2.0)
@@ -148,8 +150,9 @@ class Matches:
 
     Attributes:
         earlier, later: (P,) rows of the features.
-        offsets: (P, 2) mean offset from the observations of one to the projection of the other.
-        by_drift: (P, 2, 4) Jacobians of the offsets by the drift of the earlier feature.
+        offsets: (P, 3) mean offset from the observations of one to the projection of the other, and
+            that of the inverse depths.
+        by_drift: (P, 3, 4) Jacobians of the offsets by the drift of the earlier feature.
         chances: (P,) probability that a false match has an offset below a standard deviation.
     """
 
@@ -228,23 +231,40 @@ def _whitened(
     seen, at, projection = scene.seen, scene.at, scene.projection
     middle = np.searchsorted(seen.feature, viewed) + seen.counts[viewed] // 2
     views = replace(seen.rows(middle), feature=other)
-    by_point = projection.jacobians(views, at)[1]
-    S = by_point @ _covariances(scene)[other] @ by_point.transpose(0, 2, 1)
-    S += (_CORRELATED + 1.0 / seen.counts[viewed])[:, None, None] * np.eye(2)
+    covariances = _covariances(scene)
+    own, of_own = _inverse_depths(scene, views, viewed)
+    inverse, of_inverse = _inverse_depths(scene, views, other)
+    by_point = np.concatenate([projection.jacobians(views, at)[1], of_inverse], axis=1)
+    S = by_point @ covariances[other] @ by_point.transpose(0, 2, 1)
+    S[:, :2, :2] += (_CORRELATED + 1.0 / seen.counts[viewed])[:, None, None] * np.eye(2)
+    S[:, 2:, 2:] += of_own @ covariances[viewed] @ of_own.transpose(0, 2, 1)
     S *= scene.sigma_px**2
     whitening = np.linalg.inv(np.linalg.cholesky(S))
     J = drift_jacobian(by_point, at.points[other] - at.positions[views.frame])
     forward = scene.times_s[other] < scene.times_s[viewed]
     J[~forward] *= -1.0
     earlier, later = np.where(forward, (other, viewed), (viewed, other))
-    area = np.sqrt(np.linalg.det(S))
-    offsets = (whitening @ offsets_px[:, :, None])[:, :, 0]
+    area = np.sqrt(np.linalg.det(S[:, :2, :2]))
+    offsets = np.column_stack([offsets_px, inverse - own])
+    offsets = (whitening @ offsets[:, :, None])[:, :, 0]
     order = np.lexsort((area, later, earlier))
     best = order[np.diff(earlier[order] * len(seen.ids) + later[order], prepend=-1) != 0]
-    certain = (
-        np.linalg.norm(S[best], ord=2, axis=(1, 2)) < (_MAX_PROJECTION_SIGMAS * scene.sigma_px) ** 2
-    )
+    pixels = np.linalg.norm(S[best, :2, :2], ord=2, axis=(1, 2))
+    certain = pixels < (_MAX_PROJECTION_SIGMAS * scene.sigma_px) ** 2
     return Matches(earlier, later, offsets, whitening @ J, area / reach_px**2).select(best[certain])
+
+
+def _inverse_depths(
+    scene: Scene, views: Observations, feature: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Inverse depths (P,) of features in some images, and (P, 1, 3) Jacobians by their points."""
+    at, projection = scene.at, scene.projection
+    frame, camera = views.frame, views.camera
+    R = at.rotations[frame]
+    centre = at.positions[frame] + (R @ projection.body_p_camera[camera][:, :, None])[:, :, 0]
+    axis = (R @ projection.body_R_camera[camera])[:, :, 2]
+    inverse = 1.0 / np.sum(axis * (at.points[feature] - centre), axis=1)
+    return inverse, (-(inverse**2)[:, None] * axis)[:, None, :]
 
 
 def _covariances(scene: Scene) -> FloatArray:
