@@ -41,9 +41,9 @@ FULL_AGE = 25.0
 RESIDUAL_GAIN = 10.0
 """Residuals are drawn so many times as long as they are."""
 
-_BRIEF_STRIDE = 3
-"""Frames from one piece of a tail to the next where it is to be brief: most of a recording without
-images would be tails."""
+_BRIEF_STRIDE = 5
+"""Frames from one piece of a tail to the next where it is to be brief, and from one set of features
+of a further camera to the next: most of a recording without images would be pixels."""
 
 FATES = ("tracked", "new", "in another camera too", "gate", "RANSAC", "dynamic")
 _TRACKED, _NEW, _SHARED, _GATED, _OUTLIER, _DYNAMIC = range(1, len(FATES) + 1)
@@ -57,12 +57,13 @@ class CameraViews:
         stream: where it goes.
         rig: the cameras.
         body: entity of the body.
-        brief: whether tails are coarse, and only the first camera has tails and residuals.
+        brief: whether tails are coarse, only the first camera has tails and residuals, without
+            the reprojected landmarks, and the others have features in some of the frames.
     """
 
     def __init__(self, stream: RerunStream, rig: Rig, body: str, brief: bool = False) -> None:
         self._stream, self._rig, self._body = stream, rig, body
-        self._detailed = 1 if brief else len(rig.cameras)
+        self._brief, self._detailed = brief, 1 if brief else len(rig.cameras)
         self._stride = _BRIEF_STRIDE if brief else 1
         self._shrink = [-(-mounted.camera.width // MAX_WIDTH) for mounted in rig.cameras]
         self._tails = [_Tails() for _ in rig.cameras]
@@ -139,11 +140,14 @@ class CameraViews:
             fates[tails.ages == 1] = _NEW
             fates[np.isin(camera.ids, dynamic)] = _DYNAMIC
             fates[np.isin(camera.ids, rejected)] = _GATED
+            due = self._frames % self._stride == 0
+            if index >= self._detailed and not due:
+                continue
             entity = self._entity(index)
             places = _on_screen(camera.pixels, shrink)
             marks = rr.Points2D.from_fields(positions=places, class_ids=fates)
             self._stream.log(f"{entity}/features", marks)
-            if self._frames % self._stride == 0 and index < self._detailed:
+            if due and index < self._detailed:
                 pieces, ages = tails.pieces()
                 colours = scaled(ages, 0.0, FULL_AGE)
                 lines = rr.LineStrips2D.from_fields(strips=pieces, colors=colours)
@@ -184,6 +188,8 @@ class CameraViews:
             ways = _on_screen(np.stack([seen, ends], axis=1), shrink)
             entity = f"{self._entity(index)}/residuals"
             self._stream.log(entity, rr.LineStrips2D.from_fields(strips=ways))
+            if self._brief:
+                continue
             marks = rr.Points2D.from_fields(positions=_on_screen(predicted, shrink))
             self._stream.log(f"{entity}/reprojected", marks)
 

@@ -15,9 +15,6 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 
-_IMU_STRIDE = 4
-"""Of the IMU samples each of so many is sent."""
-
 
 class ShownFrame(Protocol):
     """A frame, and what was made of it: `EstimatedFrame` of the pipeline says what each part is."""
@@ -101,7 +98,7 @@ class StepSeries:
 
     def add(self, number: int, stamp_ns: int, frame: ShownFrame, estimator: Estimator) -> None:
         """Add the rows of a frame."""
-        self._add_imu(number, frame.packet)
+        add_imu(self._series, number, frame.packet)
         add = self._series.add
         ms, counts = frame.milliseconds, frame.counts
         nan = float("nan")
@@ -149,10 +146,10 @@ class StepSeries:
         add("state/gyro_bias/bounds", number, stamp_ns, gyro)
         add("state/accel_bias/bounds", number, stamp_ns, accel)
 
-    def _add_imu(self, number: int, packet: Packet) -> None:
-        """Raw IMU samples, not all of them."""
-        imu = packet.imu
-        for row in range(0, len(imu), _IMU_STRIDE):
-            stamp_ns = int(imu.stamps_ns[row])
-            self._series.add("imu/gyro", number, stamp_ns, imu.gyro[row])
-            self._series.add("imu/accel", number, stamp_ns, imu.accel[row])
+
+
+def add_imu(series: SeriesLog, number: int, packet: Packet) -> None:
+    """Add the IMU samples since the frame before, as they were read."""
+    imu = packet.imu
+    series.add_samples("imu/gyro", number, imu.stamps_ns, imu.gyro)
+    series.add_samples("imu/accel", number, imu.stamps_ns, imu.accel)

@@ -27,7 +27,7 @@ DEFAULT_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
 _ABSOLUTE_NS = 10**17
 """Stamps from here on (three years after 1970) are shown as dates, others as seconds."""
 
-_TICK_S, _CHUNK_BYTES = 60.0, 1 << 20
+_TICK_S, _CHUNK_BYTES = 60.0, 8 << 20
 
 _CONNECT_TIMEOUT_S = 3.0
 

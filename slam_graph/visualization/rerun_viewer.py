@@ -17,7 +17,7 @@ from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
-from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_map import MapLog, log_map
 from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
@@ -25,8 +25,6 @@ from slam_graph.visualization.rerun_palette import (
     PURPLE,
     VERMILLION,
     YELLOW,
-    robust_range,
-    scaled,
 )
 from slam_graph.visualization.rerun_progress import ShownFrame, StepSeries
 from slam_graph.visualization.rerun_series import SeriesLog
@@ -76,7 +74,7 @@ class RerunViewer:
         self._history = StateHistory()
         self._states = StateRows(self._stream, world)
         self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
-        self._heights: list[FloatArray] = []
+        self._map = MapLog(self._stream, world)
         self._keyframes: set[int] = set()
         self._image_ns: int | None = None
 
@@ -134,6 +132,7 @@ class RerunViewer:
         self._stream.at(number, stamp_ns)
         if frame.restarted:
             self._states.flush()
+            self._map.flush()
             self._begin(f"world_from_{number}")
             self._set_world(frame.corrected_rig or self._rig)
         images = frame.packet.frame
@@ -164,16 +163,19 @@ class RerunViewer:
         self._states.flush()
         self._stream.at(max(len(self._stamps_ns) - 1, 0), self._stamps_ns[-1])
         self._show_map(np.ones(len(self._ids), np.bool_))
+        self._map.flush()
         plots = self._outcome.show(result)
+        if not self._keyframes:
+            self._outcome.show_keyframes(result)
         best = result.smoothed or result.trajectory
-        points = np.concatenate([*self._heights, np.zeros((0, 3))])
-        self._arrange(plots, Eye.on(best.positions, points), result.in_map)
+        self._arrange(plots, Eye.on(best.positions, self._map.points), result.in_map)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
         logging.getLogger("slam_graph").removeHandler(self._log_handler)
         self._series.flush()
         self._states.flush()
+        self._map.flush()
         self._stream.close()
 
     def _wants_images(self, estimator: Estimator, stamp_ns: int) -> bool:
@@ -204,14 +206,7 @@ class RerunViewer:
 
     def _show_map(self, rows: BoolArray) -> None:
         """Add landmarks to the map."""
-        left = self._points[rows]
-        if len(left) == 0:
-            return
-        self._heights.append(left)
-        heights = np.concatenate([part[:, 2] for part in self._heights])
-        colours = scaled(left[:, 2], *robust_range(heights))
-        cloud = self._stream.rr.Points3D.from_fields(positions=left, colors=colours)
-        self._stream.log(f"{self._world}/map/points", cloud)
+        self._map.add(len(self._stamps_ns) - 1, self._stamps_ns[-1], self._points[rows])
 
     def _show_window(self, estimator: Estimator) -> None:
         """The past poses in the state, and new keyframes."""
