@@ -259,7 +259,9 @@ class OutcomeLog:
         sizes = np.stack([sigmas[known], 3 * sigmas[known]], axis=1)
         columns = self._stream.rr.Ellipsoids3D.columns(half_sizes=sizes.reshape(-1, 3))
         lengths = [2] * len(sizes)
-        self._stream.send_columns(entity, frames[known], stamps_ns[known], columns.partition(lengths))
+        self._stream.send_columns(
+            entity, frames[known], stamps_ns[known], columns.partition(lengths)
+        )
 
     def show_legend(self) -> None:
         """Log what the colours mean."""

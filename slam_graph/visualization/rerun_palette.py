@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,9 @@ from slam_graph.arrays import FloatArray
 
 Colour = tuple[int, int, int]
 Colours = NDArray[np.uint8]
+
+_LIGHTER = 0.45
+"""How much of white is mixed into a colour that stands for a dashed line: Rerun has no dashes."""
 
 ORANGE: Colour = (230, 159, 0)
 SKY: Colour = (86, 180, 233)
@@ -48,6 +53,25 @@ def scaled(values: FloatArray, low: float, high: float) -> Colours:
     """Colours (N, 3) of values (N,) on the scale viridis, from dark blue (low) to yellow (high)."""
     part = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     return _VIRIDIS[(_DARKEST + (255 - _DARKEST) * part).astype(np.uint8)]
+
+
+def line_colours(names: Iterable[str]) -> dict[str, Colour]:
+    """A colour for each name, that of all pictures (`style.line_styles`), on a dark background."""
+    # matplotlib takes long to load, and only comparisons need it here
+    from matplotlib.colors import to_rgb
+
+    from slam_graph.visualization.style import BLACK, line_styles
+
+    found = {}
+    for name, style in line_styles(names).items():
+        colour = np.array(to_rgb(style.color))
+        if style.color == BLACK:
+            colour = 1.0 - colour
+        if style.dash != "-":
+            colour += _LIGHTER * (1.0 - colour)
+        red, green, blue = np.rint(255 * colour).astype(int).tolist()
+        found[name] = (red, green, blue)
+    return found
 
 
 def robust_range(values: FloatArray) -> tuple[float, float]:

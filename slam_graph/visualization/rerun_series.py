@@ -158,9 +158,7 @@ class SeriesLog:
         if len(rows.frames) >= (_ROWS_IN_FILES if self._stream.saves else _ROWS_AT_ONCE):
             self._send(entity)
 
-    def add_samples(
-        self, entity: str, frame: int, stamps_ns: IntArray, values: FloatArray
-    ) -> None:
+    def add_samples(self, entity: str, frame: int, stamps_ns: IntArray, values: FloatArray) -> None:
         """Add rows (N, k) at times (N,) that belong to one frame."""
         kept = self._samples.setdefault(entity, _Samples())
         kept.frames.append(frame)

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray
 from slam_graph.backend import Estimator
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.maps import SlamMap
