@@ -31,7 +31,8 @@ from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
 from slam_graph.backend.solve.gauss_newton import linearized
 from slam_graph.config import load_config
-from slam_graph.datasets.dataset_registry import DEMO, open_dataset
+from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.formats.eqvio import DEMO
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.experiment import FrontendReport
 from slam_graph.sensors.measurements import FeatureFrame, ImuData

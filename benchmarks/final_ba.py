@@ -17,7 +17,7 @@ from benchmarks.recordings import is_held_out
 from benchmarks.running import Errors, Run
 from benchmarks.suite import Benchmark, Outcome
 from benchmarks.wheel import TRUTH
-from slam_graph.datasets.dataset_registry import DEMO
+from slam_graph.datasets.formats.eqvio import DEMO
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.experiment.tasks import find_sources
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.metric import QUANTISED_TOLERANCE, Metric
 from benchmarks.running import Run
 from benchmarks.suite import CORE, PEERS, UNBOUNDED, Benchmark, Outcome
-from slam_graph.datasets.dataset_registry import DEMO
+from slam_graph.datasets.formats.eqvio import DEMO
 
 TRUTH = "euroc_inertial/V1_01_easy"
 

@@ -128,6 +128,26 @@ class RunConfig(Settings):
     limits: LimitsConfig = LimitsConfig()
     """When a run is given up as diverged."""
 
+    def _facts(self) -> dict[str, object]:
+        """The policies of the algorithm, and what differs from the defaults."""
+        table = self.algorithm.model_dump(mode="json")
+        policies = {
+            f"algorithm.{section}": ", ".join(
+                f"{name} {value}"
+                for name, value in values.items()
+                if not _is_expert(getattr(self.algorithm, section), name)
+            )
+            for section, values in table.items()
+            if isinstance(values, dict)
+        }
+        changed = {
+            name: value
+            for name, value in self._changed().items()
+            if not name.startswith("algorithm")
+        }
+        first: dict[str, object] = {"algorithm": f"{table['name']} ({table['engine']})"}
+        return first | policies | (changed or {"other settings": "their defaults"})
+
     @field_validator("backend")
     @classmethod
     def _engine_can_calibrate(cls, backend: BackendConfig, info: ValidationInfo) -> BackendConfig:
@@ -157,6 +177,12 @@ class RunConfig(Settings):
         """
         tree = ConfigTree(self.model_dump(exclude_unset=True))
         return _changed(tree, overrides, options).validated(type(self))
+
+
+def _is_expert(table: Settings, name: str) -> bool:
+    """Whether a setting is of the second tier and has its default."""
+    info = type(table).model_fields[name]
+    return isinstance(info.json_schema_extra, dict) and getattr(table, name) == info.default
 
 
 def load_config(

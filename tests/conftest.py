@@ -4,9 +4,13 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import gtsam
 import pytest
+
+if TYPE_CHECKING:
+    from documented_stock import Stock
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +29,13 @@ def data_dir() -> Path:
 def gtsam_data() -> Path:
     """The data folder of the GTSAM wheel, always there."""
     return Path(gtsam.__file__).parent / "Data"
+
+
+@pytest.fixture(scope="session")
+def stock(tmp_path_factory: pytest.TempPathFactory) -> "Stock":
+    """Short recordings under the names that the documents use."""
+    from documented_stock import Stock
+
+    folder = os.environ.get("SLAM_GRAPH_DATA")
+    real = Path(folder).resolve() if folder and Path(folder).is_dir() else None
+    return Stock(tmp_path_factory.mktemp("stock"), real)

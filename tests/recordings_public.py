@@ -38,7 +38,11 @@ def random_image(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
 
 def write_tum_vi(root: Path) -> Path:
     """An EuRoC folder whose calibration is where TUM-VI keeps it, and whose images have 16 bits."""
-    write_euroc(root)
+    return as_tum_vi(write_euroc(root))
+
+
+def as_tum_vi(root: Path) -> Path:
+    """Turn an EuRoC folder into one of TUM-VI, in place."""
     (root / "dso").mkdir()
     write_kalibr(EurocSequence(root).rig, root / "dso" / "camchain.yaml")
     chain = root / "dso" / "camchain.yaml"
@@ -123,8 +127,8 @@ def write_kitti_raw(day: Path, frames: int = 6, extract: bool = True) -> Path:
     return drive
 
 
-def write_kitti_odometry(root: Path, frames: int = 6) -> Path:
-    sequence = root / "sequences" / "03"
+def write_kitti_odometry(root: Path, frames: int = 6, number: str = "03") -> Path:
+    sequence = root / "sequences" / number
     lines, times, poses = [], [], []
     for k, camera in enumerate(P_RECT):
         (sequence / f"image_{k}").mkdir(parents=True)
@@ -141,7 +145,7 @@ def write_kitti_odometry(root: Path, frames: int = 6) -> Path:
     write_lines(sequence / "calib.txt", lines)
     write_lines(sequence / "times.txt", times)
     (root / "poses").mkdir()
-    write_lines(root / "poses" / "03.txt", poses)
+    write_lines(root / "poses" / f"{number}.txt", poses)
     return sequence
 
 

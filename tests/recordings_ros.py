@@ -17,7 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from slam_graph.datasets.rosbag.messages import TRANSFORMS
 from slam_graph.datasets.sequence import RecordedSequence
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame
+from slam_graph.sensors.rig import Rig
 
 LAG_NS = 7_000_000
 """How much later than its stamp a message is recorded."""
@@ -84,14 +86,19 @@ class BagWriter:
             "sensor_msgs/msg/CompressedImage", header, form, np.frombuffer(data, np.uint8)
         )
 
-    def camera_info(self, stamp_ns: int, frame: str, k3: float = 0.0) -> Any:
-        fx, fy, cx, cy = INTRINSICS
+    def camera_info(
+        self, stamp_ns: int, frame: str, k3: float = 0.0, camera: Camera | None = None
+    ) -> Any:
+        """Of a camera with distortion `radtan`, by default of the small made-up one."""
+        fx, fy, cx, cy = INTRINSICS if camera is None else camera.intrinsics.tolist()
+        distortion = DISTORTION if camera is None else camera.coefficients
+        width, height = SIZE if camera is None else (camera.width, camera.height)
         K = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
         P = np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0])
         region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-        matrices = (np.array([*DISTORTION, k3]), K, np.eye(3).ravel(), P)
+        matrices = (np.array([*distortion, k3]), K, np.eye(3).ravel(), P)
         header = self.header(stamp_ns, frame)
-        model = (SIZE[1], SIZE[0], "plumb_bob")
+        model = (height, width, "plumb_bob")
         return self.make("sensor_msgs/msg/CameraInfo", header, *model, *matrices, 0, 0, region)
 
     def transform(self, stamp_ns: int, parent: str, child: str, t: Any, q: Any) -> Any:
@@ -181,6 +188,17 @@ def write_calibration(bag: BagWriter) -> None:
     bag.write("/tf_static", message, begin_ns)
     for c in range(2):
         bag.write(f"/cam{c}/camera_info", bag.camera_info(begin_ns, f"cam{c}"), begin_ns)
+
+
+def write_calibration_of(bag: BagWriter, rig: Rig, places: list[str]) -> None:
+    """`camera_info` of the cameras of a rig below some topics, and where they are on the IMU."""
+    transforms = []
+    for c, mounted in enumerate(rig.cameras):
+        pose = mounted.body_T_camera
+        q = pose.rotation().toQuaternion().coeffs()
+        transforms.append(bag.transform(0, "imu", f"cam{c}", pose.translation(), q))
+        bag.write(f"{places[c]}/camera_info", bag.camera_info(1, f"cam{c}", 0.0, mounted.camera), 1)
+    bag.write("/tf_static", bag.make(TRANSFORMS, transforms), 1)
 
 
 def encoded(image: np.ndarray, suffix: str) -> bytes:

@@ -15,8 +15,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, skew
-from slam_graph.backend.smoothing.final_adjustment import FinalBa, FinalBaSummary
+from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary
+from slam_graph.backend.smoothing.final_adjustment import FinalBa
 from slam_graph.backend.smoothing.state_covariances import gauge_motion
+from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.evaluation.evaluation_report import nees_of_run
 from slam_graph.geometry.state_history import StateHistory
@@ -137,3 +139,19 @@ def test_errors_after_alignment_are_as_large_as_the_covariances_say(
     means = drawn[f"{name}.{part}"].mean(axis=0)[1 if name == "first_pose" else 0 :]
     low, high = mean_bounds(3, DRAWS, 1.0 - FALSE_ALARMS)
     assert np.all((means > low) & (means < high)), means
+
+
+def test_a_smoothed_covariance_that_is_none_is_left_out() -> None:
+    problem = Problem.random(np.random.default_rng(4))
+    own = [slice(6 * k, 6 * k + 6) for k in range(POSES)]
+    _, P = problem.gains(POSES - 1)
+    smooth = [problem.in_body(k, P[own[k], own[k]]) for k in range(POSES)]
+    aligned = problem.after_alignment(P)
+    causal = problem.history(np.zeros((POSES, 6)), smooth)
+    smooth[-1] = smooth[-1] - 2 * np.linalg.eigvalsh(smooth[-1])[0] * np.eye(6)
+    best = problem.history(np.zeros((POSES, 6)), smooth)
+    found = aligned_by_smoothed(
+        problem.truth, causal, FinalBa(best, cast(FinalBaSummary, None), aligned)
+    )
+    assert found is not None
+    assert np.isfinite(found[1]).all(axis=(1, 2)).tolist() == [True] * (POSES - 1) + [False]

@@ -5,14 +5,12 @@
 import os
 import pty
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from limits import HANG_S
 from typer.testing import CliRunner
 
@@ -31,18 +29,6 @@ def test_every_command_has_examples_in_its_help(name: str) -> None:
     assert "Examples" in shown
     for line in EXAMPLES[name]:
         assert line in shown
-
-
-@pytest.mark.parametrize("line", sorted({line for name in ["", *NAMES] for line in EXAMPLES[name]}))
-def test_examples_are_understood(line: str) -> None:
-    """Every word is a command, an option or a value of the right type."""
-    _, *words = shlex.split(line)
-    command: Any = typer.main.get_command(app)
-    context = command.make_context("slam-graph", words)
-    while hasattr(command, "commands"):
-        rest = [*getattr(context, "_protected_args", []), *context.args]
-        name, command, rest = command.resolve_command(context, rest)
-        context = command.make_context(name, rest, parent=context)
 
 
 @pytest.mark.parametrize(

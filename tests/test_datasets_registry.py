@@ -32,6 +32,7 @@ def test_formats_are_guessed(tmp_path: Path) -> None:
     assert open_dataset(tmp_path / "flight" / "mav0").info().format == "euroc"
     assert open_dataset(tmp_path / "simulated").info().format == "openvins_sim"
     assert open_dataset("demo").info().format == "eqvio"
+    assert open_dataset("demo").info().name == "demo", "where its results lie"
 
 
 def test_unknown_path_names_all_formats(tmp_path: Path) -> None:

@@ -102,7 +102,10 @@ def test_every_picture_that_is_asked_for_can_be_drawn() -> None:
 def test_settings_show_what_differs_from_the_defaults() -> None:
     config = sg.load_config("swf", {"backend.noise.pixel_sigma": 2.0}, seed=3)
     assert repr(config) == "RunConfig(algorithm=swf, seed=3, backend.noise.pixel_sigma=2.0)"
-    assert "backend.noise.pixel_sigma" in html_of(config)
+    html = html_of(config)
+    assert "backend.noise.pixel_sigma" in html
+    assert "max_past_poses 15" in html, "the policies of the algorithm"
+    assert "first_estimates" in html_of(sg.load_config())
     assert repr(config.frontend) == "FrontendConfig(defaults)"
 
 
@@ -126,6 +129,8 @@ def test_a_pose_is_found_at_any_time(trajectory: Trajectory) -> None:
         trajectory.at(first - 1)
     with pytest.raises(DataError, match="empty"):
         trajectory[:0].at(first)
+    with pytest.raises(DataError, match="whole number of nanoseconds"):
+        trajectory.at(0.5)  # type: ignore[arg-type]
 
 
 def test_files_hold_the_trajectory(trajectory: Trajectory, tmp_path: Path) -> None:

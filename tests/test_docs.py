@@ -215,15 +215,3 @@ print(len(result.history))
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout.split()[-1]) > 100
-
-
-@pytest.mark.parametrize("name", ["quickstart.md", "api.md"])
-def test_the_python_of_the_page_runs(name: str, tmp_path: Path) -> None:
-    page = (ROOT / "docs" / name).read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```python\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
-    done = subprocess.run(
-        [sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("ok ")
-    assert (tmp_path / "results" / "demo" / "trajectory.tum").is_file()

@@ -124,6 +124,16 @@ def test_without_noise_every_frame_is_exact(keep: Keep, cameras: int) -> None:
     assert alone.summary.cost_after < 1e-9 * alone.summary.cost_before
 
 
+def test_the_cost_before_and_after_is_one_quantity(keep: Keep) -> None:
+    """It falls; one that begins at its own minimum gains only by points, which are triangulated
+    without weights before it."""
+    kept = keep(flight(sigma=1.0))
+    found = kept.adjusted(disturbed(kept.truth))
+    assert found.summary.cost_before > 2.0 * found.summary.cost_after
+    again = kept.adjusted(found.trajectory).summary
+    assert again.cost_after <= again.cost_before < 1.3 * again.cost_after
+
+
 @pytest.mark.parametrize("camera", [FISHEYE, DOUBLE_SPHERE], ids=lambda c: c.distortion)
 def test_wide_lenses_are_solved(keep: Keep, camera: Camera, tmp_path: Path) -> None:
     write_kalibr(rig(2, camera), tmp_path / "wide.yaml")

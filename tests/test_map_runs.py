@@ -141,17 +141,19 @@ def test_strangers_are_refused(tour: Path, known: Path) -> None:
     assert json.loads(done.stdout)["localization"]["located"] == 0
 
 
-def test_tracks_without_descriptors_make_no_map(known: Path) -> None:
-    tracks = TrackConfig(features=30)
-    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks))
-    result = run(sequence, load_config(None, ["map.enabled=true"]), known_map=load_map(known))
-    assert result.status == "no_map"
-    with pytest.raises(EstimationError, match="no map was made: nothing to recognise places by"):
-        result.check()
-    assert result.slam_map is None
-    assert result.metrics["extent"]["coverage"] == 1.0
-    assert result.warnings["map_impossible"] == 1
-    assert result.warnings["localization_impossible"] == 1
+def test_what_has_no_descriptors_is_refused_before_the_first_frame(
+    tmp_path: Path, known: Path
+) -> None:
+    plain = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=TrackConfig(features=9)))
+    with pytest.raises(DataError, match=r"cannot make a map.*tracks\.descriptors=true"):
+        run(plain, load_config(None, ["map.enabled=true"]))
+    plain.save(tmp_path / "plain")
+    for words in (("run", "--save-map"), ("localize", "--map", known)):
+        done = call(words[0], tmp_path / "plain", *words[1:], "--output", tmp_path / "out")
+        assert isinstance(done.exception, DataError)
+        assert done.exception.exit_code == 1
+        assert "tracks.descriptors=true" in str(done.exception)
+    assert not any((tmp_path / "out").rglob("*.tum"))
 
 
 def test_two_flights_through_one_place_by_the_recipe(
@@ -177,8 +179,15 @@ def test_two_flights_through_one_place_by_the_recipe(
     assert table["localization"]["accuracy"]["none"]["ate"]["translation_m"]["rmse"] < 0.1
 
 
-def test_a_run_that_makes_no_map_is_an_error(tmp_path: Path) -> None:
-    simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0)).save(tmp_path / "plain")
+def test_a_run_that_makes_no_map_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("no points")
+
+    monkeypatch.setattr("slam_graph.pipeline.mapping.build_map", fails)
+    tracks = TrackConfig(features=30, descriptors=True)
+    simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, tracks=tracks)).save(tmp_path / "plain")
     done = call("run", tmp_path / "plain", "--save-map", "--output", tmp_path / "out")
     assert isinstance(done.exception, EstimationError)
     assert done.exception.exit_code == 3

@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 import slam_graph as sg
 from slam_graph.evaluation.evaluation_report import nees_of_run
 from slam_graph.geometry.trajectory import Trajectory, interpolate
-from slam_graph.results.run_picture import PoseEstimate
+from slam_graph.geometry.trajectory_alignment import Similarity
+from slam_graph.results.run_picture import (
+    IN_MAP,
+    LOOPS_CLOSED,
+    PoseEstimate,
+    with_path_in_map,
+)
 from slam_graph.visualization.bundle_picture import bundle_figure
 from slam_graph.visualization.panels import Panel, panel_figure
 from slam_graph.visualization.style import line_styles
@@ -61,6 +67,53 @@ def test_bars_and_boxes_of_any_number_of_samples(runs: int) -> None:
         Panel("", ""),
     ]
     assert panel_figure("runs", panels).png(40)[:4] == PNG
+
+
+@pytest.mark.parametrize("largest", [0.0181, 4000.0])
+def test_numbers_and_the_ideal_lie_inside_of_their_panel(largest: float) -> None:
+    """Linear and logarithmic."""
+    for low, samples in ((0.00875, 1), (0.005, 5)):
+        values = {"msckf": low, "swf": 0.00875, "okvis": largest}
+        columns = {name: np.linspace(0.9, 1.0, samples) * value for name, value in values.items()}
+        ideal = 3.0 * largest
+        figure = panel_figure("", [Panel("error", "", samples=columns, ideal=ideal)])
+        figure.draw_without_rendering()
+        (axes,) = figure.axes
+        frame = axes.get_window_extent()
+        for text in axes.texts:
+            if text.get_text() != " ideal":
+                assert text.get_window_extent().x1 <= frame.x1
+        assert axes.get_xlim()[0] <= 0.005
+        assert axes.get_xlim()[1] >= ideal
+
+
+def test_no_path_hides_another() -> None:
+    x = np.linspace(0.0, 1.0, 9)
+    curves = dict.fromkeys(("ground truth", "causal", "smoothed", "loops closed"), (x, x))
+    figure = panel_figure("", [Panel("x", "y", curves, "path")])
+    widths = [line.get_linewidth() for line in figure.axes[0].lines if line.get_label() in curves]
+    assert all(np.diff(widths) < -0.5)
+
+
+def test_a_path_after_loop_closure_is_shown_where_loops_were_accepted() -> None:
+    tracks = {"features": 30, "descriptors": True}
+    flight = sg.simulate(duration_s=2.0, rate_hz=10.0, tracks=tracks)
+    result = sg.run(flight, overrides={"loop_closure.enabled": True})
+    assert result.loop_closed is not None
+    assert not len(result.loop_ends_ns)
+    assert LOOPS_CLOSED not in result._view().paths
+    assert result._facts()["error, loops closed"] is None
+
+
+def test_a_path_in_a_map_is_aligned_by_itself() -> None:
+    result = sg.run(sg.simulate(trajectory="figure8", duration_s=4.0, rate_hz=10.0))
+    view = result._view()
+    elsewhere = Similarity(Rotation.from_euler("z", 0.7).as_matrix(), np.array([3.0, 1.0, -2.0]))
+    path = with_path_in_map(view, elsewhere.apply(result.trajectory)).paths[IN_MAP]
+    assert result.groundtruth is not None
+    error = sg.ape(result.groundtruth, path).statistics.rmse
+    aligned = sg.ape(result.groundtruth, result.trajectory, alignment="yaw").statistics.rmse
+    assert error == pytest.approx(aligned, rel=1e-6)
 
 
 def test_a_picture_for_a_notebook_has_a_palette_and_looks_the_same() -> None:

@@ -3,10 +3,12 @@
 """Recordings for Rerun, read back by Rerun: what is promised is in them, at its times."""
 
 import logging
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -24,12 +26,14 @@ from slam_graph.errors import DataError
 from slam_graph.pose_graph import optimize_pose_graph
 from slam_graph.results import RunResult
 from slam_graph.visualization import RerunRecording
-from slam_graph.visualization.rerun_blueprints import GROWING
+from slam_graph.visualization.rerun_blueprints import GROWING, Eye, with_ticks
 from slam_graph.visualization.rerun_progress import StepSeries
 from slam_graph.visualization.rerun_series import PLOTS
 
 DURATION_S = 6.0
 TIMELINES = {"frame", "sensor_time"}
+NOBODY = "rerun+http://127.0.0.1:9/proxy"
+"""An address at which no viewer listens."""
 
 OF_A_RUN = {
     *("/world/path/causal", "/world/path/smoothed", "/world/path/groundtruth", "/world/gravity"),
@@ -139,9 +143,8 @@ def test_the_layout_has_space_cameras_plots_and_window(
     _, found = watched
     views = ("Run", "cam0", "Window", "Factor graph of the window", "Legend", "Log")
     plots = ("velocity [m/s]", "gyro bias [rad/s]", "time [ms]", "NIS / degrees of freedom")
-    assert len(found.layouts) == 2
-    assert found.has_layout(*views, *plots), "during the run"
-    assert found.has_layout(*views, *plots, "position error [m]", "NEES"), "at its end"
+    assert len(found.layouts) == 1, "a file has the layout of the end only"
+    assert found.has_layout(*views, *plots, "position error [m]", "NEES")
 
 
 def test_a_result_that_was_not_watched_is_shown_from_its_files(
@@ -248,6 +251,59 @@ def refused(*arguments: str | Path) -> str:
     return str(done.exception) if isinstance(done.exception, sg.SlamGraphError) else done.output
 
 
+@pytest.mark.parametrize("aspect", [1.0, 1.8])
+def test_a_whole_path_is_in_view(aspect: float) -> None:
+    rng = np.random.default_rng(3)
+    for scale in ((10.0, 3.0, 1.0), (1.0, 8.0, 2.0), (1.0, 1.0, 0.0)):
+        path = rng.normal(size=(200, 3)) * scale + rng.normal(size=3)
+        eye = Eye.on(path, aspect=aspect)
+        assert eye is not None
+        ahead = np.subtract(eye.target, eye.position)
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        seen = (path - eye.position) @ np.column_stack([right, np.cross(right, ahead), ahead])
+        across, up = (np.abs(seen[:, :2]) / seen[:, 2:]).max(axis=0)
+        half = np.tan(np.deg2rad(55.0 / 2))  # of the view of Rerun, from top to bottom
+        assert seen[:, 2].min() > 0.0
+        assert 0.6 < max(across / aspect, up) / half < 1.0
+
+
+def test_two_numbers_stand_beside_an_axis() -> None:
+    rng = np.random.default_rng(5)
+    for low, size in zip(rng.normal(size=300), 10 ** rng.uniform(-6, 4, size=300), strict=True):
+        first, last = with_ticks(low, low + size)
+        assert first < low < low + size < last
+        step = 10 ** np.ceil(np.log10(0.1 * (last - first)))
+        assert np.floor(last / step) - np.ceil(first / step) >= 1
+
+
+def test_a_window_is_opened_by_the_viewer_that_is_installed_beside(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened: dict[str, Any] = {}
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr("rerun.spawn", lambda **arguments: opened.update(arguments))
+    monkeypatch.setattr("slam_graph.visualization.rerun_stream.DEFAULT_ADDRESS", NOBODY)
+    with pytest.raises(DataError, match="the viewer did not start"):
+        RerunRecording("spawn", "name")
+    assert Path(opened["executable_path"]).is_file()
+
+
+def test_a_window_that_does_not_open_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tmp_path / "a.rrd"
+    with RerunRecording("save", "a", recording):
+        pass
+    ends = [sys.executable, "-c", "raise SystemExit(1)"]
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("slam_graph.visualization.rerun_screenshot._viewer_command", lambda: ends)
+    with pytest.raises(DataError, match="no window could be opened"):
+        RerunRecording.open(recording)
+
+
 def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(variable, raising=False)
@@ -255,7 +311,7 @@ def test_what_cannot_be_shown_is_an_error(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(DataError, match="no display"):
         RerunRecording("spawn", "name")
     with pytest.raises(DataError, match="no Rerun viewer can be reached"):
-        RerunRecording("connect", "name", address="rerun+http://127.0.0.1:9/proxy")
+        RerunRecording("connect", "name", address=NOBODY)
     with pytest.raises(DataError, match="no address of a viewer"):
         RerunRecording("connect", "name", address="localhost")
     with pytest.raises(DataError, match="cannot be written"):

@@ -14,7 +14,7 @@ from benchmarks.policy_product import FLIGHT
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing.bayes_tree import cliques_of, joint_covariances, solved
+from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, joint_covariances, solved
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_problem import (
@@ -127,6 +127,18 @@ def test_covariances_of_cliques_are_those_of_the_dense_inverse(problem: Problem)
     keys = list(right)
     expected = dense.joint(keys) @ np.concatenate(list(right.values()))
     np.testing.assert_allclose(np.concatenate([found[k] for k in keys]), expected, rtol=1e-6)
+
+
+def test_a_difference_that_is_known_far_better_than_its_parts_is_not_lost() -> None:
+    """A parent knows x - y to 1e-7 and x + y to 1; its child is 1e7 (x - y) with an error of 1."""
+    rows = np.array([[1e7, -1e7, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    lever = np.zeros((3, 3))
+    lever[0, :2] = -1e7, 1e7
+    whole = slice(0, 3)
+    parent = Clique({V(0): whole}, [V(0)], np.linalg.qr(rows)[1], np.zeros((3, 0)), -1, np.r_[:0])
+    child = Clique({V(1): whole, V(0): slice(3, 6)}, [V(1)], np.eye(3), lever, 0, np.r_[whole])
+    _, (_, P) = joint_covariances([parent, child])
+    np.testing.assert_allclose(P[whole, whole], np.diag([2.0, 1.0, 1.0]), atol=1e-6)
 
 
 def test_covariances_at_keyframes_and_after_alignment_are_those_of_the_dense_inverse(

@@ -39,7 +39,21 @@ def commands() -> str:
         [*typer, *arguments], cwd=PACKAGE.parent, capture_output=True, text=True, check=True
     )
     _, _, body = done.stdout.partition("\n")  # the page has a title of its own
+    body = _whole_summaries(body)
     return TAG.sub(lambda found: found[0].replace("<", "&lt;") if found["tag"] else found[0], body)
+
+
+def _whole_summaries(body: str) -> str:
+    """The lists of commands with the whole first sentences, which Typer cuts short."""
+    first = dict(re.findall(r"^##+ `slam-graph (.+)`\n\n(.+(?:\n.+)*)", body, re.MULTILINE))
+    lines, group = [], ""
+    for line in body.splitlines():
+        if heading := re.match(r"##+ `slam-graph (.+)`", line):
+            group = f"{heading[1]} "
+        if entry := re.match(r"\* `([a-z]+)`: .*\.\.\.$", line):
+            line = f"* `{entry[1]}`: {first[group + entry[1]].replace(chr(10), ' ')}"
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def main_names() -> str:

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,9 +24,12 @@ from slam_graph.cli.options import (
     Json,
     Overrides,
     Progress,
+    RerunImages,
+    SaveGraph,
     Seed,
     Sources,
     Start,
+    graph_times,
     sources_from,
 )
 
@@ -95,6 +98,12 @@ def batch(
             show_default=False,
         ),
     ] = None,
+    save_graph: SaveGraph = None,
+    rerun: Annotated[
+        Literal["off", "save"],
+        typer.Option("--rerun", help="save: write recording.rrd for Rerun beside each result."),
+    ] = "off",
+    rerun_images: RerunImages = "all",
     format_: Format = None,
     calibration: Calibration = None,
     sources: Sources = None,
@@ -132,6 +141,9 @@ def batch(
                 scheduler=scheduler,
                 progress=None if shown is None else shown.ended,
                 watch=None if shown is None else shown.running,
+                rerun=rerun,
+                rerun_images=rerun_images,
+                graph_times=graph_times(save_graph),
                 **options,
             )
     except KeyboardInterrupt:

@@ -37,7 +37,9 @@ def export(
     which: Annotated[
         Which,
         typer.Option(
-            "--which", help="Trajectory to write; best: smoothed if there is one, else causal."
+            "--which",
+            help="Poses to write. best: of a trajectory smoothed if there is one, else causal; of "
+            "images those of the map, else loop, smoothed, causal, the first that there is.",
         ),
     ] = "best",
     colmap: Annotated[
@@ -68,7 +70,7 @@ def export(
     """Write a result for other programs: trajectories, or keyframes with images and points.
 
     After a run with --save-map the keyframes and points of its map are exported too, with the
-    observations of the first camera.
+    observations of the points.
     """
     from slam_graph.errors import ConfigError
     from slam_graph.results import load_result
@@ -88,10 +90,12 @@ def export(
         typer.echo(str(_chosen(saved, which).save(path, name)))  # type: ignore[arg-type]
     if recording is None:
         return
+    if scenes:
+        typer.echo(f"poses of the images: {saved.exported_poses(which)[0]}", err=True)
     sequence = open_recording(recording, format_, calibration, None, sources)
     for folder in dict.fromkeys(scenes.values()):
         wanted = [name for name, path in scenes.items() if path == folder]
-        for file in saved.export(folder, sequence, wanted, spacing):
+        for file in saved.export(folder, sequence, wanted, spacing, which):
             typer.echo(str(file))
 
 

@@ -30,12 +30,12 @@ EXAMPLES = {
     ),
     "run": (
         "slam-graph run demo --algorithm swf --duration 20",
-        "slam-graph run path/to/MH_01_easy --cameras stereo --loop-closure",
+        "slam-graph run path/to/MH_01_easy --loop-closure --save-map",
         "slam-graph run flight.bag --topic imu=/imu0 --topic cam0=/cam0/image_raw",
     ),
     "batch": (
         "slam-graph batch path/to/recordings --jobs 4",
-        "slam-graph batch 'data/*/MH_*' --algorithm okvis --output results/okvis",
+        "slam-graph batch 'path/to/*/MH_*' --algorithm okvis --output results/okvis",
         "slam-graph batch list.yaml --scheduler tcp://127.0.0.1:8786",
     ),
     "localize": ("slam-graph localize path/to/MH_02_easy --map results/MH_01_easy",),
@@ -43,30 +43,37 @@ EXAMPLES = {
         "slam-graph map info results/MH_01_easy",
         "slam-graph map merge monday.slam tuesday.slam --output both.slam",
     ),
-    "ape": ("slam-graph ape groundtruth.tum results/demo/latest/trajectory.tum --align yaw",),
-    "rpe": ("slam-graph rpe groundtruth.tum trajectory.tum --delta 1 --delta_unit m",),
+    "ape": (
+        "slam-graph ape path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum --align yaw",
+    ),
+    "rpe": (
+        "slam-graph rpe path/to/MH_01_easy results/MH_01_easy/latest/trajectory.tum -d 0.5 -u m",
+    ),
     "view": (
-        "slam-graph view results/demo",
-        "slam-graph view results/demo --screenshot demo.png",
+        "slam-graph view results/MH_01_easy",
+        "slam-graph view results/MH_01_easy --screenshot picture.png",
     ),
     "export": (
-        "slam-graph export results/demo --tum poses.tum --euroc states.csv",
+        "slam-graph export results/MH_01_easy --tum poses.tum --euroc states.csv",
         "slam-graph export results/MH_01_easy --recording path/to/MH_01_easy --colmap scene",
     ),
     "compare": (
         "slam-graph compare sim:figure8 --algorithms msckf,swf --seeds 5",
-        "slam-graph compare path/to/MH_01_easy --algorithms msckf,okvis,own.yaml",
+        "slam-graph compare path/to/MH_01_easy --algorithms msckf,okvis,kmsckf.yaml",
     ),
-    "optimize": ("slam-graph optimize sphere.g2o", "slam-graph optimize problem-49-7776.txt.bz2"),
+    "optimize": (
+        "slam-graph optimize sphere2500.g2o",
+        "slam-graph optimize problem-16-22106-pre.txt.bz2",
+    ),
     "simulate": (
         "slam-graph simulate flight --duration 30",
-        "slam-graph simulate flight --kind images --trajectory rooms",
+        "slam-graph simulate rooms --kind images --trajectory rooms",
     ),
     "data": ("slam-graph data info demo", "slam-graph data check path/to/MH_01_easy"),
     "frontend": ("slam-graph frontend run path/to/MH_01_easy --duration 10",),
     "config": (
-        "slam-graph config dump --algorithm okvis",
-        "slam-graph config check own.yaml",
+        "slam-graph config dump --algorithm okvis > my.yaml",
+        "slam-graph config check my.yaml",
     ),
 }
 """Commands that a user can type, for the help of each command; of the program itself under ``""``.

@@ -150,6 +150,16 @@ RerunAddress = Annotated[
         rich_help_panel=_VIEWER,
     ),
 ]
+SaveGraph = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--save-graph",
+        metavar="STAMP",
+        help="Save the factor graph of the back end at this time, repeatable: seconds after "
+        "the first frame, or a stamp in ns. Files for GTSAM and Graphviz.",
+        show_default=False,
+    ),
+]
 Progress = Annotated[
     bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
 ]
@@ -266,3 +276,16 @@ def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
     start = perf_counter()
     yield
     seconds[part] = perf_counter() - start
+
+
+def graph_times(texts: list[str] | None) -> list[int | float]:
+    """The times of `--save-graph`: seconds, or stamps in ns, which a float could not hold."""
+    times: list[int | float] = []
+    for text in texts or ():
+        try:
+            times.append(int(text) if text.isdecimal() else float(text))
+        except ValueError as error:
+            raise typer.BadParameter(
+                f"'{text}' is neither seconds nor a stamp in ns", param_hint="--save-graph"
+            ) from error
+    return times

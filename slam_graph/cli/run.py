@@ -38,9 +38,11 @@ from slam_graph.cli.options import (
     RerunAddress,
     RerunDetail,
     RerunImages,
+    SaveGraph,
     Seed,
     Sources,
     Start,
+    graph_times,
     open_recording,
     run_settings,
 )
@@ -68,9 +70,10 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     if metrics["final_ba"] and metrics["final_ba"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["final_ba"]["accuracy"], "smoothed"))
-    if metrics["loop_closure"] and metrics["loop_closure"]["accuracy"]:
+    loops = metrics["loop_closure"]
+    if loops and loops["accepted"] and loops["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(metrics["loop_closure"]["accuracy"], "loops closed"))
+        echo_table(_accuracy(loops["accuracy"], "loops closed"))
     if metrics["localization"] and metrics["localization"]["accuracy"]:
         typer.echo("")
         echo_table(_accuracy(metrics["localization"]["accuracy"], "in the map"))
@@ -230,16 +233,7 @@ def run(
             show_default=False,
         ),
     ] = None,
-    save_graph: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--save-graph",
-            metavar="STAMP",
-            help="Save the factor graph of the back end at this time, repeatable: seconds after "
-            "the first frame, or a stamp in ns. Files for GTSAM and Graphviz.",
-            show_default=False,
-        ),
-    ] = None,
+    save_graph: SaveGraph = None,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -271,22 +265,12 @@ def run(
             Watching(rerun, rerun_images, rerun_detail, rerun_address),
             progress,
             log,
-            graph_times=[_time(text) for text in save_graph or ()],
+            graph_times=graph_times(save_graph),
         )
     try:
         report(result, folder, files, as_json)
     finally:
         keep_serving(rerun)
-
-
-def _time(text: str) -> int | float:
-    """Seconds, or a stamp in ns, which a float could not hold."""
-    try:
-        return int(text) if text.isdecimal() else float(text)
-    except ValueError as error:
-        raise typer.BadParameter(
-            f"'{text}' is neither seconds nor a stamp in ns", param_hint="--save-graph"
-        ) from error
 
 
 def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _Show = Callable[["RerunRecording"], None]
 _ERRORS = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
+_ERROR_TITLES = ("time_s", "position error [m]", "orientation error [deg]")
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
 """What NumPy raises for a file that is no archive of arrays, or lacks one."""
 _SAME_M = 1e-6
@@ -197,7 +198,7 @@ def _run(folder: Path, options: RunOptions) -> _Show:
     )
 
 
-def _comparison(folder: Path) -> _Show | None:
+def _comparison(folder: Path) -> _Show:
     """A comparison by `slam-graph compare`: all algorithms on the first data, with one seed."""
     import numpy as np
 
@@ -211,13 +212,20 @@ def _comparison(folder: Path) -> _Show | None:
             continue
         try:
             with file.open("rb") as data, np.load(data, allow_pickle=False) as series:
-                if "time_s" not in series or "translation_m_yaw" not in series:
-                    continue  # without a truth, or without motion
-                columns = np.stack([series[name] for name in _ERRORS])
-                path, true_path = series["path"].reshape(-1, 3), series["true_path"]
+                run = {
+                    "path": series.get("path", np.zeros(0)).reshape(-1, 3),
+                    "time_s": np.zeros(0),
+                }
+                if "time_s" in series and "translation_m_yaw" in series:
+                    columns = np.stack([series[name] for name in _ERRORS])
+                    run |= dict(zip(_ERROR_TITLES, columns, strict=True))
+                elif len(run["path"]) == 0:
+                    continue  # without motion
+                true_path = series.get("true_path", true_path)
         except (*_DAMAGED, BadZipFile, zlib.error) as error:
             raise DataError(f"{file}: not the series of a run ({error})") from error
-        titles = ("time_s", "position error [m]", "orientation error [deg]")
-        runs[file.stem] = {"path": path, **dict(zip(titles, columns, strict=True))}
+        runs[file.stem] = run
+    if not runs:
+        raise DataError(f"{folder}: nothing to show: no run has a path")
     true_paths = {} if true_path is None else {"ground truth": true_path}
-    return (lambda recording: recording.show_comparison(runs, true_paths)) if runs else None
+    return lambda recording: recording.show_comparison(runs, true_paths)

@@ -8,7 +8,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from slam_graph.datasets.formats.eqvio import EqvioTracks, is_eqvio_file, wheel_tracks
+from slam_graph.datasets.formats.eqvio import (
+    DEMO,
+    EqvioTracks,
+    is_eqvio_file,
+    wheel_tracks,
+)
 from slam_graph.datasets.formats.euroc import EurocSequence, TumViSequence, is_tum_vi
 from slam_graph.datasets.formats.image_folder import ImageFolderSequence, is_image_folder
 from slam_graph.datasets.formats.kitti_odometry import KittiOdometrySequence, is_kitti_odometry
@@ -23,9 +28,6 @@ from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.plugins import Registry
-
-DEMO = "demo"
-"""The name of the recording that comes with GTSAM."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,8 +48,8 @@ def aligned_by_smoothed(
 
     Returns:
         The map from the world of the states to that of the truth, and (N, 6, 6) pose covariances of
-        what is left, body frame, rotation before position, NaN where there is no smoothed state;
-        None if the smoothed covariances are not known.
+        what is left, body frame, rotation before position, NaN where there is no smoothed state, or
+        none with a positive definite covariance; None if the smoothed covariances are not known.
 
     Raises:
         DataError: if truth and smoothed trajectory share no time, or no yaw is determined.
@@ -68,6 +68,7 @@ def aligned_by_smoothed(
     own, whole = history.pose_covariances(), smoothed.history.pose_covariances()[rows]
     covariances = np.full_like(own, np.nan)
     known = same & np.isfinite(own).all(axis=(1, 2)) & np.isfinite(whole).all(axis=(1, 2))
+    known[known] = np.linalg.eigvalsh(whole[known])[:, 0] > 0.0
     covariances[known] = after[rows[known]] + _excess(own[known], whole[known])
     rotation = onto.rotation @ link.rotation
     return Similarity(rotation, onto.rotation @ link.translation + onto.translation), covariances

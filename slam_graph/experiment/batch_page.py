@@ -35,8 +35,10 @@ h1{font-size:1.5em;margin:0 0 .2em}
 .key i{display:inline-block;width:1.6em;height:0;margin:0 .35em 0 1em;
 border-top:3px solid;vertical-align:middle}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
-th{position:sticky;top:0;background:#fff;border-bottom:2px solid #999;cursor:pointer;
+th{position:sticky;top:0;background:#fff;border-bottom:2px solid #999;
 white-space:nowrap;padding:.4em .6em;text-align:right;font-weight:600}
+th[tabindex]{cursor:pointer}th[tabindex]:hover{background:#f2f2f2}
+th[aria-sort]::after{content:"\\2009▾";color:#0072b2}th[aria-sort=ascending]::after{content:"\\2009▴"}
 td{border-bottom:1px solid #e4e4e4;padding:.3em .6em;text-align:right}
 .text{text-align:left}.name{font-weight:600;overflow-wrap:anywhere}
 small{display:block;color:#666;font-weight:400;overflow-wrap:anywhere}
@@ -46,13 +48,18 @@ small{display:block;color:#666;font-weight:400;overflow-wrap:anywhere}
 svg{display:block}button{all:unset;cursor:zoom-in}
 dialog{border:0;border-radius:.5em;max-width:94vw;max-height:94vh;box-shadow:0 1em 4em #0006}
 dialog::backdrop{background:#0008}dialog img{max-width:90vw;max-height:86vh;display:block}
-@media(max-width:60em){.wide{display:none}}
+.table{overflow-x:auto}
+@media(min-width:60em){.table{overflow:visible}}
+@media(max-width:60em){.wide{display:none}td,th{padding:.3em .4em}svg{width:6em;height:auto}
+.name{overflow-wrap:normal;min-width:6em}.name small{min-width:8em}}
 """
 
 _SCRIPT = """
-document.querySelectorAll('th').forEach((head, column) => head.onclick = () => {
-  const body = document.querySelector('tbody'), up = head.dataset.up !== '1';
-  head.dataset.up = up ? '1' : '0';
+document.querySelectorAll('th[tabindex]').forEach(head => head.onclick = () => {
+  const body = document.querySelector('tbody'), column = head.cellIndex;
+  const up = head.getAttribute('aria-sort') !== 'ascending';
+  document.querySelectorAll('th').forEach(other => other.removeAttribute('aria-sort'));
+  head.setAttribute('aria-sort', up ? 'ascending' : 'descending');
   const key = row => row.cells[column].dataset.key;
   [...body.rows].sort((a, b) => {
     const x = key(a), y = key(b), p = Number(x), q = Number(y);
@@ -61,6 +68,9 @@ document.querySelectorAll('th').forEach((head, column) => head.onclick = () => {
     return up ? order : -order;
   }).forEach(row => body.append(row));
 });
+document.onkeydown = pressed => {
+  if (pressed.key === 'Enter' && pressed.target.matches('th')) pressed.target.click();
+};
 const shown = document.querySelector('dialog');
 document.querySelectorAll('button').forEach(button => button.onclick = () => {
   shown.querySelector('img').src = button.dataset.picture;
@@ -83,7 +93,7 @@ _EXPLANATION = (
     "ATE and rotation: root mean square errors against the ground truth, where there is one, after "
     "alignment of yaw and position. Speed: recorded time over the time of the causal estimate. "
     "A dot is the start. "
-    "A click on a title sorts, one on a path shows more of the run."
+    "A click on the title of a column sorts, one on a path shows more of the run."
 )
 
 
@@ -92,7 +102,8 @@ def write_page(folder: ResultFolder, rows: Sequence[Row]) -> None:
     titles = ("path", "recording", "status", *(title for _, title, *_ in _NUMBERS), "warnings")
     wide = {title: extra for _, title, _, extra in _NUMBERS}
     heads = "".join(
-        f'<th class="{"text" if k < 3 else ""}{wide.get(title, "")}">{title}</th>'
+        f'<th class="{"text" if k < 3 else ""}{wide.get(title, "")}"'
+        f"{' tabindex=0' if k else ''}>{title}</th>"
         for k, title in enumerate(titles)
     )
     lines = [
@@ -102,9 +113,9 @@ def write_page(folder: ResultFolder, rows: Sequence[Row]) -> None:
         f"<h1>{len(rows)} recordings</h1>",
         f'<div class="tiles">{_tiles(rows)}</div>',
         f'<p class="key">Paths from above:{_key()}<br>{escape(_EXPLANATION)}</p>',
-        f"<table><thead><tr>{heads}</tr></thead><tbody>",
+        f'<div class="table"><table><thead><tr>{heads}</tr></thead><tbody>',
         *(_line(row, folder.folder) for row in rows),
-        "</tbody></table><dialog><img alt='the run'></dialog>",
+        "</tbody></table></div><dialog><img alt='the run'></dialog>",
         f"<script>{_SCRIPT}</script></body></html>\n",
     ]
     folder.text("index.html", ["\n".join(lines)])

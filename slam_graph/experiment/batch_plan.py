@@ -78,6 +78,7 @@ def plan(
     overrides: Sequence[str],
     options: Mapping[str, Any],
     common: Mapping[str, Any],
+    extras: Mapping[str, Any],
 ) -> list[BatchTask]:
     """A task for each recording.
 
@@ -88,6 +89,7 @@ def plan(
         overrides: `a.b=value` for all; they come last.
         options: top-level settings for all, which replace those of a list; None changes nothing.
         common: `format`, `calibration` and `sources` of recordings that no list names.
+        extras: fields of all tasks that say what is written besides the results.
 
     Raises:
         ConfigError: if a setting is wrong, or two recordings of lists have one name.
@@ -122,6 +124,7 @@ def plan(
                 state=_state([entry.data, *files]),
                 config=settings,
                 output=output,
+                **extras,
                 **entry.model_dump(exclude={"name", "settings"}),
             )
         )

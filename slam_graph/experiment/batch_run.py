@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from slam_graph.errors import DataError
 from slam_graph.experiment.batch_page import write_page
@@ -61,6 +61,9 @@ def batch(
     scheduler: str | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
+    rerun: Literal["off", "save"] = "off",
+    rerun_images: Literal["none", "keyframes", "all"] = "all",
+    graph_times: Iterable[int | float] = (),
     **settings: Any,
 ) -> Batch:
     """Run many recordings, and write a summary.
@@ -87,6 +90,9 @@ def batch(
             number of runs done, and that of all.
         watch: called now and then, by another thread, with the part from 0 to 1 that is done of
             each recording that is being run, by its name, and the number of recordings to run.
+        rerun: `save` writes `recording.rrd` beside the results of each recording.
+        rerun_images: of which frames it has images.
+        graph_times: when the factor graph of the back end is kept, as for `run`.
         settings: top-level settings of all runs, such as `duration_s` and `cameras`; they replace
             those of a list.
 
@@ -105,7 +111,12 @@ def batch(
         "calibration": None if calibration is None else str(Path(calibration).resolve()),
         "sources": absolute_sources(sources or {}, Path.cwd()),
     }
-    done = Batch(folder, plan(names, folder, config, list(overrides), settings, common))
+    extras = {
+        "rerun": rerun == "save",
+        "rerun_images": rerun_images,
+        "graph_times": list(graph_times),
+    }
+    done = Batch(folder, plan(names, folder, config, list(overrides), settings, common, extras))
     _make(folder)
     remove_remains(folder)
     missing = [task for task in done.tasks if not task.is_done()]

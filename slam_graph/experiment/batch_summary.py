@@ -31,6 +31,10 @@ _ALIGNMENT = "yaw"
 """Errors are those after alignment of yaw and position, which the IMU does not observe."""
 
 
+_ORDINARY = frozenset({"feature_not_triangulated", "feature_rejected_by_gate"})
+"""Counts of single features that every run has, and no warnings: `metrics.json` has them."""
+
+
 def rows_of(tasks: Sequence[BatchTask], failures: Mapping[str, str]) -> list[Row]:
     """A row for each recording.
 
@@ -71,7 +75,8 @@ def _row(task: BatchTask, failure: str | None) -> Row:
 def _measured(metrics: Mapping[str, Any]) -> Row:
     """What the metrics of a run say."""
     dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
-    adjusted, warnings = metrics["final_ba"], metrics["warnings"]
+    adjusted = metrics["final_ba"]
+    warnings = {kind: n for kind, n in metrics["warnings"].items() if kind not in _ORDINARY}
     causal = _errors(metrics["accuracy"])
     smoothed = _errors(adjusted["accuracy"] if adjusted else None)
     return {

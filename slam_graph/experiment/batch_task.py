@@ -63,6 +63,12 @@ class BatchTask(Settings):
     """Hash of names, sizes and times of the files of the recording: it reveals a change."""
     config: RunConfig
     """All settings of the run."""
+    rerun: bool = False
+    """Whether `recording.rrd` is written for Rerun."""
+    rerun_images: Literal["none", "keyframes", "all"] = "all"
+    """Of which frames it has images."""
+    graph_times: list[int | float] = Field(default_factory=list)
+    """When the factor graph of the back end is kept, as for `run`."""
     output: Path
     """Folder of the batch."""
 
@@ -102,7 +108,14 @@ class BatchTask(Settings):
                 sources=self.sources,
             )
             progress = _ProgressFile(folder / _PROGRESS, sequence.info(), self.config)
-            result = run(sequence, self.config, progress=progress)
+            viewer = self._viewer(folder)
+            result = run(
+                sequence,
+                self.config,
+                viewer=viewer,
+                progress=progress,
+                graph_times=self.graph_times,
+            )
             if result.status == "interrupted":
                 result.check()
             result.save(folder)
@@ -117,6 +130,15 @@ class BatchTask(Settings):
                     "settings_hash": self.key,
                 },
             )
+
+    def _viewer(self, folder: Path) -> Any:
+        """What writes the recording for Rerun, if one is wanted."""
+        if not self.rerun:
+            return None
+        from slam_graph.visualization import RerunRecording
+
+        path = folder / "recording.rrd"
+        return RerunRecording("save", self.name, path, None).viewer(self.rerun_images, "normal")
 
 
 def running(output: Path) -> dict[str, float]:

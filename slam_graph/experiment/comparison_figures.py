@@ -58,7 +58,7 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     runs = {task.algorithm: _series(tasks, task.algorithm) for task in tasks}
     seeds = max((len(series) for series in runs.values()), default=0)
     mean = f", mean over {seeds} seeds" if seeds > 1 else ""
-    over = f", {seeds} seeds" if seeds > 1 else ""
+    over = f"; a dot for each of {seeds} seeds, the number is their median" if seeds > 1 else ""
     folder = ResultFolder(comparison.folder / "figures")
     yield from _draw_panels(folder, f"{data}_paths.png", f"{data}: causal paths", _paths(runs))
     title = f"{data}: errors (root mean square of a run) and cost{over}"
@@ -75,8 +75,7 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
         Panel(_TIME, "ms per frame", _curves(runs, "frame_time_s", f"ms_{STAGE}")),
         Panel(_TIME, "columns of the state", _curves(runs, "step_time_s", "columns")),
         Panel(_TIME, "steps per frame", _curves(runs, "step_time_s", "steps")),
-        Panel(_TIME, "cost before the steps", _curves(runs, "step_time_s", "cost_before")),
-        Panel(_TIME, "cost after the steps", _curves(runs, "step_time_s", "cost_after")),
+        Panel(_TIME, "decrease of the cost", _curves(runs, "step_time_s", "cost_decrease")),
     ]
     title = f"{data}: work of the back end{mean}"
     yield from _draw_panels(folder, f"{data}_steps.png", title, panels)
@@ -132,6 +131,7 @@ def _consistency_panels(runs: dict[str, list[Series]], seeds: int) -> list[Panel
             _curves(runs, "nees_time_s", f"nees_{part}"),
             band=mean_bounds(dof, seeds),
             band_label="95 % of χ²",
+            ideal=float(dof),
         )
         for part, dof in NEES_DOF.items()
     ]
@@ -158,7 +158,11 @@ def binned_mean(x: FloatArray, y: FloatArray, edges: FloatArray) -> FloatArray:
 def _series(tasks: list[RunTask], algorithm: str) -> list[Series]:
     """The series of all runs of an algorithm that reached the end."""
     mine = (task for task in tasks if task.algorithm == algorithm)
-    return [read_series(task.result) for task in mine if _is_whole(task)]
+    found = [read_series(task.result) for task in mine if _is_whole(task)]
+    return [
+        {**series, "cost_decrease": series["cost_before"] - series["cost_after"]}
+        for series in found
+    ]
 
 
 def _is_whole(task: RunTask) -> bool:

@@ -133,12 +133,17 @@ class Trajectory(Displayed):
         """`world_T_body` at any time: positions are interpolated linearly, orientations by slerp.
 
         Args:
-            stamp_ns: time.
+            stamp_ns: time, a whole number of nanoseconds as in `stamps_ns`.
             max_gap_s: inside a longer gap between poses nothing is interpolated.
 
         Raises:
-            DataError: if there is no pose before and after, near enough.
+            DataError: if there is no pose before and after, near enough, or the time is not whole.
         """
+        if not isinstance(stamp_ns, int | np.integer):
+            raise DataError(
+                f"at({stamp_ns!r}): a time is a whole number of nanoseconds, as in stamps_ns; for "
+                "seconds after the first pose give trajectory.stamps_ns[0] + round(seconds * 1e9)"
+            )
         if len(self):
             found, _ = interpolate(self, np.array([stamp_ns], np.int64), max_gap_s)
             if len(found):

@@ -15,18 +15,49 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from slam_graph.datasets import Sequence
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.loop_closure import Keyframe, KeyframeDescriber, KeyframeLog, Loop, close_loops
 from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
-from slam_graph.results import LocalizationLog, RunResult
+from slam_graph.results import LocalizationLog, RunInput, RunResult
 from slam_graph.sensors import FeatureFrame
 
 NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
 
+_REMEDY = (
+    "run on images, or on tracks that were recorded with descriptors (of a simulation: "
+    "slam-graph simulate … --set tracks.descriptors=true)"
+)
+
 logger = logging.getLogger(__name__)
+
+
+def require_places(sequence: Sequence, asked: RunInput, known_map: SlamMap | None) -> None:
+    """Make sure that places can be recognised where a map is to be saved or to be used.
+
+    Args:
+        sequence: the recording; its first features are looked at if it has no images.
+        asked: which part of it, and the settings.
+        known_map: the map to be located in, if there is one.
+
+    Raises:
+        DataError: if they cannot.
+    """
+    wanted = asked.config.map.enabled or known_map is not None
+    if not wanted or asked.info.content != "tracks":
+        return
+    counts = sequence.diagnostics.counts.copy()
+    packets = sequence.packets(asked.start_ns, asked.end_ns)
+    seen = (p.frame.cameras[0] for p in packets if isinstance(p.frame, FeatureFrame))
+    first = next((features for features in seen if len(features)), None)
+    sequence.diagnostics.counts = counts  # the run reads the same packets again
+    if first is not None and first.descriptors is None:
+        purpose = "make a map" if known_map is None else "be located in a map"
+        raise DataError(f"{asked.info.name}: cannot {purpose}, {NOT_RECOGNISABLE}; {_REMEDY}")
 
 
 class Keyframes(Stage):

@@ -16,7 +16,13 @@ from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.maps import SlamMap
 from slam_graph.pipeline.estimation import Estimation
-from slam_graph.pipeline.mapping import Keyframes, Localization, LoopClosing, MapBuilding
+from slam_graph.pipeline.mapping import (
+    Keyframes,
+    Localization,
+    LoopClosing,
+    MapBuilding,
+    require_places,
+)
 from slam_graph.pipeline.observers import (
     GraphKeeping,
     NullProgress,
@@ -74,6 +80,7 @@ def run(
     settings = _settings(config, overrides, options)
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
+    require_places(sequence, result.input, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
     watchers = (progress or NullProgress(), recorder or NullRecorder())

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from slam_graph.backend import FinalBa
     from slam_graph.visualization import Panel, Picture
 
-CAUSAL, SMOOTHED, LOOPS_CLOSED = "causal", "smoothed", "loops closed"
+CAUSAL, SMOOTHED, LOOPS_CLOSED, IN_MAP = "causal", "smoothed", "loops closed", "in the map"
 _TRUTH = "ground truth"
 
 _AXES = ("x [m]", "y [m]", "z [m]", "yaw [deg]")
@@ -110,6 +110,25 @@ class RunView:
             return self.moved(Similarity.of_positions(true.positions, own.positions, "yaw"))
         except DataError:  # no common time, or what never moves determines no yaw
             return self
+
+
+def with_path_in_map(view: RunView, path: Trajectory | None) -> RunView:
+    """The view with a path in the world of a map, aligned by itself in yaw and position.
+
+    Args:
+        view: in the world of the truth if there is one.
+        path: in the world of the map; None where there is no map.
+    """
+    reference = view.truth
+    if reference is None:
+        reference = view.estimates.get(SMOOTHED, view.estimates[CAUSAL]).trajectory
+    if path is None or not len(path):
+        return view
+    with suppress(DataError):  # no common time, or what never moves determines no yaw
+        there, own = synchronize(reference, path)
+        onto = Similarity.of_positions(there.positions, own.positions, "yaw")
+        return replace(view, paths={**view.paths, IN_MAP: onto.apply(path)})
+    return view
 
 
 def with_covariances_after_alignment(
@@ -204,9 +223,11 @@ def _series_panels(view: RunView) -> list[Panel]:
         if not len(estimate.trajectory):
             continue
         sigmas[name] = (_seconds(view, estimate.trajectory), 3.0 * estimate.world_sigmas())
-        if view.truth is not None:
+    paths = {name: estimate.trajectory for name, estimate in view.estimates.items()}
+    for name, path in (paths | dict(view.paths)).items():
+        if view.truth is not None and len(path):
             with suppress(DataError):
-                true, own = synchronize(view.truth, estimate.trajectory)
+                true, own = synchronize(view.truth, path)
                 lines[name] = (_seconds(view, own), _differences(own, true))
     if view.truth is None and SMOOTHED in sigmas:
         causal, smoothed = (view.estimates[name].trajectory for name in (CAUSAL, SMOOTHED))
@@ -252,16 +273,19 @@ def _title(metrics: Mapping[str, Any]) -> str:
         f"{cameras} camera{'' if cameras == 1 else 's'}{ending}"
     ]
     mode = "none" if metrics["extent"].get("start_was_given", False) else "yaw"
+    loops = metrics["loop_closure"] or {}
     tables = {
-        CAUSAL: metrics["accuracy"],
-        SMOOTHED: (metrics["final_ba"] or {}).get("accuracy"),
-        LOOPS_CLOSED: (metrics["loop_closure"] or {}).get("accuracy"),
+        CAUSAL: (metrics["accuracy"], mode),
+        SMOOTHED: ((metrics["final_ba"] or {}).get("accuracy"), mode),
+        LOOPS_CLOSED: (loops["accuracy"] if loops.get("accepted") else None, mode),
+        IN_MAP: ((metrics["localization"] or {}).get("accuracy"), "yaw"),
     }
     errors = [
-        f"{name} {table[mode]['ate']['translation_m']['rmse']:.3f} m, "
-        f"{table[mode]['ate']['rotation_deg']['rmse']:.2f}°"
-        for name, table in tables.items()
-        if table and "ate" in table[mode]
+        f"{name} {table[alignment]['ate']['translation_m']['rmse']:.3f} m, "
+        f"{table[alignment]['ate']['rotation_deg']['rmse']:.2f}°"
+        + (" (aligned)" if alignment != mode else "")
+        for name, (table, alignment) in tables.items()
+        if table and "ate" in table[alignment]
     ]
     if errors:
         how = "not aligned" if mode == "none" else "aligned in yaw and position"

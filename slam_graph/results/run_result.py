@@ -30,11 +30,11 @@ from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.results.run_picture import (
     CAUSAL,
-    LOOPS_CLOSED,
     SMOOTHED,
     PoseEstimate,
     RunView,
     with_covariances_after_alignment,
+    with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
@@ -364,11 +364,12 @@ class RunResult(RunSummary):
             histories[SMOOTHED] = self.final_ba.history
         view = RunView(
             {name: PoseEstimate.of_history(history) for name, history in histories.items()},
-            {} if self.loop_closed is None else {LOOPS_CLOSED: self.loop_closed},
+            self._paths_of_loops(),
             self.groundtruth,
             self.points,
             self.input.start_ns,
         )
-        return with_covariances_after_alignment(
+        view = with_covariances_after_alignment(
             view, histories, self.start_was_given, self.final_ba
         )
+        return with_path_in_map(view, self.in_map)

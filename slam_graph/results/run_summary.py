@@ -10,15 +10,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
 from slam_graph.maps import SlamMap
-from slam_graph.results.run_picture import RunView, run_figure
+from slam_graph.results.run_picture import LOOPS_CLOSED, RunView, run_figure
 from slam_graph.results.scene import SceneParts, export_scene
 from slam_graph.results.scene_files import (
     SCENE_FORMATS,
@@ -30,6 +30,18 @@ from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
     from slam_graph.visualization import Picture
+
+
+PoseChoice = Literal["best", "causal", "smoothed", "loop"]
+
+_PREFERRED: tuple[PoseChoice, ...] = ("loop", "smoothed", "causal")
+"""The better, the earlier."""
+
+_POSES_OF_MAP: dict[str, PoseChoice] = {
+    "loop_closed": "loop",
+    "smoothed": "smoothed",
+    "causal": "causal",
+}
 
 
 class RunSummary(Displayed):
@@ -44,6 +56,16 @@ class RunSummary(Displayed):
 
     @property
     @abstractmethod
+    def trajectory(self) -> Trajectory:
+        """The causal estimate."""
+
+    @property
+    @abstractmethod
+    def smoothed(self) -> Trajectory | None:
+        """The trajectory of the final bundle adjustment, if there is one."""
+
+    @property
+    @abstractmethod
     def best_trajectory(self) -> Trajectory:
         """The smoothed trajectory if there is one, else the causal one."""
 
@@ -51,6 +73,11 @@ class RunSummary(Displayed):
     @abstractmethod
     def loop_closed(self) -> Trajectory | None:
         """The best trajectory after loop closure, if loops were to be closed."""
+
+    @property
+    @abstractmethod
+    def loop_ends_ns(self) -> IntArray:
+        """(L, 2) times of the two keyframes of each accepted loop closure."""
 
     @property
     @abstractmethod
@@ -64,6 +91,11 @@ class RunSummary(Displayed):
     @abstractmethod
     def _known_map(self) -> SlamMap | None:
         """The map of the run, if there is one."""
+
+    def _paths_of_loops(self) -> dict[str, Trajectory]:
+        """The path after loop closure by its name, if loops were accepted."""
+        path = self.loop_closed
+        return {} if path is None or not len(self.loop_ends_ns) else {LOOPS_CLOSED: path}
 
     def plot(self) -> Picture:
         """The picture of the run: paths, and errors or what smoothing changed, in ±3σ.
@@ -93,11 +125,12 @@ class RunSummary(Displayed):
         recording: Sequence,
         formats: Iterable[str] = SCENE_FORMATS,
         spacing_m: float = 0.1,
+        which: PoseChoice = "best",
     ) -> list[Path]:
         """Write keyframes with their images, and points, for COLMAP or nerfstudio.
 
         Keyframes are chosen by motion. Of a run that saved a map its keyframes are among them, the
-        points are those of the map, and observations of the first camera are known.
+        points are those of the map, and the images have observations of them.
 
         Args:
             folder: is given `images/`, and for `colmap` a model in `sparse/0/`, for `nerfstudio`
@@ -105,20 +138,21 @@ class RunSummary(Displayed):
             recording: that was run, for its images.
             formats: `colmap`, `nerfstudio`, or both.
             spacing_m: between keyframes; a turn of 0.1 rad makes one too.
+            which: poses of the images, as for `exported_poses`.
 
         Returns:
             The files, without the images.
 
         Raises:
-            DataError: if a format is unknown, there are no images, or the formats lack the camera
-                model.
+            DataError: if a format is unknown, there are no images, the formats lack the camera
+                model, or the run has no such poses.
         """
         folder, formats = Path(folder), list(formats)
         for name in formats:
             if name not in SCENE_FORMATS:
                 raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
         require_models(self.rig)
-        trajectory = self.loop_closed or self.best_trajectory
+        trajectory = self.exported_poses(which)[1]
         parts = SceneParts(self.rig, trajectory, self.points, self._known_map(), spacing_m)
         scene = export_scene(parts, recording, folder / "images")
         files = []
@@ -128,9 +162,37 @@ class RunSummary(Displayed):
             files += write_nerfstudio(folder, scene)
         return files
 
+    def exported_poses(self, which: PoseChoice = "best") -> tuple[str, Trajectory]:
+        """The poses of images that are exported: what they are called, and the trajectory.
+
+        Args:
+            which: `causal`, `smoothed`, `loop` (after loop closure), or `best`: those of the map if
+                the run saved one, else the last of these that there is.
+
+        Raises:
+            DataError: if the run has no such poses, or the points of its map do not fit them.
+        """
+        found = {"loop": next(iter(self._paths_of_loops().values()), None)}
+        found |= {"smoothed": self.smoothed, "causal": self.trajectory}
+        known = self._known_map()
+        own = None if known is None else _POSES_OF_MAP.get(known.recordings[0].poses)
+        if which == "best":
+            there: list[PoseChoice] = [name for name in _PREFERRED if found[name] is not None]
+            which = there[0] if own is None else own
+        elif own is not None and which != own:
+            raise DataError(
+                f"the map of the run was made of its poses '{own}', and its points do not fit "
+                f"'{which}': give --which {own}, or export a run without --save-map"
+            )
+        trajectory = found[which]
+        if trajectory is None:
+            raise DataError(f"the run has no trajectory of the kind '{which}'")
+        return which, trajectory
+
     def _facts(self) -> dict[str, object]:
         metrics = self.metrics
         data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
+        loops = metrics["loop_closure"] or {}
         cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
         return {
             "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
@@ -140,7 +202,7 @@ class RunSummary(Displayed):
             f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
             "error": _errors(metrics["accuracy"]),
             "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy")),
-            "error, loops closed": _errors((metrics["loop_closure"] or {}).get("accuracy")),
+            "error, loops closed": _errors(loops["accuracy"]) if loops.get("accepted") else None,
             "speed": (
                 None
                 if timing["real_time_factor"] is None

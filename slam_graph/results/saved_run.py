@@ -24,10 +24,10 @@ from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
 from slam_graph.results.result_files import LATEST
 from slam_graph.results.run_picture import (
     CAUSAL,
-    LOOPS_CLOSED,
     SMOOTHED,
     PoseEstimate,
     RunView,
+    with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
@@ -260,12 +260,13 @@ class SavedRun(RunSummary):
             estimates[SMOOTHED] = PoseEstimate.of_sigmas(self.smoothed, sigmas)
         view = RunView(
             estimates,
-            {} if self.loop_closed is None else {LOOPS_CLOSED: self.loop_closed},
+            self._paths_of_loops(),
             self.groundtruth,
             self.points,
             self.metrics["extent"]["start_ns"],
         )
-        return view if self.start_was_given else view.aligned()
+        view = view if self.start_was_given else view.aligned()
+        return with_path_in_map(view, self.in_map)
 
     @cached_property
     def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:

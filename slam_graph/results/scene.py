@@ -3,7 +3,8 @@
 """Keyframes with their images, and points: what programs for dense reconstruction start from.
 
 Keyframes are chosen by motion. Where the run saved a map, its keyframes are among them, the points
-are those of the map, and the first camera's observations in its keyframes are known.
+are those of the map, and the first camera's observations in its keyframes are known. In the other
+images, those of further cameras among them, the points of the last keyframe are found again.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ _TURN_RAD = 0.1
 
 _SAME_FRAME_NS = 5_000_000
 """A keyframe of the map is the frame nearest in time, at most so far away."""
+
+_FOUND_PX = 2.0
+"""A point that is found again counts as observed if it is so near to where it projects to."""
+_SEARCH_PX = 21
+"""Side of the window by which it is recognised."""
 
 _GREY = 128
 
@@ -115,6 +121,7 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
     chosen = _Keyframes(parts)
     shades = np.zeros((len(chosen.points), 2))
     images: list[SceneImage] = []
+    last: _Observed | None = None  # by the first camera in the last keyframe of the map
     for frame in _frames(recording):
         keyframe = chosen.take(frame.stamp_ns + round(chosen.rig.pose_offset_s * 1e9))
         if keyframe is None:
@@ -128,11 +135,15 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
             name = f"cam{camera}/{frame.stamp_ns}.png"
             _write(folder / name, image)
             pose = world_T_body.compose(mounted.body_T_camera)
-            if camera:
-                images.append(SceneImage(name, camera, pose))
-                continue
-            images.append(SceneImage(name, camera, pose, pixels, points))
-            np.add.at(shades, points, np.stack([_shades(image, pixels), np.ones(len(points))], 1))
+            if camera == 0 and len(points):
+                last = image, pixels, points
+                np.add.at(
+                    shades, points, np.stack([_shades(image, pixels), np.ones(len(points))], 1)
+                )
+                images.append(SceneImage(name, camera, pose, pixels, points))
+            else:
+                found = _found_again(last, image, mounted, pose, chosen.points)
+                images.append(SceneImage(name, camera, pose, *found))
     if not images:
         raise DataError(f"{info.name}: none of its images has a pose in the result")
     grey = np.where(shades[:, 1] > 0, shades[:, 0] / np.maximum(shades[:, 1], 1.0), _GREY)
@@ -140,6 +151,8 @@ def export_scene(parts: SceneParts, recording: Sequence, folder: Path) -> Scene:
 
 
 _Keyframe = tuple[gtsam.Pose3, FloatArray, IntArray]
+_Observed = tuple[np.ndarray, FloatArray, IntArray]
+"""An image, the pixels (N, 2) of points in it, and which points (N,) these are."""
 
 
 class _Keyframes:
@@ -185,6 +198,51 @@ class _Keyframes:
             if np.linalg.norm(step.translation()) < self._parts.spacing_m and angle < _TURN_RAD:
                 return None
         return pose, np.zeros((0, 2)), np.zeros(0, np.int64)
+
+
+def _found_again(
+    last: _Observed | None,
+    image: np.ndarray,
+    mounted: RigCamera,
+    world_T_camera: gtsam.Pose3,
+    points: FloatArray,
+) -> tuple[FloatArray, IntArray]:
+    """Observations in an image of the points of another, by optical flow from where they project.
+
+    Args:
+        last: the other image; None if there is none yet.
+        image: in which they are searched.
+        mounted: its camera.
+        world_T_camera: its pose.
+        points: (P, 3) of the scene, m.
+
+    Returns:
+        Pixels (N, 2), and which points (N,) they are of.
+    """
+    if last is None:
+        return np.zeros((0, 2)), np.zeros(0, np.int64)
+    other, pixels, numbers = last
+    seen = (points[numbers] - world_T_camera.translation()) @ world_T_camera.rotation().matrix()
+    ahead = np.isfinite(seen).all(axis=1) & (seen[:, 2] > 0.0)
+    seen, pixels, numbers = seen[ahead], pixels[ahead], numbers[ahead]
+    expected = mounted.camera.distort(seen[:, :2] / seen[:, 2:])[0]
+    height, width = image.shape[:2]
+    inside = ((expected >= 0.0) & (expected < (width, height))).all(axis=1)
+    expected, pixels, numbers = expected[inside], pixels[inside], numbers[inside]
+    if not len(numbers):
+        return expected, numbers
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        other,
+        image,
+        pixels.astype(np.float32),
+        expected.astype(np.float32),
+        winSize=(_SEARCH_PX, _SEARCH_PX),
+        maxLevel=1,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    near = np.linalg.norm(found - expected, axis=1) < _FOUND_PX
+    good = near & (status[:, 0] == 1)
+    return np.asarray(found[good], np.float64), numbers[good]
 
 
 def _frames(recording: Sequence) -> Iterator[CameraFrame]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -124,9 +125,61 @@ class ConfigTree:
         try:
             return model.model_validate(self.values)
         except ValidationError as error:
-            faults = error.errors(include_url=False)
+            faults = _relevant(model, error.errors(include_url=False))
             more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
-            raise ConfigError(f"{_describe(model, self, dict(faults[0]))}{more}") from error
+            raise ConfigError(f"{_describe(model, self, faults[0])}{more}") from error
+
+
+def _relevant(model: type[BaseModel], faults: Iterable[Any]) -> list[dict[str, Any]]:
+    """The faults, each with its path in the file in place of that in the schema.
+
+    Where a value may be of several types, the schema has faults for each. Those inside of the table
+    that is there are more to the point than that it is of no other type.
+    """
+    found = []
+    for fault in faults:
+        path, wrong_type = _path_in_file(model, fault["loc"])
+        found.append(({**fault, "loc": path}, wrong_type))
+    return [fault for fault, wrong_type in found if not wrong_type] or [fault for fault, _ in found]
+
+
+def _path_in_file(model: Any, location: KeyPath) -> tuple[KeyPath, bool]:
+    """A path without the names of types by which the schema tells alternatives apart.
+
+    Returns:
+        The path, and whether the schema's ends with such a name.
+    """
+    path: list[str | int] = []
+    named = False
+    for part in location:
+        alternatives = {getattr(kind, "__name__", ""): kind for kind in _alternatives(model)}
+        named = len(alternatives) > 1 and part in alternatives
+        if named:
+            model = alternatives[str(part)]
+        else:
+            path.append(part)
+            model = _inside(model, part)
+    return tuple(path), named
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    """The types that a value may have, but for None."""
+    if get_origin(annotation) is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return [kind for kind in get_args(annotation) if kind is not type(None)]
+    return [annotation]
+
+
+def _inside(annotation: Any, part: str | int) -> Any:
+    """The type of a part of a table or list; None if it is not known."""
+    for kind in _alternatives(annotation):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            if part in kind.model_fields:
+                return kind.model_fields[str(part)].annotation
+        elif get_args(kind):  # the items of a list, the values of a dictionary
+            return get_args(kind)[-1]
+    return None
 
 
 def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]) -> str:
@@ -153,14 +206,11 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
 
 def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:
     """The type of the table at `path`; None where there is no table."""
+    kind: Any = model
     for part in path:
-        info = model.model_fields.get(str(part))
-        if info is None or not (
-            isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
-        ):
-            return None
-        model = info.annotation
-    return model if issubclass(model, Settings) else None
+        kind = _inside(kind, part)
+    tables = [one for one in _alternatives(kind) if isinstance(one, type)]
+    return next((table for table in tables if issubclass(table, Settings)), None)
 
 
 def _branch(keys: list[str], value: Any, where: str) -> ConfigTree:

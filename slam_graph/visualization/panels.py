@@ -25,8 +25,16 @@ _REFERENCES = ("ground truth",)
 _MOST_DOTS = 4000
 """Of more points an even selection is drawn."""
 
-_LEAST_ROWS = 4
-"""Bars are no thicker than those of so many."""
+_ROW_INCHES, _FRAME_INCHES = 0.36, 0.85
+"""Height of a bar or box with the space around it, and of the axis and its labels below them."""
+
+_ROOM_FOR_NUMBER = 0.2
+"""Part of a panel of bars that is kept free for the number behind the longest."""
+
+_WIDEST: dict[str, float] = {"path": 3.4, "errors": 1.8}
+_NARROWEST = 1.0
+"""Widths in points between which the lines of a panel fall in their order, so that one which covers
+another leaves its edges to be seen."""
 
 _BOUNDS_REACH = 3.0
 """Bounds are shown as far as this many times the largest value, or their own median."""
@@ -46,7 +54,7 @@ class Panel:
         band_label: label of the band.
         bounds: by the label of a curve x and the half width (N,) of what is shaded around zero.
         samples: values (N,) by their labels: a bar where all have one value, else boxes.
-        ideal: the value that samples should have, if there is one.
+        ideal: the value that samples or curves should have, if there is one.
         dots: (N, 2) points in the background, if there are any.
         title: above the panel.
     """
@@ -84,7 +92,7 @@ def panel_figure(
     """
     letters = [chr(ord("A") + index) for index in range(len(panels))]
     columns = columns or ["".join(letters[k::_COLUMNS]) for k in range(min(_COLUMNS, len(letters)))]
-    height_inches = height_inches or _CELL_INCHES[1] * max(map(len, columns))
+    height_inches = height_inches or _cell_height(panels) * max(map(len, columns))
     widths_inches = widths_inches or [_CELL_INCHES[0]] * len(columns)
     styles = line_styles(_labels(panels))
     drawn: list[Any] = []
@@ -104,6 +112,13 @@ def panel_figure(
     return figure
 
 
+def _cell_height(panels: Sequence[Panel]) -> float:
+    """Height of a panel in inches; panels of samples alone are as high as these need."""
+    if not all(panel.samples for panel in panels):
+        return _CELL_INCHES[1]
+    return _FRAME_INCHES + _ROW_INCHES * max(len(panel.samples) for panel in panels)
+
+
 def _labels(panels: Sequence[Panel]) -> list[str]:
     """All labels, in the order in which they come."""
     return [label for panel in panels for label in (*panel.curves, *panel.samples, *panel.bounds)]
@@ -114,12 +129,7 @@ def _draw(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
         axes.set_title(panel.title, loc="left")
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
     if panel.samples:
-        _draw_samples(axes, panel.samples, styles)
-        if panel.ideal is not None:
-            axes.axvline(panel.ideal, color=GREY, linestyle="--", linewidth=1.0, zorder=0.5)
-            axes.annotate(
-                " ideal", (panel.ideal, axes.get_ylim()[1]), va="top", color="0.4", size=8
-            )
+        _draw_samples(axes, panel, styles)
         return
     if not panel.curves and not panel.bounds:
         axes.set(xticks=[], yticks=[])
@@ -136,10 +146,9 @@ def _draw(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
             x, -half, half, color=colour, alpha=0.16, linewidth=0, label=f"±3σ {label}"
         )
         axes.plot(x, half, x, -half, color=colour, alpha=0.5, linewidth=0.6)
-    compared = set(panel.curves) - set(_REFERENCES)
-    for label, (x, y) in panel.curves.items():
-        reference = bool(compared) and label in _REFERENCES
-        _draw_curve(axes, label, x, y, styles[label], reference)
+    if panel.ideal is not None:
+        axes.axhline(panel.ideal, color=GREY, linestyle="--", lw=1.0, zorder=1.5, label="ideal")
+    _draw_curves(axes, panel, styles)
     if panel.kind == "path":
         axes.set_aspect("equal", adjustable="datalim")
         _mark_start(axes, panel.curves)
@@ -153,20 +162,27 @@ def _draw(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
         axes.set_ylim(bottom=0.0)
 
 
-def _draw_curve(
-    axes: Any, label: str, x: FloatArray, y: FloatArray, style: LineStyle, reference: bool
-) -> None:
-    axes.plot(
-        x,
-        y,
-        color=style.color,
-        linestyle=style.dash,
-        linewidth=3.2 if reference else 1.2,
-        alpha=0.55 if reference else 1.0,
-        solid_capstyle="round",
-        label=label,
-        zorder=2.0 if reference else 2.5,
-    )
+def _draw_curves(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
+    """All lines, the first the widest; a reference that others are compared with is below them."""
+    compared = [label for label in panel.curves if label not in _REFERENCES] or list(panel.curves)
+    widest = _WIDEST.get(panel.kind, 1.2) if len(compared) > 1 else 1.2
+    widths = np.linspace(widest, min(_NARROWEST, widest), len(compared))
+    if panel.kind not in _WIDEST:
+        widths[:] = widest
+    width_of = dict(zip(compared, widths.tolist(), strict=True))
+    for label, (x, y) in panel.curves.items():
+        reference = label not in width_of
+        axes.plot(
+            x,
+            y,
+            color=styles[label].color,
+            linestyle=styles[label].dash,
+            linewidth=width_of.get(label, 2.0 + widest),
+            alpha=0.55 if reference else 1.0,
+            solid_capstyle="round",
+            label=label,
+            zorder=2.0 if reference else 2.5,
+        )
 
 
 def _mark_start(axes: Any, curves: Mapping[str, tuple[FloatArray, FloatArray]]) -> None:
@@ -205,14 +221,12 @@ def _spread(curves: Sequence[FloatArray]) -> float:
     return max(medians) / min(medians)
 
 
-def _draw_samples(
-    axes: Any, samples: Mapping[str, FloatArray], styles: Mapping[str, LineStyle]
-) -> None:
-    """Bars with their values, or boxes with their samples; the first label is at the top."""
+def _draw_samples(axes: Any, panel: Panel, styles: Mapping[str, LineStyle]) -> None:
+    """Bars with their values, or boxes with samples and median; the first label is at the top."""
+    samples = panel.samples
     places = [float(place) for place in range(len(samples), 0, -1)]
     middles = [float(np.median(values)) if len(values) else np.nan for values in samples.values()]
     single = all(len(values) <= 1 for values in samples.values())
-    logarithmic = _spread([np.array([m]) for m in middles]) > _LOGARITHMIC_RANGE
     for place, (label, values), middle in zip(places, samples.items(), middles, strict=True):
         colour = styles[label].color
         if single and len(values):
@@ -224,14 +238,31 @@ def _draw_samples(
         axes.annotate(
             text, (end, place), xytext=(4, 0), textcoords="offset points", va="center", size=8
         )
-    if logarithmic:
-        axes.set_xscale("log")
-    else:
-        axes.set_xlim(left=0.0)
+    if panel.ideal is not None:
+        axes.axvline(panel.ideal, color=GREY, linestyle="--", linewidth=1.0, zorder=0.5)
     axes.set_yticks(places, list(samples))
-    axes.set_ylim(min(0.4, len(samples) - _LEAST_ROWS + 0.4), len(samples) + 0.6)
-    axes.margins(x=0.14)
+    axes.set_ylim(0.4, len(samples) + (0.6 if panel.ideal is None else 1.0))
+    if panel.ideal is not None:
+        top = axes.get_ylim()[1]
+        axes.annotate(" ideal", (panel.ideal, top), va="top", color="0.4", size=8)
+    _limit_samples(axes, panel, middles)
     axes.grid(visible=False, axis="y")
+
+
+def _limit_samples(axes: Any, panel: Panel, middles: Sequence[float]) -> None:
+    """Show all samples, the ideal, and the number behind the longest."""
+    shown = [values for values in panel.samples.values() if len(values)]
+    shown += [] if panel.ideal is None else [np.array([panel.ideal])]
+    if not shown:
+        return
+    everything = np.concatenate(shown)
+    low, high = float(everything.min()), float(everything.max())
+    if low > 0.0 and _spread([np.array([middle]) for middle in middles]) > _LOGARITHMIC_RANGE:
+        axes.set_xscale("log")
+        low /= 2.0  # where bars start
+        axes.set_xlim(low, high * (high / low) ** (_ROOM_FOR_NUMBER / (1.0 - _ROOM_FOR_NUMBER)))
+    elif high > 0.0:
+        axes.set_xlim(0.0, high / (1.0 - _ROOM_FOR_NUMBER))
 
 
 def _draw_box(axes: Any, place: float, values: FloatArray, colour: str) -> None:

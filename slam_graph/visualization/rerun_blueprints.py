@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,11 +26,22 @@ KNOWN_MAP = "known_map"
 WINDOW_BOUNDS = ((-140.0, 2040.0), (-390.0, 330.0))
 """Ranges of x and y in which the graph of a window is drawn."""
 
+_LEAST_TICK = 0.12
+"""Part of a plot's height by which ticks are apart at least, so that numbers stand beside them."""
+
 _BEHIND_BODY = ((-4.0, -3.0, 3.0), (0.0, 0.0, 0.0))
 """Where the eye is, and what it looks at, when it begins to follow the body, m."""
 
-_DISTANCE = 0.95
-"""Distance of the eye from what it looks at, in diameters of that."""
+_HALF_VIEW = float(np.tan(np.deg2rad(55.0) / 2))
+"""Half the height of what Rerun's eye sees, at the distance 1."""
+
+WIDE, SQUARE = 1.8, 1.0
+"""Width over height of views: one with cameras below it, and one that is about as high as wide."""
+
+_MARGIN = 1.12
+
+RIG_M = 0.3
+"""Size of the cameras at the end of a path, as they are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +57,20 @@ class Eye:
     target: tuple[float, ...]
 
     @staticmethod
-    def on(path: FloatArray, points: FloatArray | None = None) -> Eye | None:
-        """From above at an angle, so that a path (N, 3) and most points (M, 3) are in view."""
+    def on(
+        path: FloatArray,
+        points: FloatArray | None = None,
+        aspect: float = WIDE,
+        around: float = 0.0,
+    ) -> Eye | None:
+        """From above at an angle, so that a path and most points are in view.
+
+        Args:
+            path: (N, 3) m.
+            points: (M, 3) m.
+            aspect: width of the view over its height.
+            around: what is in view around each place of the path, m.
+        """
         if len(path) == 0:
             return None
         low, high = path.min(axis=0), path.max(axis=0)
@@ -57,12 +80,31 @@ class Eye:
             if len(near):
                 bounds = np.percentile(near, _SPREAD_PERCENT, axis=0)
                 low, high = np.minimum(low, bounds[0]), np.maximum(high, bounds[1])
-        centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+                path = np.concatenate([path, near[np.all((near > low) & (near < high), axis=1)]])
+        centre = (low + high) / 2
         # along the longer horizontal side, so that this one is seen across the screen
         wide = high[0] - low[0] > high[1] - low[1]
         direction = np.array([0.35, -1.0, 0.75] if wide else [-1.0, -0.35, 0.75])
-        position = centre + _DISTANCE * size * direction / np.linalg.norm(direction)
+        direction /= np.linalg.norm(direction)
+        distance = _distance(path - centre, direction, aspect) + around / _HALF_VIEW
+        position = centre + distance * direction
         return Eye(tuple(position.tolist()), tuple(centre.tolist()))
+
+
+def _distance(offsets: FloatArray, direction: FloatArray, aspect: float) -> float:
+    """How far away an eye sees all points.
+
+    Args:
+        offsets: (N, 3) of the points from what it looks at, m.
+        direction: (3,) to the eye, of length 1.
+        aspect: width of the view over its height.
+    """
+    right = np.cross([0.0, 0.0, 1.0], direction)
+    right /= np.linalg.norm(right)
+    towards = offsets @ direction
+    across = np.abs(offsets @ right) / (aspect * _HALF_VIEW)
+    upwards = np.abs(offsets @ np.cross(direction, right)) / _HALF_VIEW
+    return max(_MARGIN * float(np.max(towards + np.maximum(across, upwards))), 0.5)
 
 
 def _controls(eye: Eye | None, tracked: str | None = None) -> Any:
@@ -91,6 +133,13 @@ def growing(entities: Iterable[str]) -> Any:
     return {entity: [rrb.VisibleTimeRanges(ranges)] for entity in entities}
 
 
+def _dark() -> Any:
+    """The background for colours that are light, also where the viewer itself is light."""
+    import rerun.blueprint as rrb
+
+    return rrb.Background(color=_BACKGROUND, kind=rrb.BackgroundKind.SolidColor)
+
+
 def space(
     name: str,
     origin: str,
@@ -107,14 +156,14 @@ def space(
         origin=origin,
         contents=list(contents),
         overrides=growing(grown),
-        background=rrb.Background(color=_BACKGROUND, kind=rrb.BackgroundKind.SolidColor),
+        background=_dark(),
         line_grid=rrb.LineGrid3D(visible=True, color=_GRID, stroke_width=0.7),
         eye_controls=_controls(eye, tracked),
     )
 
 
-def plot_view(plot: Plot) -> Any:
-    """A view of time series."""
+def plot_view(plot: Plot, span: tuple[float, float] | None = None) -> Any:
+    """A view of time series; `span` is the range of its values, if it is known."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -122,9 +171,26 @@ def plot_view(plot: Plot) -> Any:
         origin=plot.entity,
         contents="$origin/**",
         axis_x=whole_axis(),
+        axis_y=None if span is None else rrb.ScalarAxis(range=with_ticks(*span)),
         # with bounds it would have nine lines, and colours are those of the plot of the velocity
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=len(plot.bounds) < 6),
     )
+
+
+def with_ticks(low: float, high: float) -> tuple[float, float]:
+    """The range of an axis, widened so that two numbers stand beside it.
+
+    Rerun writes multiples of powers of ten only, and leaves out what would be too dense.
+    """
+    size = high - low
+    if not size > 0.0:
+        return low - 1.0, high + 1.0
+    step = 10.0 ** np.ceil(np.log10(_LEAST_TICK * size))
+    first, last = np.ceil(low / step), np.floor(high / step)
+    if last - first < 1.0:
+        low, high = float(step * np.floor(low / step)), float(step * np.ceil(high / step))
+    margin = 0.05 * (high - low)
+    return low - margin, high + margin
 
 
 def whole_axis() -> Any:
@@ -160,7 +226,9 @@ class Shown:
         log: whether there is a log.
         window: whether the factor graph of every window is shown.
         in_map: whether the run is located in a map.
-        map_path: (N, 3) path in that map, if it is known already.
+        map_path: (N, 3) poses in that map and of its keyframes, if they are known already.
+        spans: least and largest values of plots, by their entities, once they are known.
+        title: of the 3D view.
     """
 
     world: str = "world"
@@ -170,6 +238,8 @@ class Shown:
     window: bool = False
     in_map: bool = False
     map_path: FloatArray | None = None
+    spans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    title: str = "Run"
 
 
 GROWING = (
@@ -200,9 +270,10 @@ def odometry(shown: Shown, eye: Eye | None = None) -> Any:
         for what in ("tails", "features", "residuals", "rejected")
     ]
     grown = [f"{root}/{name}" for name in GROWING]
-    spaces = [space("Run", root, ["$origin/**", *flat], grown, eye, body)]
+    spaces = [space(shown.title, root, ["$origin/**", *flat], grown, eye, body)]
     if shown.in_map:
-        place = Eye.on(shown.map_path) if shown.map_path is not None else None
+        aspect = WIDE if shown.cameras else SQUARE
+        place = None if shown.map_path is None else Eye.on(shown.map_path, aspect=aspect)
         view = space("In the map", f"/{KNOWN_MAP}", grown=[f"/{KNOWN_MAP}/path"], eye=place)
         spaces.insert(0, view)
     if shown.window:
@@ -233,7 +304,7 @@ def _camera(name: str, entity: str) -> Any:
         ),
     ]
     overrides: Any = {f"{entity}/tails": [rrb.VisibleTimeRanges(tails)]}
-    return rrb.Spatial2DView(name=name, origin=entity, overrides=overrides)
+    return rrb.Spatial2DView(name=name, origin=entity, overrides=overrides, background=_dark())
 
 
 def _plots(shown: Shown) -> list[Any]:
@@ -242,7 +313,11 @@ def _plots(shown: Shown) -> list[Any]:
 
     stacks = []
     for plots in (STATE_PLOTS, ERROR_PLOTS, WORK_PLOTS):
-        views = [plot_view(plot) for plot in plots if plot.entity in shown.plots]
+        views = [
+            plot_view(plot, shown.spans.get(plot.entity))
+            for plot in plots
+            if plot.entity in shown.plots
+        ]
         if views:
             stacks.append(views)
     texts: list[Any] = [rrb.TextDocumentView(name="Legend", origin="/legend")]
@@ -263,7 +338,10 @@ def window() -> Any:
 
     return rrb.Vertical(
         rrb.Spatial2DView(
-            name="Factor graph of the window", origin="/window/graph", visual_bounds=bounds
+            name="Factor graph of the window",
+            origin="/window/graph",
+            visual_bounds=bounds,
+            background=_dark(),
         ),
         rrb.Horizontal(
             rrb.Spatial2DView(name="Information before marginalization", origin="/window/before"),

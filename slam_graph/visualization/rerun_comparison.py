@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.visualization.rerun_blueprints import Eye, space, whole, whole_axis
+from slam_graph.visualization.rerun_blueprints import (
+    SQUARE,
+    Eye,
+    space,
+    whole,
+    whole_axis,
+    with_ticks,
+)
 from slam_graph.visualization.rerun_palette import TRUTH, line_colours
 from slam_graph.visualization.rerun_stream import RerunStream
 
@@ -58,13 +65,14 @@ def show_comparison(
     rr, titles, runs = stream.rr, dict[str, str](), list(runs)
     stream.log("paths", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     colours, rows = line_colours(run.name for run in runs), []
+    largest = dict[str, float]()
     for run, radius in zip(runs, np.linspace(*_RADII, len(runs)), strict=True):
-        colour, name = colours[run.name], rr.escape_entity_path_part(run.name)
+        (colour, said), name = colours[run.name], rr.escape_entity_path_part(run.name)
         line = rr.LineStrips3D(
             [run.path], colors=colour, radii=radius, labels=[run.name], show_labels=False
         )
         stream.log(f"paths/{name}", line, static=True)
-        row = [run.name]
+        row = [run.name, said]
         for index, (title, values) in enumerate(run.errors.items()):
             entity = titles.setdefault(title, f"errors/{index}")
             style = rr.SeriesLines(colors=colour, names=run.name, widths=1.5)
@@ -73,12 +81,14 @@ def show_comparison(
             times = rr.TimeColumn(_SINCE_START, duration=run.time_s)
             stream.send_along(f"{entity}/{name}", times, columns)
             row.append(f"{np.sqrt(np.mean(values**2)):.4g}")
+            largest[title] = max(largest.get(title, 0.0), float(np.max(values, initial=0.0)))
         rows.append("| " + " | ".join(row) + " |")
     for label, path in true_paths.items():
-        line = rr.LineStrips3D([path], colors=TRUTH, radii=-0.7, labels=[label], show_labels=False)
+        line = rr.LineStrips3D([path], colors=TRUTH, radii=-0.5, labels=[label], show_labels=False)
         stream.log(f"paths/{rr.escape_entity_path_part(label)}", line, static=True)
-    head = "| RMSE | " + " | ".join(titles) + " |\n" + "|---" * (1 + len(titles)) + "|\n"
-    text = "# Comparison\n\n" + head + "\n".join(rows) + f"\n\n{note}"
+    head = "| RMSE | " + " | ".join(["colour", *titles]) + " |\n" + "|---" * (2 + len(titles))
+    grey = "\n\nThin, light grey: ground truth." if true_paths else ""
+    text = "# Comparison\n\n" + head + "|\n" + "\n".join(rows) + grey + f"\n\n{note}"
     stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
     plots: list[Any] = [
         rrb.TimeSeriesView(
@@ -86,12 +96,13 @@ def show_comparison(
             origin=f"/{entity}",
             plot_legend=rrb.Corner2D.LeftTop,
             axis_x=whole_axis(),
+            axis_y=rrb.ScalarAxis(range=with_ticks(0.0, largest[title])),
         )
         for title, entity in titles.items()
     ]
     plots.append(rrb.TextDocumentView(name="Summary", origin="/summary"))
     places = [*(run.path for run in runs), *true_paths.values(), np.zeros((0, 3))]
-    view = space("Paths", "/paths", eye=Eye.on(np.concatenate(places)))
+    view = space("Paths", "/paths", eye=Eye.on(np.concatenate(places), aspect=SQUARE))
     stream.arrange(
         whole(
             rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[60, 40]),

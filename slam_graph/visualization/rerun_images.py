@@ -41,9 +41,13 @@ FULL_AGE = 25.0
 RESIDUAL_GAIN = 10.0
 """Residuals are drawn so many times as long as they are."""
 
-_BRIEF_STRIDE = 5
+_BRIEF_STRIDE = 3
 """Frames from one piece of a tail to the next where it is to be brief, and from one set of features
 of a further camera to the next: most of a recording without images would be pixels."""
+
+_UNSEEN_TAIL, _UNSEEN_RESIDUAL = 1.0, 2.0
+"""Pieces of tails and residuals shorter than this, in pixels of the shrunken image, are left out
+where it is to be brief: the points of their features cover them."""
 
 FATES = ("tracked", "new", "in another camera too", "gate", "RANSAC", "dynamic")
 _TRACKED, _NEW, _SHARED, _GATED, _OUTLIER, _DYNAMIC = range(1, len(FATES) + 1)
@@ -57,20 +61,20 @@ class CameraViews:
         stream: where it goes.
         rig: the cameras.
         body: entity of the body.
-        brief: whether tails are coarse, only the first camera has tails and residuals, without
-            the reprojected landmarks, and the others have features in some of the frames.
+        brief: whether tails are coarse, what is too short to be seen is left out, only the first
+            camera has tails and residuals, and the others have features in some of the frames.
     """
 
     def __init__(self, stream: RerunStream, rig: Rig, body: str, brief: bool = False) -> None:
         self._stream, self._rig, self._body = stream, rig, body
-        self._brief, self._detailed = brief, 1 if brief else len(rig.cameras)
-        self._stride = _BRIEF_STRIDE if brief else 1
+        self._detailed = 1 if brief else len(rig.cameras)
+        self._stride, self._brief = _BRIEF_STRIDE if brief else 1, brief
         self._shrink = [-(-mounted.camera.width // MAX_WIDTH) for mounted in rig.cameras]
         self._tails = [_Tails() for _ in rig.cameras]
         self._frames = 0
         self._rejecting: set[int] = set()
 
-    def mount(self, rig: Rig, frustum_m: float = 0.25) -> None:
+    def mount(self, rig: Rig, frustum_m: float = 0.2) -> None:
         """Send what does not change: places and lenses of the cameras, names of the fates."""
         rr, self._rig = self._stream.rr, rig
         for index, mounted in enumerate(rig.cameras):
@@ -84,7 +88,7 @@ class CameraViews:
                 resolution=(camera.width // shrink, camera.height // shrink),
                 image_plane_distance=frustum_m,
                 color=LIGHT_GREY,
-                line_width=-1.0,
+                line_width=-0.6,
             )
             entity = self._entity(index)
             self._stream.log(entity, placed, static=True)
@@ -145,13 +149,15 @@ class CameraViews:
                 continue
             entity = self._entity(index)
             places = _on_screen(camera.pixels, shrink)
-            marks = rr.Points2D.from_fields(positions=places, class_ids=fates)
-            self._stream.log(f"{entity}/features", marks)
+            named = f"{entity}/features"
+            self._stream.log_rows(named, rr.Points2D, positions=places, class_ids=fates)
             if due and index < self._detailed:
                 pieces, ages = tails.pieces()
-                colours = scaled(ages, 0.0, FULL_AGE)
-                lines = rr.LineStrips2D.from_fields(strips=pieces, colors=colours)
-                self._stream.log(f"{entity}/tails", lines)
+                rows = self._visible(pieces, _UNSEEN_TAIL)
+                colours = scaled(ages[rows], 0.0, FULL_AGE)
+                strips = pieces[rows]
+                named = f"{entity}/tails"
+                self._stream.log_rows(named, rr.LineStrips2D, strips=strips, colors=colours)
         self._frames += 1
         for index, outliers in enumerate(features.outliers):
             if not len(outliers) and index not in self._rejecting:
@@ -187,11 +193,15 @@ class CameraViews:
             shrink = self._shrink[index]
             ways = _on_screen(np.stack([seen, ends], axis=1), shrink)
             entity = f"{self._entity(index)}/residuals"
-            self._stream.log(entity, rr.LineStrips2D.from_fields(strips=ways))
-            if self._brief:
-                continue
-            marks = rr.Points2D.from_fields(positions=_on_screen(predicted, shrink))
-            self._stream.log(f"{entity}/reprojected", marks)
+            ways = ways[self._visible(ways, _UNSEEN_RESIDUAL)]
+            self._stream.log_rows(entity, rr.LineStrips2D, strips=ways)
+            marks = _on_screen(predicted, shrink)
+            self._stream.log_rows(f"{entity}/reprojected", rr.Points2D, positions=marks)
+
+    def _visible(self, ways: FloatArray, least: float) -> NDArray[np.bool_]:
+        """(M,) which of some ways (M, 2, 2) are worth sending."""
+        lengths = np.linalg.norm(ways[:, 1] - ways[:, 0], axis=1)
+        return np.asarray((lengths >= least) | (not self._brief))
 
     def _entity(self, index: int) -> str:
         return f"{self._body}/cam{index}"

@@ -8,8 +8,8 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.maps import SlamMap
-from slam_graph.visualization.rerun_blueprints import Eye, space, whole
-from slam_graph.visualization.rerun_outcome import POINT_RADIUS
+from slam_graph.visualization.rerun_blueprints import SQUARE, Eye, space, whole
+from slam_graph.visualization.rerun_outcome import END_RADIUS, POINT_RADIUS, FinishedRun
 from slam_graph.visualization.rerun_palette import CYCLE, GREEN, robust_range, scaled
 from slam_graph.visualization.rerun_stream import RerunStream
 
@@ -85,7 +85,7 @@ def show_map(stream: RerunStream, content: SlamMap) -> None:
         "for each recording; green lines are links between keyframes of the same place."
     )
     stream.log("summary", stream.rr.TextDocument(text, media_type="text/markdown"), static=True)
-    eye = Eye.on(content.poses.translations, content.points)
+    eye = Eye.on(content.poses.translations, content.points, SQUARE)
     stream.arrange(
         whole(
             rrb.Horizontal(
@@ -96,6 +96,14 @@ def show_map(stream: RerunStream, content: SlamMap) -> None:
             timeline=None,
         )
     )
+
+
+def places_in_map(run: FinishedRun, known_map: SlamMap | None) -> FloatArray | None:
+    """(N, 3) where a run was in a map, and the keyframes of this; None if it was not located."""
+    if run.in_map is None or len(run.in_map) == 0:
+        return None
+    keyframes = np.zeros((0, 3)) if known_map is None else known_map.poses.translations
+    return np.concatenate([run.in_map.positions, keyframes])
 
 
 def log_map(stream: RerunStream, entity: str, content: SlamMap) -> None:
@@ -121,5 +129,8 @@ def log_map(stream: RerunStream, entity: str, content: SlamMap) -> None:
         marks = rr.Points3D(trajectory.positions, colors=colour, radii=-2.0)
         stream.log(f"{name}/keyframes", marks, static=True)
     if len(content.links):
-        lines = rr.LineStrips3D(places[content.links.ends], colors=GREEN, radii=-0.7)
-        stream.log(f"{entity}/links", lines, static=True)
+        ends = places[content.links.ends]
+        stream.log(f"{entity}/links", rr.LineStrips3D(ends, colors=GREEN, radii=-0.7), static=True)
+        # both ends are at one place: the line between them alone would hardly be seen
+        marks = rr.Points3D(ends.reshape(-1, 3), colors=GREEN, radii=END_RADIUS)
+        stream.log(f"{entity}/links/ends", marks, static=True)

@@ -31,13 +31,14 @@ from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 from slam_graph.visualization.rerun_states import style_ellipsoids
 from slam_graph.visualization.rerun_stream import RerunStream
 
-PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.1, TRUTH: -0.7, IN_MAP: -2.6}
+PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
-POINT_RADIUS = -1.3
+POINT_RADIUS, END_RADIUS = -1.3, -4.0
+"""Of points of maps, and of the ends of loop closures, in pixels of the screen."""
 
 _TRUTH_POINTS = 2000
-"""About so many points of the true path are drawn."""
+"""At most so many points of the true path are drawn."""
 
 LEGEND = """\
 # What is shown
@@ -47,8 +48,8 @@ and position over the whole run. Small points: the map, coloured by height (dark
 is high). Larger points are features of this frame: green, in the state; yellow, used in this step;
 red, rejected by the gate. White points: past poses in the window; purple: keyframes of the
 algorithm or, where it has none, of loop closure or of the map, at the end of the run. Green: loop
-closures and the path after them. The arrow at the start is gravity. Ellipsoids at the body: 1σ and
-3σ of its position.
+closures, large points at their ends, and the path after them. The arrow at the start is gravity.
+Ellipsoids at the body: 1σ and 3σ of its position.
 
 **Cameras.** Tails are the last 12 places of a feature; dark is young, yellow is old. Points: green,
 tracked; yellow, new; light blue, seen by another camera too; red, rejected by the gate; orange,
@@ -210,9 +211,9 @@ class OutcomeLog:
         except DataError:
             return
         rr, entity = self._stream.rr, f"{self._world}/path/groundtruth"
-        if not self._truth_sent:
+        if not self._truth_sent and len(truth):
             self._truth_sent = True
-            step = max(1, len(truth) // _TRUTH_POINTS)
+            step = -(-len(truth) // _TRUTH_POINTS)
             line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=PATH_RADII[TRUTH])
             self._stream.log(entity, line, static=True)
         placed = rr.Transform3D(translation=onto.translation, mat3x3=onto.rotation)
@@ -277,8 +278,11 @@ class OutcomeLog:
         if len(loops_ns) == 0 or len(closed) == 0:
             return
         rows = np.clip(np.searchsorted(closed.stamps_ns, loops_ns), 0, len(closed) - 1)
-        lines = self._stream.rr.LineStrips3D(closed.positions[rows], colors=LOOP, radii=-1.2)
-        self._stream.log(f"{self._world}/loop_closures", lines, static=True)
+        rr, ends, entity = self._stream.rr, closed.positions[rows], f"{self._world}/loop_closures"
+        self._stream.log(entity, rr.LineStrips3D(ends, colors=LOOP, radii=-1.2), static=True)
+        # both ends are at one place: the line between them alone would hardly be seen
+        marks = rr.Points3D(ends.reshape(-1, 3), colors=LOOP, radii=END_RADIUS)
+        self._stream.log(f"{entity}/ends", marks, static=True)
 
     def _show_errors(self, run: FinishedRun) -> bool:
         """The true path and the errors of the causal estimate; False without a truth."""

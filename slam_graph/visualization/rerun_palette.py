@@ -55,22 +55,25 @@ def scaled(values: FloatArray, low: float, high: float) -> Colours:
     return _VIRIDIS[(_DARKEST + (255 - _DARKEST) * part).astype(np.uint8)]
 
 
-def line_colours(names: Iterable[str]) -> dict[str, Colour]:
-    """A colour for each name, that of all pictures (`style.line_styles`), on a dark background."""
+def line_colours(names: Iterable[str]) -> dict[str, tuple[Colour, str]]:
+    """Colours of lines by their names, those of all pictures, and what these are called.
+
+    On the dark background black is white, and what is dashed in pictures is lighter.
+    """
     # matplotlib takes long to load, and only comparisons need it here
     from matplotlib.colors import to_rgb
 
-    from slam_graph.visualization.style import BLACK, line_styles
+    from slam_graph.visualization.style import BLACK, COLOUR_NAMES, line_styles
 
     found = {}
     for name, style in line_styles(names).items():
-        colour = np.array(to_rgb(style.color))
+        colour, said = np.array(to_rgb(style.color)), COLOUR_NAMES[style.color]
         if style.color == BLACK:
-            colour = 1.0 - colour
+            colour, said = 1.0 - colour, "white"
         if style.dash != "-":
-            colour += _LIGHTER * (1.0 - colour)
+            colour, said = colour + _LIGHTER * (1.0 - colour), f"lighter {said}"
         red, green, blue = np.rint(255 * colour).astype(int).tolist()
-        found[name] = (red, green, blue)
+        found[name] = ((red, green, blue), said)
     return found
 
 

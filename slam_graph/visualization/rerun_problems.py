@@ -13,7 +13,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.bundle_adjustment import BalSolution
 from slam_graph.pose_graph import PoseGraphSolution
-from slam_graph.visualization.rerun_blueprints import Eye, space, whole, whole_axis
+from slam_graph.visualization.rerun_blueprints import SQUARE, Eye, space, whole, whole_axis
 from slam_graph.visualization.rerun_palette import (
     LIGHT_GREY,
     PURPLE,
@@ -34,7 +34,7 @@ _RESIDUAL_COLOURS = {
     ("after", "odometry"): VERMILLION,
     ("after", "loop_closures"): PURPLE,
 }
-_BINS = 60
+_FEWEST_BINS, _BINS = 10, 60
 _ERROR_PERCENTILE = 98.0
 _VIEWED_PERCENT = (2.0, 98.0)
 _MANY_POINTS = 2000
@@ -140,8 +140,7 @@ def _summary(solution: PoseGraphSolution, chi2: dict[str, float]) -> str:
 {rows}
 
 **Edges** are coloured by the logarithm of χ²{both}: dark blue fits, yellow does not. Red: rejected
-as an outlier. Below is log10 χ² of every edge by its number; edges that fit exactly (χ² below
-{_LEAST_CHI2:g}) have none.
+as an outlier. Edges that fit exactly (χ² below {_LEAST_CHI2:g}) have no residual.
 """
 
 
@@ -170,7 +169,9 @@ def _eye(places: FloatArray) -> Eye | None:
     low, high = np.percentile(places, _VIEWED_PERCENT, axis=0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     if high[2] - low[2] > 0.02 * size:
-        return Eye.on(np.stack([low, high]))
+        near = 0.2 * size
+        inside = np.all((places >= low - near) & (places <= high + near), axis=1)
+        return Eye.on(places[inside], aspect=SQUARE)
     centre = (low + high) / 2
     above = centre + np.array([0.0, -0.05 * size, 0.95 * size])
     return Eye(tuple(above.tolist()), tuple(centre.tolist()))
@@ -188,7 +189,8 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         scenes["after"] = solution.adjusted
     errors = solution.errors_px
     last = float(np.percentile(errors["before"], _ERROR_PERCENTILE))
-    edges = np.linspace(0.0, max(last, 1e-6), _BINS + 1)
+    bins = int(np.clip(np.sqrt(len(errors["before"])), _FEWEST_BINS, _BINS))
+    edges = np.linspace(0.0, max(last, 1e-6), bins + 1)
     rr = stream.rr
     worst = {name: _worst_of_points(part.point, part.points, errors[name]) for name in scenes}
     high = float(np.percentile(worst["before"], 90.0))
@@ -210,7 +212,7 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         )
         counts, _ = np.histogram(errors[name], edges)
         colour = SKY if name == "before" else VERMILLION
-        bars = rr.BarChart(counts, abscissa=(edges[1:] + edges[:-1]) / 2, color=colour)
+        bars = rr.BarChart(counts, abscissa=edges[:-1], widths=np.diff(edges), color=colour)
         stream.log(f"errors/{name}", bars, static=True)
     rms = {name: float(np.sqrt(np.mean(errors[name] ** 2))) for name in scenes}
     titles = {name: titles[name] for name in scenes}
@@ -265,7 +267,11 @@ def _bundle_layout(eye: Eye, titles: Mapping[str, str]) -> Any:
     import rerun.blueprint as rrb
 
     charts = [
-        rrb.BarChartView(name=f"Errors {title.lower()} [px]", origin=f"/errors/{name}")
+        rrb.BarChartView(
+            name=f"Errors {title.lower()} [px]",
+            origin=f"/errors/{name}",
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
         for name, title in titles.items()
     ]
     text = rrb.TextDocumentView(name="Summary", origin="/summary")

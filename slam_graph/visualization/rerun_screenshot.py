@@ -28,6 +28,11 @@ from slam_graph.visualization.rerun_stream import (
 _START_S, _SETTLE_S, _PERIOD_S = 20.0, 40.0, 1.0
 """Longest times to wait for the viewer and for a picture that does not change; time between two."""
 
+_OPENS_S = 3.0
+"""A viewer that runs for so long has found its display; it goes on by itself."""
+
+_OTHER_WAYS = "use --rerun serve for a browser, or --screenshot PICTURE.png"
+
 _SAME = 0.2
 """Mean difference of the grey values of two pictures that are the same."""
 
@@ -122,15 +127,16 @@ def open_recording(recording: Path) -> None:
     """Open a recording in a window, and go on.
 
     Raises:
-        DataError: if there is no such file, it is damaged, or there is no display.
+        DataError: if there is no such file, it is damaged, there is no display, or no window opens
+            on it.
     """
     require_readable(recording)
     if not has_display():
-        raise DataError(
-            f"{recording}: cannot be shown here: there is no display; use --rerun serve for a "
-            "browser, or --screenshot PICTURE.png"
-        )
-    subprocess.Popen([*_viewer_command(), str(recording)], start_new_session=True)
+        raise DataError(f"{recording}: cannot be shown here: there is no display; {_OTHER_WAYS}")
+    viewer = subprocess.Popen([*_viewer_command(), str(recording)], start_new_session=True)
+    with suppress(subprocess.TimeoutExpired):
+        if viewer.wait(_OPENS_S) != 0:
+            raise DataError(f"{recording}: no window could be opened; {_OTHER_WAYS}")
 
 
 def serve_recording(recording: Path) -> tuple[subprocess.Popen[bytes], str]:

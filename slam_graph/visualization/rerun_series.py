@@ -139,6 +139,9 @@ class SeriesLog:
 
     Args:
         stream: where they go.
+
+    Attributes:
+        spans: least and largest values that were sent, with those of the bounds, by the plots.
     """
 
     def __init__(self, stream: RerunStream) -> None:
@@ -146,6 +149,7 @@ class SeriesLog:
         self._rows: dict[str, _Rows] = {}
         self._samples: dict[str, _Samples] = {}
         self._styled: set[str] = set()
+        self.spans: dict[str, tuple[float, float]] = {}
 
     def add(
         self, entity: str, frame: int, stamp_ns: int, values: Sequence[float] | FloatArray
@@ -183,6 +187,11 @@ class SeriesLog:
         values = np.ascontiguousarray(values, dtype=np.float64)
         columns = rr.Scalars.columns(scalars=values)
         self._stream.send_columns(entity, frames, stamps_ns, columns)
+        finite = values[np.isfinite(values)]
+        if len(finite):
+            plot = entity.removesuffix("/bounds")
+            low, high = self.spans.get(plot, (np.inf, -np.inf))
+            self.spans[plot] = min(low, float(finite.min())), max(high, float(finite.max()))
 
     def _send(self, entity: str) -> None:
         rows = self._rows.pop(entity)

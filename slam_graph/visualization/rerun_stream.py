@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import sys
+import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +30,9 @@ _ABSOLUTE_NS = 10**17
 """Stamps from here on (three years after 1970) are shown as dates, others as seconds."""
 
 _TICK_S, _CHUNK_BYTES = 60.0, 8 << 20
+
+_ROWS_IN_FILES = 400
+"""Rows that are sent together where nobody waits for them: one by one they cost more time."""
 
 _CONNECT_TIMEOUT_S = 3.0
 
@@ -69,6 +74,9 @@ class RerunStream:
             switch(False, recording=self._raw)
         self._path = self._partial = path if mode == "save" else None
         self._absolute: bool | None = None
+        self._layout: Any = None
+        self._now = (0, 0)
+        self._kept: dict[str, tuple[Any, list[tuple[int, int]], list[Mapping[str, Any]]]] = {}
         if mode == "save":
             self._save(path)
         elif mode == "spawn":
@@ -83,12 +91,38 @@ class RerunStream:
 
     def at(self, frame: int, stamp_ns: int) -> None:
         """Set the time of what is logged next."""
+        self._now = frame, stamp_ns
         self._raw.set_time(FRAME, sequence=frame)
         self._raw.set_time(SENSOR_TIME, **self._time(np.int64(stamp_ns)))
 
     def log(self, entity: str, *what: Any, static: bool = False) -> None:
         """Log something at the time that was set, or for all times."""
         self._raw.log(entity, *what, static=static)
+
+    def log_rows(self, entity: str, kind: Any, **fields: Any) -> None:
+        """Log things of one kind at the time that was set: in a file many times together.
+
+        Args:
+            entity: where; of it all calls have the same kind and fields.
+            kind: an archetype of Rerun.
+            fields: of the things (M, …), each of the same length.
+        """
+        if not self.saves:
+            self.log(entity, kind.from_fields(**fields))
+            return
+        _, times, rows = self._kept.setdefault(entity, (kind, [], []))
+        times.append(self._now)
+        rows.append(fields)
+        if len(times) >= _ROWS_IN_FILES:
+            self._send_kept(entity)
+
+    def _send_kept(self, entity: str) -> None:
+        kind, times, rows = self._kept.pop(entity)
+        lengths = [len(next(iter(fields.values()))) for fields in rows]
+        frames, stamps_ns = np.array(times, np.int64).T
+        together = {name: np.concatenate([fields[name] for fields in rows]) for name in rows[0]}
+        columns = kind.columns(**together).partition(lengths)
+        self.send_columns(entity, frames, stamps_ns, columns)
 
     def send_columns(
         self, entity: str, frames: IntArray, stamps_ns: IntArray, columns: Any
@@ -120,11 +154,19 @@ class RerunStream:
         self._raw.send_columns(entity, indexes=[times], columns=columns)
 
     def arrange(self, blueprint: Any) -> None:
-        """Send the layout of the viewer."""
-        self._raw.send_blueprint(blueprint)
+        """Send the layout of the viewer; a file gets the last one only, as each is 0.2 MB."""
+        if self.saves:
+            self._layout = blueprint
+        else:
+            self._raw.send_blueprint(blueprint)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name. A server goes on serving."""
+        for entity in list(self._kept):
+            self._send_kept(entity)
+        if self._layout is not None:
+            self._raw.send_blueprint(self._layout)
+            self._layout = None
         self._raw.flush()
         self._closed = True
         if self.url is not None:  # to disconnect would end it
@@ -167,8 +209,18 @@ class RerunStream:
                 "cannot open a Rerun window: there is no display (DISPLAY and WAYLAND_DISPLAY are "
                 "not set); use --rerun save, or --rerun serve for a browser"
             )
+        # the viewer of this installation, which need not be on the path
+        places = [sysconfig.get_path("scripts"), os.environ.get("PATH", "")]
+        viewer = shutil.which("rerun", path=os.pathsep.join(places))
         try:
-            self._raw.spawn()
+            self.rr.spawn(executable_path=viewer, recording=self._raw)
+            # of a viewer that ends at once, as on a display that is gone, Rerun only warns
+            require_viewer(DEFAULT_ADDRESS)
+        except DataError as error:
+            raise DataError(
+                "cannot open a Rerun window: the viewer did not start; use --rerun save, or "
+                "--rerun serve for a browser"
+            ) from error
         except (RuntimeError, OSError) as error:
             first = str(error).splitlines()[0]
             raise DataError(f"cannot open a Rerun window ({first}); use --rerun save") from error

@@ -5,19 +5,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import BoolArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend import Estimator
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
-from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, Eye, Shown, odometry
+from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
-from slam_graph.visualization.rerun_map import MapLog, log_map
+from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
@@ -104,7 +105,8 @@ class RerunViewer:
         self,
         outcome_plots: frozenset[str] = frozenset(),
         eye: Eye | None = None,
-        in_map: Trajectory | None = None,
+        map_path: FloatArray | None = None,
+        spans: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Send the layout."""
         plots = outcome_plots | StepSeries.PLOTS
@@ -115,7 +117,8 @@ class RerunViewer:
             log=True,
             window=self._detail == "graph",
             in_map=self._known_map is not None,
-            map_path=None if in_map is None or not len(in_map) else in_map.positions,
+            map_path=map_path,
+            spans=spans or {},
         )
         self._stream.arrange(odometry(shown, eye))
 
@@ -168,7 +171,8 @@ class RerunViewer:
         if not self._keyframes:
             self._outcome.show_keyframes(result)
         best = result.smoothed or result.trajectory
-        self._arrange(plots, Eye.on(best.positions, self._map.points), result.in_map)
+        eye = Eye.on(best.positions, self._map.points, around=RIG_M)
+        self._arrange(plots, eye, places_in_map(result, self._known_map), self._series.spans)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
@@ -199,8 +203,8 @@ class RerunViewer:
         if window is not None:
             colours[np.isin(ids, window.state_features)] = GREEN
         colours[np.isin(ids, frame.rejected)] = VERMILLION
-        cloud = self._stream.rr.Points3D.from_fields(positions=points, colors=colours)
-        self._stream.log(f"{self._world}/features", cloud)
+        named, kind = f"{self._world}/features", self._stream.rr.Points3D
+        self._stream.log_rows(named, kind, positions=points, colors=colours)
         self._show_map(~np.isin(self._ids, ids))
         self._ids, self._points = ids, points
 
@@ -218,10 +222,12 @@ class RerunViewer:
         poses = np.array([values.atPose3(X(number)).translation() for number in past])
         held = np.array([number in window.keyframes for number in past], np.bool_)
         colours = np.where(held[:, None], np.array(PURPLE), np.full(3, 255)).astype(np.uint8)
-        cloud = rr.Points3D.from_fields(
-            positions=poses.reshape(-1, 3), colors=colours.reshape(-1, 3)
+        self._stream.log_rows(
+            f"{self._world}/window",
+            rr.Points3D,
+            positions=poses.reshape(-1, 3),
+            colors=colours.reshape(-1, 3),
         )
-        self._stream.log(f"{self._world}/window", cloud)
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
             places = [values.atPose3(X(number)).translation() for number in new]

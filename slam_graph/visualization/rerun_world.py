@@ -18,12 +18,14 @@ from slam_graph.results.frame_log import COSTS, COUNTS, INNOVATION, REJECTED
 from slam_graph.sensors import CameraFrame, FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
+    RIG_M,
+    SQUARE,
     Eye,
     Shown,
     odometry,
 )
 from slam_graph.visualization.rerun_images import CameraViews
-from slam_graph.visualization.rerun_map import log_map
+from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
 from slam_graph.visualization.rerun_palette import TRUTH
 from slam_graph.visualization.rerun_progress import add_imu, nis_rows
@@ -95,16 +97,15 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
             level = next((word for word in ("ERROR", "WARNING") if f" {word} " in line), "INFO")
             stream.log("log", stream.rr.TextLog(line.rstrip(), level=level))
     best = run.smoothed or run.trajectory
-    inside = run.in_map
-    place = None if inside is None else inside.positions
     shown = Shown(
         cameras=cameras,
         plots=plots,
         log=bool(lines),
-        in_map=inside is not None,
-        map_path=place,
+        in_map=run.in_map is not None,
+        map_path=places_in_map(run, details.known_map),
+        spans=series.spans,
     )
-    stream.arrange(odometry(shown, Eye.on(best.positions, details.points)))
+    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, SQUARE, RIG_M)))
 
 
 def _show_timing(
@@ -232,8 +233,7 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         if len(truth):
             extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
             frustum_m = float(np.clip(_FRUSTUM_PART * extent_m, *_FRUSTUM_M))
-            around = np.array([-2.0, 2.0])[:, None] * frustum_m
-            eye = Eye.on(np.concatenate([truth.positions, truth.positions[-1] + around]))
+        eye = Eye.on(truth.positions, around=RIG_M)
     cameras.mount(sequence.rig, frustum_m)
-    shown = Shown(cameras=len(sequence.rig.cameras), plots=_IMU_PLOTS)
+    shown = Shown(cameras=len(sequence.rig.cameras), plots=_IMU_PLOTS, title="Recording")
     stream.arrange(odometry(shown, eye))

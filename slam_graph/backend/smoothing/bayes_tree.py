@@ -80,28 +80,29 @@ def cliques_of(
 def joint_covariances(cliques: list[Clique]) -> Iterator[tuple[Clique, FloatArray]]:
     """Each clique with the joint covariance of all its variables, in the order of its columns.
 
+    Square roots are passed on from parent to child. Differences of variables may be known far
+    better than the variables themselves, and would be lost in the rounding of covariances.
+
     Args:
         cliques: parents before children.
     """
     children = np.bincount([c.parent for c in cliques if c.parent >= 0], minlength=len(cliques))
-    known: dict[int, FloatArray] = {}
+    roots: dict[int, FloatArray] = {}
     for number, clique in enumerate(cliques):
         f, s = clique.S.shape
-        P = np.empty((f + s, f + s))
-        inverse = solve_triangular(clique.R, np.eye(f))
-        P[:f, :f] = inverse @ inverse.T
+        root = np.zeros((f + s, f + s))
+        root[:f, :f] = solve_triangular(clique.R, np.eye(f))
         if s:
-            P[f:, f:] = known[clique.parent][np.ix_(clique.shared, clique.shared)]
-            gain = -inverse @ clique.S
-            P[:f, f:] = gain @ P[f:, f:]
-            P[f:, :f] = P[:f, f:].T
-            P[:f, :f] += P[:f, f:] @ gain.T
+            rows = roots[clique.parent][clique.shared]
+            separator = np.asarray(np.linalg.qr(rows.T, mode="r")).T
+            root[:f, f:] = -root[:f, :f] @ clique.S @ separator
+            root[f:, f:] = separator
             children[clique.parent] -= 1
             if children[clique.parent] == 0:
-                del known[clique.parent]
+                del roots[clique.parent]
         if children[number]:
-            known[number] = P
-        yield clique, P
+            roots[number] = root
+        yield clique, root @ root.T
 
 
 def solved(cliques: list[Clique], right: Mapping[int, FloatArray]) -> dict[int, FloatArray]:

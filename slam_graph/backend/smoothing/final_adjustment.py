@@ -20,13 +20,13 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_problem import (
     NOISE_ROUNDS,
     AdjustedSegment,
-    AdjustmentFigures,
     BundleAdjustment,
     SegmentStart,
     SmoothingTask,
@@ -54,23 +54,6 @@ MAX_PIXEL_RESIDUAL = 3.0
 
 class _UndeterminedError(EstimationError):
     """There are too few observations to improve on the causal estimate."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FinalBaSummary(AdjustmentFigures):
-    """Figures of the bundle adjustment over a whole recording, summed over its segments.
-
-    Attributes:
-        segments: number of segments.
-        frames: number of poses.
-        seconds: wall time.
-        cpu_seconds: processor time.
-    """
-
-    segments: int
-    frames: int
-    seconds: float
-    cpu_seconds: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +153,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         history.append(state)
     figures = [part.figures for part in solved]
     aligned = solved[0].aligned if len(solved) == 1 else None
-    return FinalBa(history, _summary(figures, len(history), began), aligned)
+    return FinalBa(history, summary_of(figures, len(history), began), aligned)
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:
@@ -189,6 +172,7 @@ def _adjusted(
             def report(step: int, passes: int) -> None:
                 progress.solving(steps + step, passes)
 
+            fused = replace(fused, given=start.states)
             solved = BundleAdjustment(fused, task, report).solve()
             _check(solved)
             figures = solved.figures
@@ -315,34 +299,4 @@ def _concatenated(parts: list[Trajectory]) -> Trajectory:
     names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
     return Trajectory(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    )
-
-
-def _summary(
-    solved: list[AdjustmentFigures], frames: int, began: tuple[float, float]
-) -> FinalBaSummary:
-    """Figures of all segments together."""
-
-    def total(name: str) -> int:
-        return sum(getattr(part, name) for part in solved)
-
-    def rms(name: str, weight: str) -> float:
-        weights = [getattr(part, weight) for part in solved]
-        squares = [getattr(part, name) ** 2 for part in solved]
-        return float(np.sqrt(np.average(squares, weights=weights)))
-
-    return FinalBaSummary(
-        segments=len(solved),
-        frames=frames,
-        keyframes=total("keyframes"),
-        features=total("features"),
-        observations=total("observations"),
-        iterations=total("iterations"),
-        cost_before=sum(part.cost_before for part in solved),
-        cost_after=sum(part.cost_after for part in solved),
-        imu_residual=rms("imu_residual", "keyframes"),
-        pixel_residual=rms("pixel_residual", "observations"),
-        pixel_sigma=rms("pixel_sigma", "observations"),
-        seconds=time.perf_counter() - began[0],
-        cpu_seconds=time.process_time() - began[1],
     )

@@ -148,3 +148,13 @@ def fill_in(
             velocity = state.velocity + part * velocity_error
             states.append(replace(state, world_T_body=pose, velocity=velocity))
     return [*states, keyframes[-1]]
+
+
+def values_of(states: list[NavState]) -> gtsam.Values:
+    """Poses, velocities and biases of the keyframes as variables."""
+    values = gtsam.Values()
+    for k, state in enumerate(states):
+        values.insert(X(k), state.world_T_body)
+        values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
+        values.insert(B(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
+    return values

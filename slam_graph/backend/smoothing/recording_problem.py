@@ -22,8 +22,9 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
-from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in
+from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
     averaged,
@@ -98,38 +99,13 @@ class SegmentStart:
         segment: times, observations, IMU samples.
         states: initial states of the keyframes.
         anchor: number of the keyframe whose position and yaw are fixed.
+        given: states of the keyframes before any adjustment, for `cost_before`; `states` if None.
     """
 
     segment: RecordingSegment
     states: list[NavState]
     anchor: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AdjustmentFigures:
-    """Figures of the minimum of one segment or of several together.
-
-    Attributes:
-        keyframes: number of keyframes.
-        features: number of features in the cost.
-        observations: number of observations in the cost.
-        iterations: Levenberg-Marquardt steps.
-        cost_before: initial cost, of all observations.
-        cost_after: cost at the minimum, without outliers.
-        imu_residual: root mean square of the whitened IMU residuals.
-        pixel_residual: root mean square of the whitened reprojection residuals.
-        pixel_sigma: assumed standard deviation of the observations at the end, pixels.
-    """
-
-    keyframes: int
-    features: int
-    observations: int
-    iterations: int
-    cost_before: float
-    cost_after: float
-    imu_residual: float
-    pixel_residual: float
-    pixel_sigma: float
+    given: list[NavState] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,12 +149,8 @@ class BundleAdjustment:
         self._everything = segment.seen.subset(chosen)
         self.iterations = self._passes = 0
         self._sigma_px = backend.noise.pixel_sigma
-        self._values = gtsam.Values()
-        for k, state in enumerate(start.states):
-            self._values.insert(X(k), state.world_T_body)
-            self._values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
-            bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-            self._values.insert(B(k), bias)
+        self._values = values_of(start.states)
+        self._given = values_of(start.given or start.states)
         self._note_motions()
 
     @property
@@ -193,20 +165,20 @@ class BundleAdjustment:
             EstimationError: if there is no minimum.
         """
         keyframes = self._segment.keyframes
-        before = self._minimize_loosely()
+        self._minimize_loosely()
         points, good = self._triangulated(self._candidates)
         points, good = self._with_estimates(self._candidates, points, good)
         self._note_motions()
         if self._config.learn_pixel_sigma:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
-        _, cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
+        cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
         figures = AdjustmentFigures(
             keyframes=len(keyframes),
             features=len(obs.ids),
             observations=len(obs),
             iterations=self.iterations,
-            cost_before=before,
+            cost_before=self._cost_before(obs),
             cost_after=cost,
             imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
@@ -319,19 +291,19 @@ class BundleAdjustment:
 
     # --- Levenberg-Marquardt ---------------------------------------------------------------------
 
-    def _minimize_loosely(self) -> float:
-        """Minimise with all observations to a loose tolerance; returns the initial cost."""
+    def _minimize_loosely(self) -> None:
+        """Minimise with all observations to a loose tolerance."""
         points, good = self._triangulated(self._candidates)
         obs = self._candidates.subset(good)
-        return self._minimize(obs, points[good], np.ones(len(obs)), _LOOSE_TOLERANCE)[0]
+        self._minimize(obs, points[good], np.ones(len(obs)), _LOOSE_TOLERANCE)
 
     def _minimize(
         self, obs: Observations, points: FloatArray, variances: FloatArray, tolerance: float
-    ) -> tuple[float, float, float]:
+    ) -> tuple[float, float]:
         """Move the values to the minimum.
 
         Returns:
-            The initial cost, the minimum, and the part of IMU and priors in it.
+            The minimum, and the part of IMU and priors in it.
         """
         start = gtsam.Values()
         for k in range(len(self._segment.keyframes)):
@@ -348,7 +320,7 @@ class BundleAdjustment:
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
         params.setOrdering(ordering)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
-        before = cost = optimizer.error()
+        cost = optimizer.error()
         for _ in range(self._config.max_iterations):
             optimizer.iterate()
             self.iterations += 1
@@ -362,7 +334,22 @@ class BundleAdjustment:
         self._passes += 1
         self._values = optimizer.values()
         self._solved = graph, ordering
-        return before, cost, inertial.error(self._values)
+        return cost, inertial.error(self._values)
+
+    def _cost_before(self, obs: Observations) -> float:
+        """What the cost that was minimised last is at the states before the adjustment.
+
+        Features are triangulated from these states; those that cannot be stay where they are.
+
+        Args:
+            obs: that are in the cost.
+        """
+        poses = stacked_poses(self._given, obs.frames)
+        points, good = triangulated(obs, poses, self._projection, self._backend)
+        values = gtsam.Values(self._given)
+        for j, point, known in zip(obs.ids.tolist(), points, good, strict=True):
+            values.insert(L(j), point if known else self._values.atPoint3(L(j)))
+        return float(self._solved[0].error(values))
 
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""

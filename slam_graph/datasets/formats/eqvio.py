@@ -54,6 +54,9 @@ META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"
 _QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of the length of the calibration's quaternion from one."""
 
+DEMO = "demo"
+"""The name of the recording that comes with GTSAM."""
+
 _RESOLUTION = (752, 480)
 """Of EuRoC's cameras; it is not in the file."""
 
@@ -95,7 +98,8 @@ class EqvioTracks(RecordedSequence):
         self.path = path
         chain = options.calibration
         rig = _read_rig(path) if chain is None else read_kalibr(chain).select(1)
-        super().__init__(path.stem, options.select(rig), options)
+        name = DEMO if path.resolve() == wheel_tracks().resolve() else path.stem
+        super().__init__(name, options.select(rig), options)
 
     def measure(self) -> SequenceInfo:
         """Count frames and IMU samples in one pass over the file."""
