@@ -14,7 +14,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import Innovations
-from slam_graph.results.frame_log import FrameLog
+from slam_graph.results.frame_table import FrameTable
 from slam_graph.sensors import CalibrationEstimate
 
 
@@ -232,7 +232,7 @@ class RunLogs:
     steps: StepLog = field(default_factory=StepLog)
     innovations: InnovationLog = field(default_factory=InnovationLog)
     calibration: CalibrationLog = field(default_factory=CalibrationLog)
-    by_frame: FrameLog = field(default_factory=FrameLog)
+    by_frame: FrameTable = field(default_factory=FrameTable)
     frames: int = 0
     features: Counter[str] = field(default_factory=Counter)
     last_frame_ns: int | None = None

@@ -14,7 +14,6 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.maps import SlamMap
-from slam_graph.results.frame_log import COSTS, COUNTS, INNOVATION, REJECTED
 from slam_graph.sensors import CameraFrame, FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
@@ -129,6 +128,12 @@ def _show_timing(
     return frozenset(shown)
 
 
+_COUNTS = ("tracked", "tracked_other_cameras", "estimated", "poses_in_state")
+_REJECTED = ("rejected_ransac", "rejected_gate", "rejected_stereo")
+_NIS = ("nis", "nis_dof", "nis_expected")
+"""Columns of `frames.csv` (`results/frame_table.py`), in the order of the plots."""
+
+
 def _show_frames(series: SeriesLog, table: Mapping[str, Any]) -> frozenset[str]:
     """Counts, rejections, cost and NIS of each frame."""
     if not table:
@@ -136,9 +141,9 @@ def _show_frames(series: SeriesLog, table: Mapping[str, Any]) -> frozenset[str]:
     stamps_ns = np.asarray(table["stamp_ns"], np.int64)
     numbers = np.arange(len(stamps_ns))
     plots = {
-        "backend/counts": COUNTS,
-        "backend/rejected": REJECTED,
-        "backend/cost": [name for name in COSTS if name in table],
+        "backend/counts": _COUNTS,
+        "backend/rejected": _REJECTED,
+        "backend/cost": [name for name in table if name.startswith("cost_")],
     }
     shown = set()
     for entity, columns in plots.items():
@@ -148,8 +153,8 @@ def _show_frames(series: SeriesLog, table: Mapping[str, Any]) -> frozenset[str]:
         rows = np.isfinite(values).any(axis=1)
         series.send(entity, numbers[rows], stamps_ns[rows], values[rows])
         shown.add(entity)
-    if all(name in table for name in INNOVATION):
-        distance, dof, expected = (table[name] for name in INNOVATION)
+    if all(name in table for name in _NIS):
+        distance, dof, expected = (table[name] for name in _NIS)
         rows = dof > 0
         if rows.any():
             values, bounds = nis_rows(distance[rows], dof[rows], expected[rows])

@@ -28,7 +28,7 @@ _WHOLE = (*COUNTS, "features_in_state", *REJECTED, "nis_dof")
 _OF_STATES = [_COLUMNS.index(name) for name in (*INNOVATION, *COSTS)]
 
 
-class FrameLog:
+class FrameTable:
     """A growing table with a row for each frame."""
 
     def __init__(self) -> None:
