@@ -34,8 +34,8 @@ from slam_graph.visualization.rerun_stream import RerunStream
 PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
-POINT_RADIUS, END_RADIUS = -1.3, -4.0
-"""Of points of maps, and of the ends of loop closures, in pixels of the screen."""
+POINT_RADIUS, KEYFRAME_RADIUS, END_RADIUS = -1.3, -3.2, -4.0
+"""Of points of maps, keyframes (they lie on paths), and ends of loop closures, in pixels."""
 
 _TRUTH_POINTS = 2000
 """At most so many points of the true path are drawn."""
@@ -243,7 +243,7 @@ class OutcomeLog:
         if not len(best) or not len(stamps_ns):
             return
         rr, entity = self._stream.rr, f"{self._world}/keyframes"
-        style = rr.Points3D.from_fields(colors=[PURPLE], radii=[-2.0])
+        style = rr.Points3D.from_fields(colors=[PURPLE], radii=[KEYFRAME_RADIUS])
         self._stream.log(entity, style, static=True)
         rows = np.clip(np.searchsorted(best.stamps_ns, stamps_ns), 0, len(best) - 1)
         columns = rr.Points3D.columns(positions=best.positions[rows])

@@ -19,7 +19,12 @@ from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
 from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
-from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
+from slam_graph.visualization.rerun_outcome import (
+    KEYFRAME_RADIUS,
+    POINT_RADIUS,
+    FinishedRun,
+    OutcomeLog,
+)
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
     GREEN,
@@ -231,7 +236,7 @@ class RerunViewer:
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
             places = [values.atPose3(X(number)).translation() for number in new]
-            marks = rr.Points3D(places, colors=PURPLE, radii=-2.0)
+            marks = rr.Points3D(places, colors=PURPLE, radii=KEYFRAME_RADIUS)
             self._stream.log(f"{self._world}/keyframes", marks)
         self._keyframes |= set(window.keyframes)
 
