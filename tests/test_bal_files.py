@@ -18,6 +18,7 @@ from slam_graph.cli.main import app
 from slam_graph.errors import DataError, SlamGraphError
 
 FILES = {
+    "problem.txt",
     "optimized.txt",
     "config.yaml",
     "metrics.json",

@@ -24,6 +24,7 @@ FILES = {
     "map.ply",
     "trajectory.png",
     "timing.csv",
+    "frames.csv",
     "config.yaml",
     "calibration.yaml",
     "metrics.json",

@@ -24,13 +24,15 @@ from slam_graph.bundle_adjustment import adjust_bundle, read_bal
 from slam_graph.cli.main import app
 from slam_graph.errors import DataError
 from slam_graph.pose_graph import optimize_pose_graph
-from slam_graph.results import RunResult
+from slam_graph.results import BalResult, RunResult
 from slam_graph.visualization import RerunRecording
 from slam_graph.visualization.rerun_blueprints import GROWING, Eye, with_ticks
+from slam_graph.visualization.rerun_palette import line_colours
 from slam_graph.visualization.rerun_progress import StepSeries
 from slam_graph.visualization.rerun_series import PLOTS
 
 DURATION_S = 6.0
+PLOTTED = ("/state/", "/imu/", "/error/", "/consistency/", "/backend/")
 TIMELINES = {"frame", "sensor_time"}
 NOBODY = "rerun+http://127.0.0.1:9/proxy"
 """An address at which no viewer listens."""
@@ -154,22 +156,80 @@ def test_a_result_that_was_not_watched_is_shown_from_its_files(
     result.save(tmp_path / "run")
     found = viewed(tmp_path, tmp_path / "run")
     paths = {f"/world/path/{name}" for name in ("causal", "smoothed", "groundtruth")}
-    plots = {
-        "/state/velocity",
-        "/state/gyro_bias/bounds",
-        "/error/position",
-        "/backend/milliseconds",
-    }
-    assert found.entities >= paths | plots | {"/world/map/points", "/world/body", "/legend"}
+    plots = {entity for entity in OF_A_RUN if entity.startswith(PLOTTED)}
+    points = {"/world/map/points", "/world/body", "/world/body/position_sigma", "/legend"}
+    assert found.entities >= paths | points | (plots - {"/imu/gyro", "/imu/accel"})
+    for plot in ("/consistency/nis", "/backend/cost", "/backend/counts"):
+        assert found.rows[plot] == watched[1].rows[plot]
     assert found.timelines == TIMELINES
     assert found.rows["/world/path/causal"] == len(result.trajectory) - 1
-    both = viewed(tmp_path, tmp_path / "run", tmp_path / "run")
-    name = result.config.algorithm.name
-    assert both.has_layout("Paths", "position error [m]", "Summary")
-    assert len([entity for entity in both.entities if entity.startswith(f"/paths/{name}")]) == 2
+    assert found.rows["/world/body/position_sigma"] == len(result.trajectory)
 
 
-def viewed(tmp_path: Path, *what: Path) -> Content:
+def test_the_recording_of_a_run_adds_its_inputs(tmp_path: Path) -> None:
+    flight = sg.simulate(trajectory="figure8", duration_s=2.0, rate_hz=10.0)
+    flight.save(tmp_path / "flight")
+    sg.run(tmp_path / "flight").save(tmp_path / "run")
+    found = viewed(tmp_path, tmp_path / "run", "--recording", tmp_path / "flight")
+    assert found.rows["/world/body/cam0/features"] == 21
+    samples = sum(len(packet.imu) for packet in flight.packets())
+    assert found.rows["/imu/gyro"] == found.rows["/imu/accel"] == samples
+
+
+def test_every_run_is_judged_by_its_own_truth(tmp_path: Path) -> None:
+    """Two flights through one place, of the same algorithm: errors are those of their metrics."""
+    for seed, day in enumerate(("monday", "tuesday"), start=1):
+        result = sg.run(sg.simulate(trajectory="rooms", duration_s=4.0, seed=seed, world_seed=7))
+        result.save(tmp_path / day / "run")
+    days = [tmp_path / day / "run" for day in ("monday", "tuesday")]
+    found = viewed(tmp_path, *days)
+    assert found.static >= {"/paths/monday", "/paths/tuesday"}
+    shown = []
+    show_comparison = RerunRecording.show_comparison
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            RerunRecording,
+            "show_comparison",
+            lambda self, runs, *rest: (shown.append(runs), show_comparison(self, runs, *rest)),
+        )
+        viewed(tmp_path, *days)
+    for day, folder in zip(("monday", "tuesday"), days, strict=True):
+        said = sg.load_result(folder).metrics["accuracy"]["yaw"]["ate"]["translation_m"]["rmse"]
+        errors = shown[0][day]["position error [m]"]
+        assert np.sqrt(np.mean(errors**2)) == pytest.approx(said, rel=1e-6)
+    (days[1] / "groundtruth.tum").unlink()
+    assert "different recordings" in refused(*days, "--output", tmp_path / "no.rrd")
+
+
+def test_an_optimised_bundle_is_seen_before_and_after_from_its_files(tmp_path: Path) -> None:
+    file = Path(gtsam.__file__).parent / "Data" / "dubrovnik-3-7-pre.txt"
+    BalResult(sg.BalPolicy(), adjust_bundle(read_bal(file))).save(tmp_path / "bundle")
+    found = viewed(tmp_path, tmp_path / "bundle")
+    assert found.static >= {"/before/points", "/after/points"}
+    assert found.has_layout("Before", "After")
+
+
+def test_options_that_change_nothing_are_refused(tmp_path: Path) -> None:
+    graph, _ = laps(2, noise=0.01)
+    (tmp_path / "laps.g2o").write_text("".join(optimize_pose_graph(graph).g2o_lines()))
+    view = viewed(tmp_path, tmp_path / "laps.g2o")
+    assert view.has_layout("Odometry alone", "As in the file")
+    assert "changes nothing" in refused(tmp_path / "viewed.rrd", "--no-images")
+    out = ("--output", tmp_path / "again.rrd")
+    assert "folder of one run" in refused(tmp_path / "laps.g2o", "--map", "place.slam", *out)
+
+
+def test_colours_of_algorithms_are_those_of_the_pictures() -> None:
+    from slam_graph.visualization.style import COLOUR_NAMES, line_styles
+
+    names = ["msckf", "swf", "okvis"]
+    styles = line_styles(names)
+    for name, (colour, said) in line_colours(names).items():
+        assert "#{:02X}{:02X}{:02X}".format(*colour) == styles[name].color
+        assert said == COLOUR_NAMES[styles[name].color]
+
+
+def viewed(tmp_path: Path, *what: Path | str) -> Content:
     """What `slam-graph view` saves."""
     path = tmp_path / "viewed.rrd"
     done = CliRunner().invoke(app, ["view", *map(str, what), "--output", str(path)])
@@ -205,7 +265,7 @@ def test_a_pose_graph_is_shown_before_and_after(dimension: int, tmp_path: Path) 
         loops = int(np.count_nonzero(~graph.is_odometry))
         assert found.rows[f"/residuals/{stage}/loop_closures"] == loops
     assert found.timelines == {"edge"}
-    assert found.has_layout("Before", "After", "log10 χ² of each edge", "Summary")
+    assert found.has_layout("Before: as in the file", "After", "log10 χ² of each edge", "Summary")
 
 
 def test_graph_files_are_shown_as_they_are(tmp_path: Path) -> None:

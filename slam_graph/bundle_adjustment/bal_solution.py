@@ -63,9 +63,27 @@ class BalSolution(Displayed):
         Raises:
             DataError: if nothing of it can be estimated.
         """
+        return BalSolution.of(problem, problem.estimates)
+
+    @staticmethod
+    def of(problem: BalProblem, estimates: BalEstimates) -> BalSolution:
+        """Estimates that come from elsewhere, e.g. from a file, as a solution.
+
+        Args:
+            problem: as it was.
+            estimates: of all its cameras and points.
+
+        Raises:
+            DataError: if nothing of it can be estimated.
+        """
         part = usable(problem, Diagnostics())
         minimum = BalMinimum(part.problem.estimates, np.nan, np.nan, 0, 0, False)
-        return BalSolution(problem, part, minimum, problem.estimates)
+        return BalSolution(problem, part, minimum, estimates)
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the estimates are others than those of the problem."""
+        return self.estimates is not self.problem.estimates
 
     def __repr__(self) -> str:
         part, minimum = self.part.problem, self.minimum
@@ -110,6 +128,10 @@ class BalSolution(Displayed):
             "before": reprojection_errors(problem, problem.estimates),
             "after": reprojection_errors(problem, self.adjusted),
         }
+
+    def problem_lines(self) -> Iterator[str]:
+        """The whole problem as it was read, in BAL's format."""
+        return bal_lines(self.problem, self.problem.estimates)
 
     def lines(self) -> Iterator[str]:
         """The whole problem with its estimates, in BAL's format."""

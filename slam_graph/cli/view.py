@@ -52,6 +52,14 @@ def view(
         Path | None,
         typer.Option("--map", metavar="MAP", help="Map that the run was located in."),
     ] = None,
+    recording_of_run: Annotated[
+        str | None,
+        typer.Option(
+            "--recording",
+            metavar="DATA",
+            help="Recording of the run: adds its images or tracks and its IMU samples.",
+        ),
+    ] = None,
     rerun_address: RerunAddress = None,
     format_: Format = None,
     calibration: Calibration = None,
@@ -61,7 +69,8 @@ def view(
     """Show a result, a recording, a map or a graph in Rerun.
 
     Everything is read from files, so runs that were not watched can be seen as well. With
-    --screenshot no window is opened: a picture of it is written.
+    --screenshot no window is opened: a picture of it is written. A run that was watched is shown
+    as it was then, unless --map, --recording or --no-images ask for its files.
     """
     from slam_graph.errors import ConfigError
 
@@ -72,11 +81,19 @@ def view(
     pixels = _size(size)
     if screenshot is not None:
         _check_picture(screenshot)
-    existing = _recording_of(what)
+    wanted = {
+        "--map": known_map,
+        "--recording": recording_of_run,
+        "--no-images": None if images else images,
+    }
+    existing = _recording_of(
+        what, [option for option, value in wanted.items() if value is not None]
+    )
     if existing is not None:
-        _show_existing(existing, mode, output, screenshot, pixels)
+        _show_existing(existing, mode, output, screenshot, pixels, rerun_address)
         return
-    name, show = _shown(what, images, known_map, (format_, calibration, groundtruth, sources))
+    options = (format_, calibration, groundtruth, sources)
+    name, show = _shown(what, images, known_map, recording_of_run, options)
     with tempfile.TemporaryDirectory(prefix="slam_graph_") as folder:
         files = output is not None or screenshot is not None
         path = output or Path(folder) / f"{name}{_RRD}"
@@ -110,13 +127,27 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _recording_of(what: list[str]) -> Path | None:
-    """The recording for Rerun that is meant: a file, or that of a run that was watched."""
+def _recording_of(what: list[str], options: list[str]) -> Path | None:
+    """The recording for Rerun that is meant: a file, or that of a run that was watched.
+
+    Args:
+        what: is to be shown.
+        options: that were given and need other files than the recording.
+
+    Raises:
+        ConfigError: if it is a file, for which there are no such options.
+    """
+    from slam_graph.errors import ConfigError
+
     if len(what) != 1:
         return None
     path = Path(what[0])
     if path.suffix == _RRD:
+        if options:
+            raise ConfigError(f"{path}: shown as it was recorded; {options[0]} changes nothing")
         return path
+    if options:
+        return None
     for folder in (path, path / "latest"):
         if (folder / "recording.rrd").is_file():
             return folder / "recording.rrd"
@@ -129,6 +160,7 @@ def _show_existing(
     output: Path | None,
     screenshot: Path | None,
     pixels: tuple[int, int],
+    address: str | None,
 ) -> None:
     """Show a recording for Rerun."""
     from slam_graph.errors import ConfigError
@@ -144,7 +176,7 @@ def _show_existing(
             typer.echo(f"open {url} in a browser", err=True)
             keep_serving("serve")
     elif mode == "connect":
-        raise ConfigError(f"{path}: open it in the viewer that is there, or use --rerun spawn")
+        RerunRecording.send(path, address)
     else:
         RerunRecording.open(path)
 
@@ -153,24 +185,42 @@ def _shown(
     what: list[str],
     images: bool,
     known_map: Path | None,
+    recording_of_run: str | None,
     options: tuple[str | None, Path | None, Path | None, list[str] | None],
 ) -> tuple[str, _Show]:
     """The name of what is meant, and what logs it.
 
     Raises:
+        ConfigError: if options do not fit what is to be shown.
         DataError: if it cannot be read.
     """
     from slam_graph.cli import view_files as files
+    from slam_graph.cli.options import open_recording
+    from slam_graph.errors import ConfigError
 
+    of_run = known_map is not None or recording_of_run is not None
+    misplaced = "--map and --recording are for the folder of one run"
     if len(what) > 1:
-        return "comparison", files.runs_compared([Path(path) for path in what])
+        from slam_graph.cli.view_runs import runs_compared
+
+        if of_run:
+            raise ConfigError(misplaced)
+        return "comparison", runs_compared([Path(path) for path in what])
     path = Path(what[0])
     for folder in (path, path / "latest"):
-        if folder.is_dir() and (found := files.of_folder(folder, known_map)) is not None:
+        if not folder.is_dir():
+            continue
+        wanted = None
+        if files.is_run(folder):
+            sequence = open_recording(recording_of_run, *options) if recording_of_run else None
+            wanted = files.RunOptions(known_map, sequence, images)
+        elif of_run and files.of_folder(folder) is not None:
+            raise ConfigError(f"{folder}: {misplaced}")
+        if (found := files.of_folder(folder, wanted)) is not None:
             return folder.resolve().parent.name or path.name, found
+    if of_run:
+        raise ConfigError(f"{path}: {misplaced}")
     if path.is_file() and options[0] is None and (found := files.of_file(path)) is not None:
         return path.stem, found
-    from slam_graph.cli.options import open_recording
-
     sequence = open_recording(what[0], *options)
     return sequence.info().name, lambda recording: recording.show_recording(sequence, images)

@@ -7,14 +7,14 @@ from __future__ import annotations
 import csv
 import zlib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile, is_zipfile
 
 if TYPE_CHECKING:
     from slam_graph.arrays import FloatArray
-    from slam_graph.results import SavedRun
+    from slam_graph.datasets import Sequence
     from slam_graph.visualization import RerunRecording
 
 _Show = Callable[["RerunRecording"], None]
@@ -22,22 +22,52 @@ _ERRORS = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
 _ERROR_TITLES = ("time_s", "position error [m]", "orientation error [deg]")
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
 """What NumPy raises for a file that is no archive of arrays, or lacks one."""
+_SAME_M = 1e-6
+"""Poses of a file that are nearer than this to those of odometry alone are these."""
 _GRAPH_SUFFIXES = {".g2o", ".graph", ".toro"}
 
 
-def of_folder(folder: Path, known_map: Path | None = None) -> _Show | None:
-    """What logs a folder of results; None if it is none."""
+@dataclass(frozen=True)
+class RunOptions:
+    """What is shown of a run beside its files.
+
+    Attributes:
+        known_map: file of the map that it was located in.
+        recording: that was run, with its images or tracks and IMU samples.
+        images: whether images of the recording are shown.
+    """
+
+    known_map: Path | None = None
+    recording: Sequence | None = None
+    images: bool = True
+
+
+def of_folder(folder: Path, options: RunOptions | None = None) -> _Show | None:
+    """What logs a folder of results; None if it is none.
+
+    Args:
+        folder: with the files.
+        options: for a run.
+
+    Raises:
+        DataError: if a file is damaged.
+    """
     if (folder / "optimized.g2o").is_file():
         return _optimized_graph(folder)
     if (folder / "optimized.txt").is_file():
-        return _bundle(folder / "optimized.txt")
+        return _optimized_bundle(folder)
     if (folder / "runs").is_dir() and (folder / "summary.json").is_file():
         return _comparison(folder)
-    if (folder / "metrics.json").is_file() and (folder / "trajectory.tum").is_file():
-        return _run(folder, known_map)
+    if is_run(folder):
+        return _run(folder, options or RunOptions())
     if (folder / "map.slam").is_file():
         return _map(folder / "map.slam")
     return None
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run."""
+    return (folder / "metrics.json").is_file() and (folder / "trajectory.tum").is_file()
 
 
 def of_file(path: Path) -> _Show | None:
@@ -67,14 +97,22 @@ def _begins_like_graph(path: Path) -> bool:
 
 
 def _graph(path: Path) -> _Show:
-    """A pose graph as it is in its file, after odometry alone."""
+    """A pose graph as it is in its file beside odometry alone, or one of both if they agree."""
+    import numpy as np
+
     from slam_graph.pose_graph import PoseGraphSolution, read_pose_graph
 
     graph = read_pose_graph(path)
     odometry = replace(graph, estimates=None)
-    poses = graph.estimates or PoseGraphSolution.of(odometry, graph.anchor_poses()).before
+    alone = PoseGraphSolution.of(odometry, graph.anchor_poses()).before
+    poses = graph.estimates or alone
     solution = PoseGraphSolution.of(odometry, poses)
-    return lambda recording: recording.show_pose_graph(solution)
+    titles = {"before": "Odometry alone", "after": "As in the file"}
+    if graph.estimates is None:
+        del titles["after"]
+    elif np.abs(poses.translations - alone.translations).max(initial=0.0) < _SAME_M:
+        titles = {"after": "As in the file: odometry alone"}
+    return lambda recording: recording.show_pose_graph(solution, titles)
 
 
 def _optimized_graph(folder: Path) -> _Show:
@@ -100,7 +138,8 @@ def _optimized_graph(folder: Path) -> _Show:
         raise DataError(f"{edges}: has {len(weights)} edges, {path.name} beside it {count}")
     odometry = replace(graph, estimates=None, name=folder.resolve().parent.name)
     solution = PoseGraphSolution.of(odometry, graph.estimates, weights)
-    return lambda recording: recording.show_pose_graph(solution)
+    titles = {"before": "Odometry alone", "after": "After"}
+    return lambda recording: recording.show_pose_graph(solution, titles)
 
 
 def _bundle(path: Path) -> _Show:
@@ -111,6 +150,22 @@ def _bundle(path: Path) -> _Show:
     return lambda recording: recording.show_bundle(solution)
 
 
+def _optimized_bundle(folder: Path) -> _Show:
+    """A bundle adjustment: the problem as it was read, and the optimum."""
+    from slam_graph.bundle_adjustment import BalSolution, read_bal
+    from slam_graph.errors import DataError
+
+    path = folder / "problem.txt"
+    if not path.is_file():  # of an earlier version
+        return _bundle(folder / "optimized.txt")
+    problem, optimum = read_bal(path), read_bal(folder / "optimized.txt")
+    if (problem.cameras, problem.points) != (optimum.cameras, optimum.points):
+        raise DataError(f"{path}: not the problem of {folder / 'optimized.txt'}")
+    named = replace(problem, name=folder.resolve().parent.name)
+    solution = BalSolution.of(named, optimum.estimates)
+    return lambda recording: recording.show_bundle(solution)
+
+
 def _map(path: Path) -> _Show:
     from slam_graph.results import load_map
 
@@ -118,63 +173,29 @@ def _map(path: Path) -> _Show:
     return lambda recording: recording.show_map(content)
 
 
-def _run(folder: Path, known_map: Path | None) -> _Show:
+def _run(folder: Path, options: RunOptions) -> _Show:
     """A run from its files."""
     from slam_graph.results import load_map, load_result
 
     saved = load_result(folder)
-    known = None if known_map is None else load_map(known_map)
+    known = None if options.known_map is None else load_map(options.known_map)
     log = folder / "run.log"
     # the log is for reading: what is damaged in it is seen, and costs nothing else
     lines = log.read_text("utf-8", errors="replace").splitlines() if log.is_file() else []
     # paths and points can be shown without the cameras
     rig = saved.rig if (folder / "calibration.yaml").is_file() else None
+    by_frame = saved.by_frame
     return lambda recording: recording.show_run(
-        saved, saved.points, saved.timing, rig, lines, known
+        saved,
+        saved.points,
+        saved.timing,
+        by_frame,
+        rig,
+        lines,
+        known,
+        options.recording,
+        options.images,
     )
-
-
-def runs_compared(folders: list[Path]) -> _Show:
-    """Several runs of one recording: in the world of the truth, or of the first one."""
-    import numpy as np
-
-    from slam_graph.errors import DataError
-    from slam_graph.results import load_result
-
-    saved = [load_result(folder) for folder in folders]
-    truth = saved[0].groundtruth
-    starts_ns = [int(run.trajectory.stamps_ns[0]) for run in saved if len(run.trajectory)]
-    start_ns = min(starts_ns, default=0)
-    runs: dict[str, dict[str, FloatArray]] = {}
-    for number, run in enumerate(saved, start=1):
-        name = str(run.metrics["algorithm"])
-        name = name if name not in runs else f"{name} ({number})"
-        try:
-            runs[name] = _compared(run, saved[0], start_ns)
-        except DataError as error:
-            raise DataError(f"{folders[number - 1]}: cannot be compared: {error}") from error
-    path = None if truth is None else np.asarray(truth.positions)
-    return lambda recording: recording.show_comparison(runs, path)
-
-
-def _compared(run: SavedRun, first: SavedRun, start_ns: int) -> dict[str, FloatArray]:
-    """The path of a run in a common world, and its errors; see `RerunRecording.show_comparison`."""
-    import numpy as np
-
-    from slam_graph.evaluation import ape
-
-    truth = first.groundtruth
-    reference = first.trajectory if truth is None else truth
-    position = ape(reference, run.trajectory, "trans_part", "yaw")
-    what = "difference" if truth is None else "error"
-    rotation = ape(reference, run.trajectory, "angle_deg", "yaw")
-    moved = position.similarity.apply(run.trajectory)
-    return {
-        "path": moved.positions,
-        "time_s": np.asarray((position.stamps_ns - start_ns) * 1e-9, np.float64),
-        f"position {what} [m]": position.values,
-        f"orientation {what} [deg]": rotation.values,
-    }
 
 
 def _comparison(folder: Path) -> _Show:
@@ -206,4 +227,5 @@ def _comparison(folder: Path) -> _Show:
         runs[file.stem] = run
     if not runs:
         raise DataError(f"{folder}: nothing to show: no run has a path")
-    return lambda recording: recording.show_comparison(runs, true_path)
+    true_paths = {} if true_path is None else {"ground truth": true_path}
+    return lambda recording: recording.show_comparison(runs, true_paths)

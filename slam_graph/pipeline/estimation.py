@@ -220,4 +220,6 @@ class Estimation:
             result.point_map.update(frame.landmark_ids, frame.landmarks)
             if estimator.calibration is not None:
                 logs.calibration.append(estimator.calibration)
+        estimated = len(frame.landmark_ids)
+        logs.by_frame.append(frame.features, estimated, estimator, tracked.frame_stats)
         logs.count_frame(stamp_ns, tracked.clock.milliseconds, tracked.frame_stats)

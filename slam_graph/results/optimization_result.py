@@ -99,6 +99,7 @@ class BalResult(Displayed):
             The files, in the order in which they were written.
         """
         files = ResultFolder(folder)
+        files.text("problem.txt", self.solution.problem_lines())
         files.text("optimized.txt", self.solution.lines())
         files.text("config.yaml", [self.policy.as_yaml()])
         files.json("metrics.json", self.metrics)

@@ -174,6 +174,7 @@ CONFIG = "config.yaml"
 RIG = "calibration.yaml"
 METRICS = "metrics.json"
 TIMING = "timing.csv"
+FRAMES = "frames.csv"
 
 VELOCITY = NavState.COMPONENTS[6:9]
 ACCEL_BIAS = NavState.COMPONENTS[9:12]

@@ -14,6 +14,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import Innovations
+from slam_graph.results.frame_table import FrameTable
 from slam_graph.sensors import CalibrationEstimate
 
 
@@ -221,6 +222,7 @@ class RunLogs:
         steps: Gauss-Newton steps of every frame, and the cost before and after.
         innovations: normalised innovations of every frame.
         calibration: estimated calibration at every frame, if any of it is estimated.
+        by_frame: what the back end did in every frame.
         frames: number of frames that were read.
         features: sums over all frames of what the front end counts, by name.
         last_frame_ns: time of the last frame that was read.
@@ -230,6 +232,7 @@ class RunLogs:
     steps: StepLog = field(default_factory=StepLog)
     innovations: InnovationLog = field(default_factory=InnovationLog)
     calibration: CalibrationLog = field(default_factory=CalibrationLog)
+    by_frame: FrameTable = field(default_factory=FrameTable)
     frames: int = 0
     features: Counter[str] = field(default_factory=Counter)
     last_frame_ns: int | None = None
@@ -238,6 +241,7 @@ class RunLogs:
         """Begin anew with what is said of states; times and counts of frames stay."""
         self.steps, self.innovations = StepLog(), InnovationLog()
         self.calibration = CalibrationLog()
+        self.by_frame.supersede()
 
     def count_frame(
         self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]

@@ -205,6 +205,18 @@ class RunResult(RunSummary):
         return np.array(ends, np.int64).reshape(-1, 2)
 
     @property
+    def keyframes_ns(self) -> IntArray:
+        """(K,) times of the keyframes of the algorithm; else of loop closure, else of the map."""
+        own = self.logs.by_frame.keyframes_ns
+        if len(own):
+            return own
+        if self.loops is not None:
+            return np.array([keyframe.stamp_ns for keyframe in self.loops.keyframes], np.int64)
+        if self.slam_map is not None:
+            return self.slam_map.trajectory(len(self.slam_map.recordings) - 1).stamps_ns
+        return own
+
+    @property
     def nees_series(self) -> tuple[IntArray, FloatArray] | None:
         """Times (K,) and NEES (K, 2) of position and orientation; None without a truth."""
         if self.groundtruth is None or not len(self.history):
@@ -325,6 +337,8 @@ class RunResult(RunSummary):
             files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)
         files.text(names.TIMING, self.logs.timing.csv_lines())
+        frames = self.logs.by_frame.csv_lines(self.keyframes_ns, self.nees_series)
+        files.text(names.FRAMES, frames)
         files.text(names.CONFIG, [self.config.as_yaml()])
         files.text(names.RIG, [kalibr_text(self.rig)])
         files.json(names.METRICS, self.metrics)

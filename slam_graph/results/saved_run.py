@@ -19,6 +19,7 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.results import result_files as names
+from slam_graph.results.frame_table import KEYFRAME, NEES
 from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
 from slam_graph.results.result_files import LATEST
 from slam_graph.results.run_picture import (
@@ -198,10 +199,28 @@ class SavedRun(RunSummary):
         """Whether the first state came with the data, in the world of the truth."""
         return bool(self.metrics["extent"].get("start_was_given", False))
 
+    @cached_property
+    def by_frame(self) -> dict[str, Any]:
+        """(F,) columns of `frames.csv` by their titles; empty for runs of earlier versions."""
+        path = self.folder / names.FRAMES
+        if not path.is_file():
+            return {}
+        return names.read_table(path, ["stamp_ns", KEYFRAME, *NEES], "the frames of a run")
+
     @property
-    def nees_series(self) -> None:
-        """None: there are no covariances in the files."""
-        return None
+    def keyframes_ns(self) -> IntArray:
+        """(K,) times of the keyframes."""
+        table = self.by_frame
+        return table["stamp_ns"][table[KEYFRAME] == 1] if table else np.zeros(0, np.int64)
+
+    @property
+    def nees_series(self) -> tuple[IntArray, FloatArray] | None:
+        """Times (K,) and NEES (K, 2) of position and orientation; None without a truth."""
+        if not self.by_frame:
+            return None
+        values = _columns(self.by_frame, NEES)
+        known = np.isfinite(values).all(axis=1)
+        return (self.by_frame["stamp_ns"][known], values[known]) if known.any() else None
 
     @cached_property
     def in_map(self) -> Trajectory | None:

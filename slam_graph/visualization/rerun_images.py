@@ -42,8 +42,8 @@ RESIDUAL_GAIN = 10.0
 """Residuals are drawn so many times as long as they are."""
 
 _BRIEF_STRIDE = 3
-"""Frames from one piece of a tail to the next where it is to be brief: most of a recording without
-images would be tails."""
+"""Frames from one piece of a tail to the next where it is to be brief, and from one set of features
+of a further camera to the next: most of a recording without images would be pixels."""
 
 _UNSEEN_TAIL, _UNSEEN_RESIDUAL = 1.0, 2.0
 """Pieces of tails and residuals shorter than this, in pixels of the shrunken image, are left out
@@ -61,8 +61,8 @@ class CameraViews:
         stream: where it goes.
         rig: the cameras.
         body: entity of the body.
-        brief: whether tails are coarse, what is too short to be seen is left out, and only the
-            first camera has tails and residuals.
+        brief: whether tails are coarse, what is too short to be seen is left out, only the first
+            camera has tails and residuals, and the others have features in some of the frames.
     """
 
     def __init__(self, stream: RerunStream, rig: Rig, body: str, brief: bool = False) -> None:
@@ -144,11 +144,14 @@ class CameraViews:
             fates[tails.ages == 1] = _NEW
             fates[np.isin(camera.ids, dynamic)] = _DYNAMIC
             fates[np.isin(camera.ids, rejected)] = _GATED
+            due = self._frames % self._stride == 0
+            if index >= self._detailed and not due:
+                continue
             entity = self._entity(index)
             places = _on_screen(camera.pixels, shrink)
             named = f"{entity}/features"
             self._stream.log_rows(named, rr.Points2D, positions=places, class_ids=fates)
-            if self._frames % self._stride == 0 and index < self._detailed:
+            if due and index < self._detailed:
                 pieces, ages = tails.pieces()
                 rows = self._visible(pieces, _UNSEEN_TAIL)
                 colours = scaled(ages[rows], 0.0, FULL_AGE)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps in Rerun: their points, keyframes and links."""
+"""Maps in Rerun: their points, keyframes and links; and the points of a run as they come."""
 
 from __future__ import annotations
 
@@ -12,6 +12,60 @@ from slam_graph.visualization.rerun_blueprints import SQUARE, Eye, space, whole
 from slam_graph.visualization.rerun_outcome import END_RADIUS, POINT_RADIUS, FinishedRun
 from slam_graph.visualization.rerun_palette import CYCLE, GREEN, robust_range, scaled
 from slam_graph.visualization.rerun_stream import RerunStream
+
+_FEWEST_FOR_RANGE = 50
+"""Points from which the range of heights is taken where it cannot wait for all of them."""
+
+
+class MapLog:
+    """The points that a run leaves behind, coloured by their height on one scale.
+
+    In a file the scale is that of all points. Where somebody watches, it is that of the first ones:
+    it cannot change any more without changing what earlier colours mean.
+
+    Args:
+        stream: where they go.
+        world: entity of the world of the run.
+    """
+
+    def __init__(self, stream: RerunStream, world: str) -> None:
+        self._stream, self._entity = stream, f"{world}/map/points"
+        self._times: list[tuple[int, int]] = []
+        self._waiting: list[FloatArray] = []
+        self._range: tuple[float, float] | None = None
+        self._sent: list[FloatArray] = []
+
+    @property
+    def points(self) -> FloatArray:
+        """(P, 3) all that were sent, m."""
+        return np.concatenate([*self._sent, np.zeros((0, 3))])
+
+    def add(self, number: int, stamp_ns: int, points: FloatArray) -> None:
+        """Add points (N, 3) that were left at a frame."""
+        if not len(points):
+            return
+        self._times.append((number, stamp_ns))
+        self._waiting.append(points)
+        if self._stream.saves:
+            return
+        enough = sum(map(len, self._waiting)) >= _FEWEST_FOR_RANGE
+        if enough or self._range is not None:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send the points that are kept."""
+        if not self._times:
+            return
+        points = np.concatenate(self._waiting)
+        self._range = self._range or robust_range(points[:, 2])
+        cloud = self._stream.rr.Points3D.columns(
+            positions=points, colors=scaled(points[:, 2], *self._range)
+        )
+        frames, stamps_ns = np.array(self._times, np.int64).T
+        rows = cloud.partition([len(part) for part in self._waiting])
+        self._stream.send_columns(self._entity, frames, stamps_ns, rows)
+        self._sent.append(points)
+        self._times, self._waiting = [], []
 
 
 def show_map(stream: RerunStream, content: SlamMap) -> None:

@@ -21,19 +21,21 @@ from slam_graph.visualization.rerun_palette import (
     IN_MAP,
     LIGHT_GREY,
     LOOP,
+    PURPLE,
     SMOOTHED,
     TRUTH,
     Colour,
     by_height,
 )
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
+from slam_graph.visualization.rerun_states import style_ellipsoids
 from slam_graph.visualization.rerun_stream import RerunStream
 
 PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
-POINT_RADIUS, END_RADIUS = -1.3, -4.0
-"""Of points of maps, and of the ends of loop closures, in pixels of the screen."""
+POINT_RADIUS, KEYFRAME_RADIUS, END_RADIUS = -1.3, -3.2, -4.0
+"""Of points of maps, keyframes (they lie on paths), and ends of loop closures, in pixels."""
 
 _TRUTH_POINTS = 2000
 """At most so many points of the true path are drawn."""
@@ -44,9 +46,10 @@ LEGEND = """\
 **Space.** Light blue: causal path. Red: smoothed path. Light grey: ground truth, aligned in yaw
 and position over the whole run. Small points: the map, coloured by height (dark blue is low, yellow
 is high). Larger points are features of this frame: green, in the state; yellow, used in this step;
-red, rejected by the gate. White points: past poses in the window; purple: keyframes. Green:
-loop closures, large points at their ends, and the path after them. The arrow at the start is
-gravity. Ellipsoids at the body: 1σ and 3σ of its position.
+red, rejected by the gate. White points: past poses in the window; purple: keyframes of the
+algorithm or, where it has none, of loop closure or of the map, at the end of the run. Green: loop
+closures, large points at their ends, and the path after them. The arrow at the start is gravity.
+Ellipsoids at the body: 1σ and 3σ of its position.
 
 **Cameras.** Tails are the last 12 places of a feature; dark is young, yellow is old. Points: green,
 tracked; yellow, new; light blue, seen by another camera too; red, rejected by the gate; orange,
@@ -93,6 +96,11 @@ class FinishedRun(Protocol):
     @property
     def loop_ends_ns(self) -> IntArray:
         """(L, 2) times of the ends of accepted loop closures."""
+        ...
+
+    @property
+    def keyframes_ns(self) -> IntArray:
+        """(K,) times of keyframes."""
         ...
 
     @property
@@ -155,6 +163,7 @@ class OutcomeLog:
             translation=causal.positions, quaternion=causal.quaternions
         )
         self._stream.send_columns(body, frames, causal.stamps_ns, columns)
+        self._show_ellipsoids(frames, causal.stamps_ns, run.sigmas[:, 3:6])
         rows: dict[str, tuple[FloatArray | None, FloatArray | None]] = {
             "state/velocity": (causal.velocities, None),
             "state/accel_bias": (causal.accel_biases, run.sigmas[:, 9:12]),
@@ -226,6 +235,34 @@ class OutcomeLog:
         """Log a map whose points are known only as they are at the end."""
         cloud = self._stream.rr.Points3D(points, colors=by_height(points), radii=POINT_RADIUS)
         self._stream.log(f"{self._world}/map/points", cloud, static=True)
+
+    def show_keyframes(self, run: FinishedRun) -> None:
+        """Log the places of the keyframes, each from its time on."""
+        best = run.trajectory if run.smoothed is None else run.smoothed
+        stamps_ns = run.keyframes_ns
+        if not len(best) or not len(stamps_ns):
+            return
+        rr, entity = self._stream.rr, f"{self._world}/keyframes"
+        style = rr.Points3D.from_fields(colors=[PURPLE], radii=[KEYFRAME_RADIUS])
+        self._stream.log(entity, style, static=True)
+        rows = np.clip(np.searchsorted(best.stamps_ns, stamps_ns), 0, len(best) - 1)
+        columns = rr.Points3D.columns(positions=best.positions[rows])
+        self._stream.send_columns(entity, self.frames(stamps_ns), stamps_ns, columns)
+
+    def _show_ellipsoids(self, frames: IntArray, stamps_ns: IntArray, sigmas: FloatArray) -> None:
+        """1σ and 3σ of the position (N, 3) along the axes of the body: files have no covariances.
+
+        States without standard deviations have none.
+        """
+        known = np.isfinite(sigmas).all(axis=1)
+        entity = f"{self._world}/body/position_sigma"
+        style_ellipsoids(self._stream, entity)
+        sizes = np.stack([sigmas[known], 3 * sigmas[known]], axis=1)
+        columns = self._stream.rr.Ellipsoids3D.columns(half_sizes=sizes.reshape(-1, 3))
+        lengths = [2] * len(sizes)
+        self._stream.send_columns(
+            entity, frames[known], stamps_ns[known], columns.partition(lengths)
+        )
 
     def show_legend(self) -> None:
         """Log what the colours mean."""

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,9 @@ from slam_graph.arrays import FloatArray
 
 Colour = tuple[int, int, int]
 Colours = NDArray[np.uint8]
+
+_LIGHTER = 0.45
+"""How much of white is mixed into a colour that stands for a dashed line: Rerun has no dashes."""
 
 ORANGE: Colour = (230, 159, 0)
 SKY: Colour = (86, 180, 233)
@@ -33,9 +38,6 @@ AXES = (VERMILLION, GREEN, SKY)
 CYCLE = (ORANGE, SKY, GREEN, PURPLE, YELLOW, VERMILLION, BLUE, LIGHT_GREY)
 """Colours of things of which there is any number."""
 
-CYCLE_NAMES = ("orange", "light blue", "green", "purple", "yellow", "red", "blue", "light grey")
-"""What these are called."""
-
 _VIRIDIS: Colours = np.ascontiguousarray(
     cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8
 )
@@ -51,6 +53,28 @@ def scaled(values: FloatArray, low: float, high: float) -> Colours:
     """Colours (N, 3) of values (N,) on the scale viridis, from dark blue (low) to yellow (high)."""
     part = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     return _VIRIDIS[(_DARKEST + (255 - _DARKEST) * part).astype(np.uint8)]
+
+
+def line_colours(names: Iterable[str]) -> dict[str, tuple[Colour, str]]:
+    """Colours of lines by their names, those of all pictures, and what these are called.
+
+    On the dark background black is white, and what is dashed in pictures is lighter.
+    """
+    # matplotlib takes long to load, and only comparisons need it here
+    from matplotlib.colors import to_rgb
+
+    from slam_graph.visualization.style import BLACK, COLOUR_NAMES, line_styles
+
+    found = {}
+    for name, style in line_styles(names).items():
+        colour, said = np.array(to_rgb(style.color)), COLOUR_NAMES[style.color]
+        if style.color == BLACK:
+            colour, said = 1.0 - colour, "white"
+        if style.dash != "-":
+            colour, said = colour + _LIGHTER * (1.0 - colour), f"lighter {said}"
+        red, green, blue = np.rint(255 * colour).astype(int).tolist()
+        found[name] = ((red, green, blue), said)
+    return found
 
 
 def robust_range(values: FloatArray) -> tuple[float, float]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +16,10 @@ from slam_graph.pose_graph import PoseGraphSolution
 from slam_graph.visualization.rerun_blueprints import SQUARE, Eye, space, whole, whole_axis
 from slam_graph.visualization.rerun_palette import (
     LIGHT_GREY,
+    PURPLE,
     SKY,
     VERMILLION,
+    YELLOW,
     scaled,
 )
 from slam_graph.visualization.rerun_stream import RerunStream
@@ -25,6 +28,12 @@ EDGE = "edge"
 """Timeline of pose graphs: the number of the edge."""
 
 _LEAST_CHI2 = 1e-3
+_RESIDUAL_COLOURS = {
+    ("before", "odometry"): SKY,
+    ("before", "loop_closures"): YELLOW,
+    ("after", "odometry"): VERMILLION,
+    ("after", "loop_closures"): PURPLE,
+}
 _FEWEST_BINS, _BINS = 10, 60
 _ERROR_PERCENTILE = 98.0
 _VIEWED_PERCENT = (2.0, 98.0)
@@ -33,25 +42,42 @@ _INDEX_LENGTH = 0.08
 """Length of the optical axes that are drawn, as a part of the scene."""
 
 
-def show_pose_graph(stream: RerunStream, solution: PoseGraphSolution) -> None:
-    """Log a pose graph before and after its optimisation, edges coloured by their residuals."""
+def show_pose_graph(
+    stream: RerunStream, solution: PoseGraphSolution, titles: Mapping[str, str] | None = None
+) -> None:
+    """Log a pose graph before and after its optimisation, edges coloured by their residuals.
+
+    Args:
+        stream: where it goes.
+        solution: the graph with its poses.
+        titles: what `before` and `after` are, or one of the two, which is then shown alone.
+    """
+    if titles is None:
+        start = "odometry alone" if solution.graph.estimates is None else "as in the file"
+        titles = {"before": f"Before: {start}", "after": "After"}
     graph, weights = solution.graph, solution.weights
     before = replace(solution, minimum=replace(solution.minimum, poses=solution.before))
-    chi2 = {"before": before.chi2_of_edges(), "after": solution.chi2_of_edges()}
+    stages = {name: {"before": before, "after": solution}[name] for name in titles}
+    chi2 = {name: stage.chi2_of_edges() for name, stage in stages.items()}
     logs = {name: np.log10(np.maximum(values, _LEAST_CHI2)) for name, values in chi2.items()}
     # one scale for both, that of a good fit: most residuals before it are beyond its end
-    low, high = np.percentile(logs["after"], 5.0), np.log10(4.0 * graph.tangent_size)
-    loops = ~graph.is_odometry
-    for name, poses in (("before", solution.before), ("after", solution.poses)):
+    best = logs["after"] if "after" in logs else logs["before"]
+    low, high = np.percentile(best, 5.0), np.log10(4.0 * graph.tangent_size)
+    loops, eyes = ~graph.is_odometry, []
+    for name, stage in stages.items():
         stream.log(name, stream.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        places = poses.in_space().translations
+        places = stage.poses.in_space().translations
         colours = scaled(logs[name], float(min(low, high - 1.0)), float(high))
         _log_edges(stream, name, places, graph.edges, colours, loops, weights < 0.5)
-        _log_residuals(stream, name, logs[name], loops)
-    eyes = [_eye(poses.in_space().translations) for poses in (solution.before, solution.poses)]
-    text = _summary(solution, {name: float(values.sum()) for name, values in chi2.items()})
+        _log_residuals(stream, name, titles[name], chi2[name], loops)
+        eyes.append(_eye(places))
+    text = _summary(solution, {titles[name]: float(v.sum()) for name, v in chi2.items()})
     stream.log("summary", stream.rr.TextDocument(text, media_type="text/markdown"), static=True)
-    stream.arrange(_pose_graph_layout(eyes))
+    views = [
+        space(title, f"/{name}", eye=eye)
+        for (name, title), eye in zip(titles.items(), eyes, strict=True)
+    ]
+    stream.arrange(_pose_graph_layout(views))
 
 
 def _log_edges(
@@ -77,20 +103,23 @@ def _log_edges(
     stream.log(f"{name}/poses", points, static=True)
 
 
-def _log_residuals(stream: RerunStream, name: str, values: FloatArray, loops: BoolArray) -> None:
-    """log10 χ² (M,) of each edge over its number."""
-    rr = stream.rr
-    colour = SKY if name == "before" else VERMILLION
-    numbers = np.arange(len(values))
-    for kind, rows in (("odometry", ~loops), ("loop_closures", loops)):
+def _log_residuals(
+    stream: RerunStream, name: str, title: str, chi2: FloatArray, loops: BoolArray
+) -> None:
+    """log10 χ² (M,) of each edge over its number, but of those that fit exactly."""
+    rr, numbers = stream.rr, np.arange(len(chi2))
+    shown = chi2 > _LEAST_CHI2
+    values = np.log10(chi2, out=np.zeros(len(chi2)), where=shown)
+    for kind, rows in (("odometry", ~loops & shown), ("loop_closures", loops & shown)):
         entity = f"residuals/{name}/{kind}"
-        label = f"{kind.replace('_', ' ')}, {name}"
+        label = f"{kind.replace('_', ' ')}, {title[0].lower()}{title[1:]}"
+        colour = _RESIDUAL_COLOURS[name, kind]
         shape = "circle" if kind == "odometry" else "diamond"
         size = 1.2 if kind == "odometry" else 2.2
         style = rr.SeriesPoints(colors=colour, names=label, markers=shape, marker_sizes=size)
-        stream.log(entity, style, static=True)
-        columns = rr.Scalars.columns(scalars=values[rows])
         if rows.any():
+            stream.log(entity, style, static=True)
+            columns = rr.Scalars.columns(scalars=values[rows])
             stream.send_along(entity, rr.TimeColumn(EDGE, sequence=numbers[rows]), columns)
 
 
@@ -98,6 +127,8 @@ def _summary(solution: PoseGraphSolution, chi2: dict[str, float]) -> str:
     graph = solution.graph
     loops = int(np.count_nonzero(~graph.is_odometry))
     rejected = int(np.count_nonzero(solution.weights < 0.5))
+    rows = "\n".join(f"| χ², {t[0].lower()}{t[1:]} | {value:.6g} |" for t, value in chi2.items())
+    both = ", on one scale for both" if len(chi2) > 1 else ""
     return f"""\
 # {graph.name}
 
@@ -106,21 +137,16 @@ def _summary(solution: PoseGraphSolution, chi2: dict[str, float]) -> str:
 | poses | {len(graph.keys)} |
 | edges | {len(graph.edges)}, {loops} of them loop closures |
 | rejected | {rejected} |
-| χ² before | {chi2["before"]:.6g} |
-| χ² after | {chi2["after"]:.6g} |
+{rows}
 
-**Edges** are coloured by the logarithm of χ², on one scale for both: dark blue fits, yellow does
-not. Red: rejected as an outlier.
+**Edges** are coloured by the logarithm of χ²{both}: dark blue fits, yellow does not. Red: rejected
+as an outlier. Edges that fit exactly (χ² below {_LEAST_CHI2:g}) have no residual.
 """
 
 
-def _pose_graph_layout(eyes: list[Eye | None]) -> Any:
+def _pose_graph_layout(views: list[Any]) -> Any:
     import rerun.blueprint as rrb
 
-    views = [
-        space("Before", "/before", eye=eyes[0]),
-        space("After", "/after", eye=eyes[1]),
-    ]
     residuals = rrb.TimeSeriesView(
         name="log10 χ² of each edge",
         origin="/residuals",
@@ -152,10 +178,14 @@ def _eye(places: FloatArray) -> Eye | None:
 
 
 def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
-    """Log a bundle adjustment before and after, with the histogram of its reprojection errors."""
+    """Log a bundle adjustment before and after, with the histogram of its reprojection errors.
+
+    Of a problem that is not solved there is one scene, as it is in the file.
+    """
     part = solution.part.problem
     scenes = {"before": part.estimates}
-    if solution.minimum.steps:
+    titles = {"before": "Before" if solution.is_solved else "As in the file", "after": "After"}
+    if solution.is_solved:
         scenes["after"] = solution.adjusted
     errors = solution.errors_px
     last = float(np.percentile(errors["before"], _ERROR_PERCENTILE))
@@ -185,11 +215,12 @@ def show_bundle(stream: RerunStream, solution: BalSolution) -> None:
         bars = rr.BarChart(counts, abscissa=edges[:-1], widths=np.diff(edges), color=colour)
         stream.log(f"errors/{name}", bars, static=True)
     rms = {name: float(np.sqrt(np.mean(errors[name] ** 2))) for name in scenes}
-    text = _bundle_summary(solution, rms)
+    titles = {name: titles[name] for name in scenes}
+    text = _bundle_summary(solution, {titles[name]: value for name, value in rms.items()})
     stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
     after = solution.adjusted
     eye = _scene_eye(after.centres(), after.points)
-    stream.arrange(_bundle_layout(eye, list(scenes)))
+    stream.arrange(_bundle_layout(eye, titles))
 
 
 def _worst_of_points(point: IntArray, count: int, errors: FloatArray) -> FloatArray:
@@ -213,8 +244,10 @@ def _scene_eye(centres: FloatArray, points: FloatArray) -> Eye:
 
 
 def _bundle_summary(solution: BalSolution, rms: dict[str, float]) -> str:
-    part = solution.part.problem
-    rows = "\n".join(f"| RMS error {name} | {value:.3f} px |" for name, value in rms.items())
+    part, both = solution.part.problem, ", on one scale for both" if len(rms) > 1 else ""
+    rows = "\n".join(
+        f"| RMS error {name.lower()} | {value:.3f} px |" for name, value in rms.items()
+    )
     return f"""\
 # {solution.problem.name}
 
@@ -225,24 +258,24 @@ def _bundle_summary(solution: BalSolution, rms: dict[str, float]) -> str:
 | observations | {len(part.camera)} |
 {rows}
 
-**Points** are coloured by their largest reprojection error, on one scale for both: dark blue fits,
-yellow does not. Arrows show where the cameras look.
+**Points** are coloured by their largest reprojection error{both}: dark blue fits, yellow does not.
+Arrows show where the cameras look.
 """
 
 
-def _bundle_layout(eye: Eye, stages: list[str]) -> Any:
+def _bundle_layout(eye: Eye, titles: Mapping[str, str]) -> Any:
     import rerun.blueprint as rrb
 
     charts = [
         rrb.BarChartView(
-            name=f"Errors {name} [px]",
+            name=f"Errors {title.lower()} [px]",
             origin=f"/errors/{name}",
             plot_legend=rrb.PlotLegend(visible=False),
         )
-        for name in stages
+        for name, title in titles.items()
     ]
     text = rrb.TextDocumentView(name="Summary", origin="/summary")
-    views = [space(name.title(), f"/{name}", eye=eye) for name in stages]
+    views = [space(title, f"/{name}", eye=eye) for name, title in titles.items()]
     return whole(
         rrb.Vertical(
             rrb.Horizontal(*views),

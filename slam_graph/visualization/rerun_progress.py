@@ -15,9 +15,6 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 
-_IMU_STRIDE = 4
-"""Of the IMU samples each of so many is sent."""
-
 
 class ShownFrame(Protocol):
     """A frame, and what was made of it: `EstimatedFrame` of the pipeline says what each part is."""
@@ -101,7 +98,7 @@ class StepSeries:
 
     def add(self, number: int, stamp_ns: int, frame: ShownFrame, estimator: Estimator) -> None:
         """Add the rows of a frame."""
-        self._add_imu(number, frame.packet)
+        add_imu(self._series, number, frame.packet)
         add = self._series.add
         ms, counts = frame.milliseconds, frame.counts
         nan = float("nan")
@@ -126,14 +123,10 @@ class StepSeries:
     def _add_nis(self, number: int, stamp_ns: int, estimator: Estimator) -> None:
         """Squared innovations over their degrees of freedom, with what is expected of them."""
         innovations = estimator.innovations
-        dof = innovations.passed_dof
-        expected = innovations.expected / dof
-        # a χ² variable over its many degrees of freedom has the variance 2 / dof
-        margin = 1.96 * expected * np.sqrt(2.0 / dof)
-        value = [innovations.passed_distance / dof]
-        self._series.add("consistency/nis", number, stamp_ns, value)
-        bounds = [expected, expected + margin, max(expected - margin, 0.0)]
-        self._series.add("consistency/nis/bounds", number, stamp_ns, bounds)
+        sums = (innovations.passed_distance, innovations.passed_dof, innovations.expected)
+        values, bounds = nis_rows(*(np.array([float(value)]) for value in sums))
+        self._series.add("consistency/nis", number, stamp_ns, values[0])
+        self._series.add("consistency/nis/bounds", number, stamp_ns, bounds[0])
 
     def _add_state(self, number: int, stamp_ns: int, state: NavState) -> None:
         """Velocity, and biases with their bounds."""
@@ -149,10 +142,26 @@ class StepSeries:
         add("state/gyro_bias/bounds", number, stamp_ns, gyro)
         add("state/accel_bias/bounds", number, stamp_ns, accel)
 
-    def _add_imu(self, number: int, packet: Packet) -> None:
-        """Raw IMU samples, not all of them."""
-        imu = packet.imu
-        for row in range(0, len(imu), _IMU_STRIDE):
-            stamp_ns = int(imu.stamps_ns[row])
-            self._series.add("imu/gyro", number, stamp_ns, imu.gyro[row])
-            self._series.add("imu/accel", number, stamp_ns, imu.accel[row])
+
+def add_imu(series: SeriesLog, number: int, packet: Packet) -> None:
+    """Add the IMU samples since the frame before, as they were read."""
+    imu = packet.imu
+    series.add_samples("imu/gyro", number, imu.stamps_ns, imu.gyro)
+    series.add_samples("imu/accel", number, imu.stamps_ns, imu.accel)
+
+
+def nis_rows(
+    distance: FloatArray, dof: FloatArray, expected: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """NIS of N frames over its degrees of freedom (N, 1), with what is expected of it (N, 3).
+
+    Args:
+        distance: (N,) sums of squared Mahalanobis distances of what passed the gate.
+        dof: (N,) their degrees of freedom, above zero.
+        expected: (N,) their expected sums.
+    """
+    mean = expected / dof
+    # a χ² variable over its many degrees of freedom has the variance 2 / dof
+    margin = 1.96 * mean * np.sqrt(2.0 / dof)
+    bounds = np.column_stack([mean, mean + margin, np.maximum(mean - margin, 0.0)])
+    return (distance / dof)[:, None], bounds

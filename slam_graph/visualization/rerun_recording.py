@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalSolution
@@ -16,6 +16,7 @@ from slam_graph.datasets import Sequence
 from slam_graph.maps import SlamMap
 from slam_graph.pose_graph import PoseGraphSolution
 from slam_graph.sensors import Rig
+from slam_graph.visualization.rerun_comparison import ComparedRun, show_comparison
 from slam_graph.visualization.rerun_images import ImagesMode
 from slam_graph.visualization.rerun_map import show_map
 from slam_graph.visualization.rerun_outcome import FinishedRun
@@ -24,18 +25,13 @@ from slam_graph.visualization.rerun_screenshot import (
     open_recording,
     require_picture,
     save_screenshot,
+    send_recording,
     serve_recording,
     stop,
 )
 from slam_graph.visualization.rerun_stream import RerunMode, RerunStream
 from slam_graph.visualization.rerun_viewer import DetailMode, RerunViewer
-from slam_graph.visualization.rerun_world import (
-    ComparedRun,
-    SavedDetails,
-    show_comparison,
-    show_recording,
-    show_saved_run,
-)
+from slam_graph.visualization.rerun_world import SavedDetails, show_recording, show_saved_run
 
 
 class RerunRecording:
@@ -103,9 +99,12 @@ class RerunRecording:
         run: FinishedRun,
         points: FloatArray,
         timing: Mapping[str, FloatArray],
+        by_frame: Mapping[str, Any] | None = None,
         rig: Rig | None = None,
         log: Iterable[str] = (),
         known_map: SlamMap | None = None,
+        recording: Sequence | None = None,
+        images: bool = True,
     ) -> None:
         """A run that has ended, from what its files hold.
 
@@ -113,11 +112,16 @@ class RerunRecording:
             run: trajectories and errors.
             points: (P, 3) its map, m.
             timing: (F,) milliseconds of stages by their names, and `stamp_ns`.
+            by_frame: (F,) columns of `frames.csv` by their titles.
             rig: the sensors, if they are known.
             log: lines.
             known_map: the map that it was located in, if it is at hand.
+            recording: that was run, if its images or tracks and IMU samples are to be shown.
+            images: whether images of the recording are shown.
         """
-        details = SavedDetails(rig, points, timing, log, known_map)
+        details = SavedDetails(
+            rig, points, timing, by_frame or {}, log, known_map, recording, images
+        )
         show_saved_run(self._stream, run, details)
 
     def show_map(self, content: SlamMap) -> None:
@@ -128,23 +132,34 @@ class RerunRecording:
         """A recording as it is; images only if wanted."""
         show_recording(self._stream, sequence, images)
 
-    def show_pose_graph(self, solution: PoseGraphSolution) -> None:
-        """A pose graph before and after its optimisation."""
-        show_pose_graph(self._stream, solution)
+    def show_pose_graph(
+        self, solution: PoseGraphSolution, titles: Mapping[str, str] | None = None
+    ) -> None:
+        """A pose graph before and after its optimisation.
+
+        Args:
+            solution: the graph with its poses.
+            titles: what `before` and `after` are, or one of the two, which is then shown alone.
+        """
+        show_pose_graph(self._stream, solution, titles)
 
     def show_bundle(self, solution: BalSolution) -> None:
         """A bundle adjustment before and after."""
         show_bundle(self._stream, solution)
 
     def show_comparison(
-        self, runs: Mapping[str, Mapping[str, FloatArray]], true_path: FloatArray | None
+        self,
+        runs: Mapping[str, Mapping[str, FloatArray]],
+        true_paths: Mapping[str, FloatArray],
+        note: str = "",
     ) -> None:
         """Several runs over one another.
 
         Args:
             runs: for each name `path` (S, 3) of all states in m, `time_s` (N,), and errors (N,) at
                 these times by the titles of their plots.
-            true_path: (M, 3) in the same world, if there is one.
+            true_paths: (M, 3) in the same world by their labels.
+            note: what else is to be known of the errors.
         """
         compared = [
             ComparedRun(
@@ -155,7 +170,7 @@ class RerunRecording:
             )
             for name, columns in runs.items()
         ]
-        show_comparison(self._stream, compared, true_path)
+        show_comparison(self._stream, compared, true_paths, note)
 
     @staticmethod
     def screenshot(recording: Path, picture: Path, size: tuple[int, int] = (1600, 1000)) -> None:
@@ -171,6 +186,11 @@ class RerunRecording:
     def open(recording: Path) -> None:
         """Open a saved recording in a window, and go on; see `open_recording` for errors."""
         open_recording(recording)
+
+    @staticmethod
+    def send(recording: Path, address: str | None = None) -> None:
+        """Send a saved recording to a viewer that is open; see `send_recording` for errors."""
+        send_recording(recording, address)
 
     @staticmethod
     @contextmanager

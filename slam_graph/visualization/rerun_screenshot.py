@@ -18,7 +18,12 @@ import cv2
 import numpy as np
 
 from slam_graph.errors import DataError
-from slam_graph.visualization.rerun_stream import free_port, has_display
+from slam_graph.visualization.rerun_stream import (
+    DEFAULT_ADDRESS,
+    free_port,
+    has_display,
+    require_viewer,
+)
 
 _START_S, _SETTLE_S, _PERIOD_S = 20.0, 40.0, 1.0
 """Longest times to wait for the viewer and for a picture that does not change; time between two."""
@@ -151,6 +156,30 @@ def serve_recording(recording: Path) -> tuple[subprocess.Popen[bytes], str]:
     server = subprocess.Popen(command, env=environment, start_new_session=True)
     source = f"rerun%2Bhttp://localhost:{port}/proxy"
     return server, f"http://localhost:{web_port}/?url={source}"
+
+
+def send_recording(recording: Path, address: str | None = None) -> None:
+    """Send a recording to a viewer that is open.
+
+    Args:
+        recording: `.rrd`.
+        address: of the viewer; None means the usual one.
+
+    Raises:
+        DataError: if there is no such file, it is damaged, or no viewer can be reached.
+    """
+    import rerun
+    from rerun.chunk import RrdReader
+
+    require_readable(recording)
+    require_viewer(address or DEFAULT_ADDRESS)
+    # with the id of the file nothing else appears in the viewer beside it
+    stored = RrdReader(recording).recordings()[0]
+    stream = rerun.RecordingStream(stored.application_id, recording_id=stored.recording_id)
+    stream.connect_grpc(address or DEFAULT_ADDRESS)
+    stream.log_file_from_path(recording)
+    stream.flush()
+    stream.disconnect()
 
 
 def stop(viewer: subprocess.Popen[bytes]) -> None:

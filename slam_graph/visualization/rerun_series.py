@@ -29,7 +29,7 @@ _BAND = ("x ±3σ", "y ±3σ", "z ±3σ", "−3σ x", "−3σ y", "−3σ z")
 _MAX_STEPS = 8
 _ROWS_AT_ONCE = 40
 """Rows that are kept before they are sent together: two seconds of frames."""
-_ROWS_IN_FILES = 400
+_ROWS_IN_FILES = 4000
 """The same where nobody waits for them: each piece costs a kilobyte."""
 
 
@@ -127,6 +127,13 @@ class _Rows:
     values: list[Sequence[float] | FloatArray] = field(default_factory=list)
 
 
+@dataclass(slots=True)
+class _Samples:
+    frames: list[int] = field(default_factory=list)
+    stamps_ns: list[IntArray] = field(default_factory=list)
+    values: list[FloatArray] = field(default_factory=list)
+
+
 class SeriesLog:
     """Rows of plots, sent many at a time: a call for each value would cost too much.
 
@@ -140,6 +147,7 @@ class SeriesLog:
     def __init__(self, stream: RerunStream) -> None:
         self._stream = stream
         self._rows: dict[str, _Rows] = {}
+        self._samples: dict[str, _Samples] = {}
         self._styled: set[str] = set()
         self.spans: dict[str, tuple[float, float]] = {}
 
@@ -154,10 +162,21 @@ class SeriesLog:
         if len(rows.frames) >= (_ROWS_IN_FILES if self._stream.saves else _ROWS_AT_ONCE):
             self._send(entity)
 
+    def add_samples(self, entity: str, frame: int, stamps_ns: IntArray, values: FloatArray) -> None:
+        """Add rows (N, k) at times (N,) that belong to one frame."""
+        kept = self._samples.setdefault(entity, _Samples())
+        kept.frames.append(frame)
+        kept.stamps_ns.append(stamps_ns)
+        kept.values.append(values)
+        if len(kept.frames) >= (_ROWS_IN_FILES if self._stream.saves else _ROWS_AT_ONCE):
+            self._send_samples(entity)
+
     def flush(self) -> None:
         """Send all rows that are kept."""
         for entity in list(self._rows):
             self._send(entity)
+        for entity in list(self._samples):
+            self._send_samples(entity)
 
     def send(self, entity: str, frames: IntArray, stamps_ns: IntArray, values: FloatArray) -> None:
         """Send rows (N, k) at once."""
@@ -182,6 +201,11 @@ class SeriesLog:
             values[number, : len(row)] = row
         frames, stamps_ns = (np.array(x, np.int64) for x in (rows.frames, rows.stamps_ns))
         self.send(entity, frames, stamps_ns, values)
+
+    def _send_samples(self, entity: str) -> None:
+        kept = self._samples.pop(entity)
+        frames = np.repeat(np.array(kept.frames, np.int64), [len(rows) for rows in kept.stamps_ns])
+        self.send(entity, frames, np.concatenate(kept.stamps_ns), np.concatenate(kept.values))
 
     def _style(self, entity: str) -> None:
         """Name and colour the values of a plot, before its first row."""

@@ -14,7 +14,7 @@ from slam_graph.geometry import NavState
 from slam_graph.visualization.rerun_palette import YELLOW
 from slam_graph.visualization.rerun_stream import RerunStream
 
-_ROWS_IN_FILES = 200
+_ROWS_IN_FILES = 4000
 """States that are sent together where nobody waits for them; else each is sent at once."""
 
 
@@ -31,10 +31,7 @@ class StateRows:
         self._most = _ROWS_IN_FILES if stream.saves else 1
         self._last: FloatArray | None = None
         self._clear()
-        ellipsoids = stream.rr.Ellipsoids3D.from_fields(
-            colors=[(*YELLOW, 255), (*YELLOW, 120)], line_radii=[-0.6], fill_mode="majorwireframe"
-        )
-        stream.log(f"{world}/body/position_sigma", ellipsoids, static=True)
+        style_ellipsoids(stream, f"{world}/body/position_sigma")
 
     def _clear(self) -> None:
         self._times: list[tuple[int, int]] = []
@@ -72,6 +69,14 @@ class StateRows:
         for entity, column in columns.items():
             self._stream.send_columns(entity, frames, stamps_ns, column)
         self._clear()
+
+
+def style_ellipsoids(stream: RerunStream, entity: str) -> None:
+    """Say how two ellipsoids look, 1σ and 3σ."""
+    ellipsoids = stream.rr.Ellipsoids3D.from_fields(
+        colors=[(*YELLOW, 255), (*YELLOW, 120)], line_radii=[-0.6], fill_mode="majorwireframe"
+    )
+    stream.log(entity, ellipsoids, static=True)
 
 
 def _ellipsoid(covariance: FloatArray | None) -> tuple[FloatArray, FloatArray]:

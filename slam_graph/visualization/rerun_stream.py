@@ -29,7 +29,7 @@ DEFAULT_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
 _ABSOLUTE_NS = 10**17
 """Stamps from here on (three years after 1970) are shown as dates, others as seconds."""
 
-_TICK_S, _CHUNK_BYTES = 60.0, 1 << 20
+_TICK_S, _CHUNK_BYTES = 60.0, 8 << 20
 
 _ROWS_IN_FILES = 400
 """Rows that are sent together where nobody waits for them: one by one they cost more time."""

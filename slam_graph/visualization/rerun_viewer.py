@@ -18,16 +18,19 @@ from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
-from slam_graph.visualization.rerun_map import log_map, places_in_map
-from slam_graph.visualization.rerun_outcome import POINT_RADIUS, FinishedRun, OutcomeLog
+from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
+from slam_graph.visualization.rerun_outcome import (
+    KEYFRAME_RADIUS,
+    POINT_RADIUS,
+    FinishedRun,
+    OutcomeLog,
+)
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
     GREEN,
     PURPLE,
     VERMILLION,
     YELLOW,
-    robust_range,
-    scaled,
 )
 from slam_graph.visualization.rerun_progress import ShownFrame, StepSeries
 from slam_graph.visualization.rerun_series import SeriesLog
@@ -77,7 +80,7 @@ class RerunViewer:
         self._history = StateHistory()
         self._states = StateRows(self._stream, world)
         self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
-        self._heights: list[FloatArray] = []
+        self._map = MapLog(self._stream, world)
         self._keyframes: set[int] = set()
         self._image_ns: int | None = None
 
@@ -137,6 +140,7 @@ class RerunViewer:
         self._stream.at(number, stamp_ns)
         if frame.restarted:
             self._states.flush()
+            self._map.flush()
             self._begin(f"world_from_{number}")
             self._set_world(frame.corrected_rig or self._rig)
         images = frame.packet.frame
@@ -167,17 +171,20 @@ class RerunViewer:
         self._states.flush()
         self._stream.at(max(len(self._stamps_ns) - 1, 0), self._stamps_ns[-1])
         self._show_map(np.ones(len(self._ids), np.bool_))
+        self._map.flush()
         plots = self._outcome.show(result)
+        if not self._keyframes:
+            self._outcome.show_keyframes(result)
         best = result.smoothed or result.trajectory
-        points = np.concatenate([*self._heights, np.zeros((0, 3))])
-        eye, spans = Eye.on(best.positions, points, around=RIG_M), self._series.spans
-        self._arrange(plots, eye, places_in_map(result, self._known_map), spans)
+        eye = Eye.on(best.positions, self._map.points, around=RIG_M)
+        self._arrange(plots, eye, places_in_map(result, self._known_map), self._series.spans)
 
     def close(self) -> None:
         """Send what is left; a saved file appears under its name."""
         logging.getLogger("slam_graph").removeHandler(self._log_handler)
         self._series.flush()
         self._states.flush()
+        self._map.flush()
         self._stream.close()
 
     def _wants_images(self, estimator: Estimator, stamp_ns: int) -> bool:
@@ -208,14 +215,7 @@ class RerunViewer:
 
     def _show_map(self, rows: BoolArray) -> None:
         """Add landmarks to the map."""
-        left = self._points[rows]
-        if len(left) == 0:
-            return
-        self._heights.append(left)
-        heights = np.concatenate([part[:, 2] for part in self._heights])
-        colours = scaled(left[:, 2], *robust_range(heights))
-        named, kind = f"{self._world}/map/points", self._stream.rr.Points3D
-        self._stream.log_rows(named, kind, positions=left, colors=colours)
+        self._map.add(len(self._stamps_ns) - 1, self._stamps_ns[-1], self._points[rows])
 
     def _show_window(self, estimator: Estimator) -> None:
         """The past poses in the state, and new keyframes."""
@@ -236,7 +236,7 @@ class RerunViewer:
         new = [n for n in past if n in window.keyframes and n not in self._keyframes]
         if new:
             places = [values.atPose3(X(number)).translation() for number in new]
-            marks = rr.Points3D(places, colors=PURPLE, radii=-2.0)
+            marks = rr.Points3D(places, colors=PURPLE, radii=KEYFRAME_RADIUS)
             self._stream.log(f"{self._world}/keyframes", marks)
         self._keyframes |= set(window.keyframes)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps, saved runs, recordings and comparisons in Rerun, from what their files hold."""
+"""Saved runs and recordings in Rerun, from what their files hold."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Sequence
+from slam_graph.errors import DataError
 from slam_graph.maps import SlamMap
-from slam_graph.sensors import CameraFrame, FeatureFrame, Rig
+from slam_graph.sensors import CameraFrame, FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
     RIG_M,
@@ -21,20 +22,19 @@ from slam_graph.visualization.rerun_blueprints import (
     Eye,
     Shown,
     odometry,
-    space,
-    whole,
-    whole_axis,
-    with_ticks,
 )
 from slam_graph.visualization.rerun_images import CameraViews
 from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
-from slam_graph.visualization.rerun_palette import CYCLE, CYCLE_NAMES, TRUTH
+from slam_graph.visualization.rerun_palette import TRUTH
+from slam_graph.visualization.rerun_progress import add_imu, nis_rows
 from slam_graph.visualization.rerun_series import SeriesLog
 from slam_graph.visualization.rerun_stream import RerunStream
 
-_SINCE_START = "since_start"
-"""Timeline of comparisons."""
+_FRUSTUM_PART, _FRUSTUM_M = 0.05, (0.04, 0.25)
+"""Length of the cameras' frusta as a part of the extent of the flight, and its bounds, m."""
+
+_IMU_PLOTS = frozenset({"imu/gyro", "imu/accel"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,31 +45,48 @@ class SavedDetails:
         rig: the sensors.
         points: (P, 3) the map of the run, m.
         timing: (F,) milliseconds of stages by their names, and `stamp_ns`.
+        by_frame: (F,) columns of `frames.csv` by their titles; empty if there is none.
         log: lines.
         known_map: the map that the run was located in, if it is at hand.
+        recording: that was run, if its images or tracks and IMU samples are to be shown.
+        images: whether images of the recording are shown.
     """
 
     rig: Rig | None
     points: FloatArray
     timing: Mapping[str, FloatArray]
+    by_frame: Mapping[str, Any]
     log: Iterable[str] = ()
     known_map: SlamMap | None = None
+    recording: Sequence | None = None
+    images: bool = True
 
 
 def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails) -> None:
-    """Log a run from its files: what a run that is watched shows, but images and features."""
+    """Log a run from its files: what a run that is watched shows, but single features.
+
+    Raises:
+        DataError: if the recording that is given with it is another one.
+    """
     series = SeriesLog(stream)
     stamps_ns = np.asarray(details.timing.get("stamp_ns", run.trajectory.stamps_ns), np.int64)
     outcome = OutcomeLog(stream, "world", series, stamps_ns.tolist())
     stream.log("world", stream.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     plots = outcome.show_states(run) | outcome.show(run)
     outcome.show_points(details.points)
+    outcome.show_keyframes(run)
     outcome.show_legend()
     if len(run.trajectory):
         outcome.show_gravity(run.trajectory.positions[0])
     plots |= _show_timing(series, stamps_ns, details.timing)
+    plots |= _show_frames(series, details.by_frame)
+    cameras = 0
     if details.rig is not None:
-        CameraViews(stream, details.rig, "world/body").mount(details.rig)
+        views = CameraViews(stream, details.rig, "world/body")
+        views.mount(details.rig)
+        if details.recording is not None:
+            plots |= _show_inputs(stream, series, views, details, outcome, stamps_ns)
+            cameras = len(details.rig.cameras)
     if details.known_map is not None:
         log_map(stream, KNOWN_MAP, details.known_map)
     lines = list(details.log)
@@ -80,6 +97,7 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
             stream.log("log", stream.rr.TextLog(line.rstrip(), level=level))
     best = run.smoothed or run.trajectory
     shown = Shown(
+        cameras=cameras,
         plots=plots,
         log=bool(lines),
         in_map=run.in_map is not None,
@@ -110,6 +128,88 @@ def _show_timing(
     return frozenset(shown)
 
 
+_COUNTS = ("tracked", "tracked_other_cameras", "estimated", "poses_in_state")
+_REJECTED = ("rejected_ransac", "rejected_gate", "rejected_stereo")
+_NIS = ("nis", "nis_dof", "nis_expected")
+"""Columns of `frames.csv` (`results/frame_table.py`), in the order of the plots."""
+
+
+def _show_frames(series: SeriesLog, table: Mapping[str, Any]) -> frozenset[str]:
+    """Counts, rejections, cost and NIS of each frame."""
+    if not table:
+        return frozenset()
+    stamps_ns = np.asarray(table["stamp_ns"], np.int64)
+    numbers = np.arange(len(stamps_ns))
+    plots = {
+        "backend/counts": _COUNTS,
+        "backend/rejected": _REJECTED,
+        "backend/cost": [name for name in table if name.startswith("cost_")],
+    }
+    shown = set()
+    for entity, columns in plots.items():
+        if not columns or any(name not in table for name in columns):
+            continue
+        values = np.column_stack([table[name] for name in columns])
+        rows = np.isfinite(values).any(axis=1)
+        series.send(entity, numbers[rows], stamps_ns[rows], values[rows])
+        shown.add(entity)
+    if all(name in table for name in _NIS):
+        distance, dof, expected = (table[name] for name in _NIS)
+        rows = dof > 0
+        if rows.any():
+            values, bounds = nis_rows(distance[rows], dof[rows], expected[rows])
+            series.send("consistency/nis", numbers[rows], stamps_ns[rows], values)
+            series.send("consistency/nis/bounds", numbers[rows], stamps_ns[rows], bounds)
+            shown.add("consistency/nis")
+    return frozenset(shown)
+
+
+def _show_inputs(
+    stream: RerunStream,
+    series: SeriesLog,
+    cameras: CameraViews,
+    details: SavedDetails,
+    outcome: OutcomeLog,
+    stamps_ns: IntArray,
+) -> frozenset[str]:
+    """Images or tracks, and IMU samples, of the frames (F,) of a run.
+
+    Raises:
+        DataError: if the recording has none of these frames.
+    """
+    assert details.recording is not None
+    known, shown = set(stamps_ns.tolist()), 0
+    for packet in details.recording.packets():
+        if packet.frame.stamp_ns not in known:
+            continue
+        shown += 1
+        number = int(outcome.frames(np.array([packet.frame.stamp_ns]))[0])
+        _show_packet(stream, series, cameras, number, packet, details.images)
+    series.flush()
+    if not shown:
+        name = details.recording.info().name
+        raise DataError(f"{name}: has none of the frames of the run; it is another recording")
+    return _IMU_PLOTS
+
+
+def _show_packet(
+    stream: RerunStream,
+    series: SeriesLog,
+    cameras: CameraViews,
+    number: int,
+    packet: Packet,
+    images: bool,
+) -> None:
+    """A frame of a recording, and the IMU samples before it."""
+    none = np.zeros(0, np.int64)
+    stream.at(number, packet.frame.stamp_ns)
+    if isinstance(packet.frame, CameraFrame) and images:
+        cameras.show_images(packet.frame)
+    elif isinstance(packet.frame, FeatureFrame):
+        cameras.show_tracks(packet.frame, none, none)
+    add_imu(series, number, packet)
+
+
 def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True) -> None:
     """Log a recording as it is: images or tracks, IMU, ground truth.
 
@@ -119,24 +219,15 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         images: whether images are sent.
     """
     series, rr = SeriesLog(stream), stream.rr
+    truth = sequence.groundtruth()
     cameras = CameraViews(stream, sequence.rig, "world/body")
-    cameras.mount(sequence.rig)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    none = np.zeros(0, np.int64)
     stamps_ns: list[int] = []
     for number, packet in enumerate(sequence.packets()):
         stamps_ns.append(packet.frame.stamp_ns)
-        stream.at(number, packet.frame.stamp_ns)
-        if isinstance(packet.frame, CameraFrame) and images:
-            cameras.show_images(packet.frame)
-        elif isinstance(packet.frame, FeatureFrame):
-            cameras.show_tracks(packet.frame, none, none)
-        for row in range(0, len(packet.imu), 2):
-            at = int(packet.imu.stamps_ns[row])
-            series.add("imu/gyro", number, at, packet.imu.gyro[row])
-            series.add("imu/accel", number, at, packet.imu.accel[row])
+        _show_packet(stream, series, cameras, number, packet, images)
     series.flush()
-    truth, eye = sequence.groundtruth(), None
+    eye, frustum_m = None, _FRUSTUM_M[1]
     if truth is not None and stamps_ns:
         near = (truth.stamps_ns >= stamps_ns[0]) & (truth.stamps_ns <= stamps_ns[-1])
         truth = truth.select(near)
@@ -144,94 +235,10 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         outcome.path("path/groundtruth", truth, TRUTH)
         columns = rr.Transform3D.columns(translation=truth.positions, quaternion=truth.quaternions)
         stream.send_columns("world/body", outcome.frames(truth.stamps_ns), truth.stamps_ns, columns)
+        if len(truth):
+            extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
+            frustum_m = float(np.clip(_FRUSTUM_PART * extent_m, *_FRUSTUM_M))
         eye = Eye.on(truth.positions, around=RIG_M)
-    plots = frozenset({"imu/gyro", "imu/accel"})
-    shown = Shown(cameras=len(sequence.rig.cameras), plots=plots, title="Recording")
+    cameras.mount(sequence.rig, frustum_m)
+    shown = Shown(cameras=len(sequence.rig.cameras), plots=_IMU_PLOTS, title="Recording")
     stream.arrange(odometry(shown, eye))
-
-
-@dataclass(frozen=True, eq=False)
-class ComparedRun:
-    """One of several runs that are shown together.
-
-    Attributes:
-        name: of the algorithm or the folder.
-        path: (S, 3) positions of all states in the world of the truth, or of the first run, m.
-        time_s: (N,) since the first frame, of the states that have a true pose.
-        errors: (N,) at these times, by the title of a plot.
-    """
-
-    name: str
-    path: FloatArray
-    time_s: FloatArray
-    errors: Mapping[str, FloatArray]
-
-
-def show_comparison(
-    stream: RerunStream, runs: Iterable[ComparedRun], true_path: FloatArray | None
-) -> None:
-    """Log several runs over one another: their paths, and their errors over time.
-
-    Args:
-        stream: where it goes.
-        runs: to compare.
-        true_path: (M, 3) in the same world, if there is one.
-    """
-    import rerun.blueprint as rrb
-
-    rr, titles, places = stream.rr, dict[str, str](), list[FloatArray]()
-    stream.log("paths", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    rows, largest = [], dict[str, float]()
-    for number, run in enumerate(runs):
-        colour, name = CYCLE[number % len(CYCLE)], rr.escape_entity_path_part(run.name)
-        places.append(run.path)
-        line = rr.LineStrips3D(
-            [run.path],
-            colors=colour,
-            radii=-1.2,
-            labels=[run.name],
-            show_labels=False,
-        )
-        stream.log(f"paths/{name}", line, static=True)
-        row = [run.name, CYCLE_NAMES[number % len(CYCLE)]]
-        for index, (title, values) in enumerate(run.errors.items()):
-            entity = titles.setdefault(title, f"errors/{index}")
-            style = rr.SeriesLines(colors=colour, names=run.name, widths=1.5)
-            stream.log(f"{entity}/{name}", style, static=True)
-            columns = rr.Scalars.columns(scalars=values)
-            times = rr.TimeColumn(_SINCE_START, duration=run.time_s)
-            stream.send_along(f"{entity}/{name}", times, columns)
-            row.append(f"{np.sqrt(np.mean(values**2)):.4g}")
-            largest[title] = max(largest.get(title, 0.0), float(np.max(values, initial=0.0)))
-        rows.append("| " + " | ".join(row) + " |")
-    if true_path is not None:
-        line = rr.LineStrips3D(
-            [true_path], colors=TRUTH, radii=-0.8, labels=["ground truth"], show_labels=False
-        )
-        stream.log("paths/ground_truth", line, static=True)
-        places.append(true_path)
-    head = "| RMSE | " + " | ".join(["colour", *titles]) + " |\n" + "|---" * (2 + len(titles))
-    head += "|\n"
-    grey = "" if true_path is None else "\n\nThin, light grey: ground truth."
-    text = "# Comparison\n\n" + head + "\n".join(rows) + grey
-    stream.log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
-    plots: list[Any] = [
-        rrb.TimeSeriesView(
-            name=title,
-            origin=f"/{entity}",
-            plot_legend=rrb.Corner2D.LeftTop,
-            axis_x=whole_axis(),
-            axis_y=rrb.ScalarAxis(range=with_ticks(0.0, largest[title])),
-        )
-        for title, entity in titles.items()
-    ]
-    plots.append(rrb.TextDocumentView(name="Summary", origin="/summary"))
-    eye = Eye.on(np.concatenate([*places, np.zeros((0, 3))]), aspect=SQUARE)
-    stream.arrange(
-        whole(
-            rrb.Horizontal(
-                space("Paths", "/paths", eye=eye), rrb.Vertical(*plots), column_shares=[60, 40]
-            ),
-            timeline=_SINCE_START if titles else None,
-        )
-    )

@@ -23,6 +23,18 @@ from PIL import Image  # a requirement of matplotlib
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, BLACK, GREY = "#56B4E9", "#E69F00", "#000000", "#7F7F7F"
 
+COLOUR_NAMES = {
+    BLUE: "blue",
+    VERMILION: "red",
+    GREEN: "green",
+    PURPLE: "purple",
+    SKY: "light blue",
+    ORANGE: "orange",
+    BLACK: "black",
+    GREY: "grey",
+}
+"""What they are called in text."""
+
 _PALETTE = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 
 _KNOWN = {

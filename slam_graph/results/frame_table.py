@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the back end did in every frame: features, poses, cost, NIS; written as `frames.csv`."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import Estimator
+from slam_graph.sensors import FeatureFrame
+
+_MAX_COSTS = 8
+"""Of more Gauss-Newton steps in one frame, the last ones are left out."""
+
+COUNTS = ("tracked", "tracked_other_cameras", "estimated", "poses_in_state")
+REJECTED = ("rejected_ransac", "rejected_gate", "rejected_stereo")
+INNOVATION = ("nis", "nis_dof", "nis_expected")
+COSTS = ("cost_before", *(f"cost_after_{k}" for k in range(1, _MAX_COSTS)))
+NEES = ("nees_position", "nees_orientation")
+KEYFRAME = "keyframe"
+_COLUMNS = (*COUNTS, "features_in_state", *REJECTED, *INNOVATION, *COSTS)
+_WHOLE = (*COUNTS, "features_in_state", *REJECTED, "nis_dof")
+_OF_STATES = [_COLUMNS.index(name) for name in (*INNOVATION, *COSTS)]
+
+
+class FrameTable:
+    """A growing table with a row for each frame."""
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._cells = array("d")
+        self._row_of: dict[int, int] = {}
+        self._keyframe_rows: set[int] = set()
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def append(
+        self,
+        features: FeatureFrame,
+        estimated: int,
+        estimator: Estimator,
+        counts: Mapping[str, float],
+    ) -> None:
+        """Add a frame.
+
+        Args:
+            features: of the frame.
+            estimated: number of the features whose positions are estimated.
+            estimator: after this frame.
+            counts: of the front end, by name.
+        """
+        seen = [len(camera) for camera in features.cameras]
+        window, found = estimator.window, estimator.innovations
+        past, held = (0, 0) if window is None else (len(window.past), len(window.state_features))
+        tested = bool(found.passed_dof)
+        costs = [*estimator.costs[:_MAX_COSTS]]
+        row: list[float] = [seen[0], sum(seen[1:]), estimated, past, held]
+        row += [counts.get(REJECTED[0], 0.0), found.rejected, counts.get(REJECTED[2], 0.0)]
+        row += [found.passed_distance, found.passed_dof, found.expected] if tested else 3 * [np.nan]
+        self._cells.extend([*row, *costs, *(_MAX_COSTS - len(costs)) * [np.nan]])
+        if window is not None:
+            self._row_of[window.frame] = len(self)
+            self._keyframe_rows |= {self._row_of[n] for n in window.keyframes if n in self._row_of}
+        self._stamps_ns.append(features.stamp_ns)
+
+    def supersede(self) -> None:
+        """Forget what is said of states; counts of frames stay."""
+        if len(self):
+            self._table()[:, _OF_STATES] = np.nan
+        self._row_of, self._keyframe_rows = {}, set()
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """(F,) times of the frames."""
+        return np.array(self._stamps_ns, dtype=np.int64)
+
+    @property
+    def keyframes_ns(self) -> IntArray:
+        """(K,) times of the frames that the algorithm has made keyframes."""
+        return self.stamps_ns[sorted(self._keyframe_rows)]
+
+    def csv_lines(
+        self, keyframes_ns: IntArray, nees: tuple[IntArray, FloatArray] | None
+    ) -> Iterator[str]:
+        """The table as CSV, empty where something is not known.
+
+        Args:
+            keyframes_ns: (K,) times of keyframes.
+            nees: times (N,) and NEES (N, 2) of position and orientation, if there is a truth.
+        """
+        stamps_ns, table = self.stamps_ns, self._table()
+        errors = np.full((len(self), 2), np.nan)
+        if nees is not None:
+            _, rows, found = np.intersect1d(stamps_ns, nees[0], return_indices=True)
+            errors[rows] = nees[1][found]
+        always = _COLUMNS.index(COSTS[0])
+        last = max([always, *np.flatnonzero(np.isfinite(table).any(axis=0)).tolist()])
+        titles = _COLUMNS[: last + 1]
+        yield ",".join(["stamp_ns", KEYFRAME, *titles, *NEES]) + "\n"
+        marks = np.isin(stamps_ns, keyframes_ns)
+        whole = [name in _WHOLE for name in titles]
+        for stamp_ns, mark, row, error in zip(stamps_ns, marks, table, errors, strict=True):
+            cells = [_cell(v, w) for v, w in zip(row[: last + 1].tolist(), whole, strict=True)]
+            cells += [_cell(value, False) for value in error.tolist()]
+            yield ",".join([str(stamp_ns), str(int(mark)), *cells]) + "\n"
+
+    def _table(self) -> FloatArray:
+        """(F, columns) a view of all cells."""
+        return np.frombuffer(self._cells, np.float64).reshape(-1, len(_COLUMNS))
+
+
+def _cell(value: float, whole: bool) -> str:
+    if math.isnan(value):
+        return ""
+    return str(int(value)) if whole else f"{value:.6g}"
