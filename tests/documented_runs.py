@@ -37,6 +37,7 @@ import slam_graph as sg
 from slam_graph.backend import POSE_SELECTIONS
 from slam_graph.cli.main import app
 from slam_graph.datasets import dataset_registry
+from slam_graph.datasets.formats import eqvio
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.errors import SlamGraphError
 from slam_graph.experiment import executors, tasks
@@ -189,7 +190,8 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
 
     empty = bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1])
     monkeypatch.setattr(Picture, "png", lambda picture: empty)
-    monkeypatch.setattr(dataset_registry, "wheel_tracks", lambda: demo)
+    for module in (dataset_registry, eqvio):
+        monkeypatch.setattr(module, "wheel_tracks", lambda: demo)
     monkeypatch.setattr(executors, "_start", lambda text: text)
     monkeypatch.setattr(executors, "_wait", do)
     monkeypatch.setattr(RerunStream, "_spawn", to_memory)
