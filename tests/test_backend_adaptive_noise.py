@@ -101,7 +101,7 @@ def test_vibration_raises_the_noise_at_once_and_motion_does_not(rate_hz: float) 
 def test_errors_of_scale_and_alignment_change_the_biases_as_the_motion_changes(
     adaptive: bool,
 ) -> None:
-    """A sensor measures (I + M) ω; over an interval M Δω has the covariance of the random walk."""
+    """A sensor measures f + M f and ω + M |ω| ω; their changes have the covariance of the walks."""
     rng = np.random.default_rng(3)
     stamps_ns = np.arange(0, 60_000_000, 5_000_000)
     before, samples = (
@@ -115,8 +115,9 @@ def test_errors_of_scale_and_alignment_change_the_biases_as_the_motion_changes(
     imu = ImuNoise(gyro_random_walk=1e-9, accel_random_walk=1e-9)
     config = NoiseConfig.model_validate({"adaptive": {"enabled": adaptive}})
     params = DynamicsNoise(imu, config).params(change=MotionChange.between(before, samples))
+    squares = [np.linalg.norm(x.gyro[0]) * x.gyro[0] for x in (before, samples)]
     for covariance, sigma, change in (
-        (params.getBiasOmegaCovariance(), GYRO_SCALE_SIGMA, samples.gyro[0] - before.gyro[0]),
+        (params.getBiasOmegaCovariance(), GYRO_SCALE_SIGMA, squares[1] - squares[0]),
         (params.getBiasAccCovariance(), ACCEL_SCALE_SIGMA, samples.accel[0] - before.accel[0]),
     ):
         drawn = np.cov((rng.normal(0.0, sigma, (20_000, 3, 3)) @ change).T)

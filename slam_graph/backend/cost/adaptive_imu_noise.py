@@ -17,8 +17,9 @@ bias at rest. What was learned of a random walk is kept for longer, as it shows 
 
 All of this takes seconds, in which a start has gone wrong. Vibration shows at once: samples are
 then many times noisier than the calibration says. And what a calibration leaves of the errors of
-scale and alignment adds to the biases in proportion to angular rate and specific force. So the
-biases change as these do, and their random walks are larger where the motion changes.
+scale and alignment adds to the biases, in proportion to the specific force, and to the square of
+the angular rate: that of a gyroscope shows in fast rotation only. So the biases change as the motion
+does, and their random walks are larger there.
 """
 
 from __future__ import annotations
@@ -56,8 +57,9 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 """Standard deviation of the third difference of white noise of 1."""
 _NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a normal variable, in units of its standard deviation."""
-GYRO_SCALE_SIGMA, ACCEL_SCALE_SIGMA = 2.5e-4, 1e-3
-"""Standard deviations of scale and alignment after calibration, relative."""
+GYRO_SCALE_SIGMA, ACCEL_SCALE_SIGMA = 1.25e-4, 1e-3
+"""Standard deviations of scale and alignment after calibration, relative; that of the gyroscope per
+rad/s."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0
@@ -72,7 +74,8 @@ class MotionChange:
     """How the motion changes from one frame interval to the next, as if it were a random walk.
 
     Attributes:
-        rate: change of the mean angular rate over the square root of the time, rad/s/√s.
+        rate: change of the mean angular rate times its magnitude over the square root of the time,
+            rad²/s²/√s.
         force: that of the mean specific force, m/s²/√s.
     """
 
@@ -85,7 +88,8 @@ class MotionChange:
         if before is None:
             return MotionChange()
         root_s = math.sqrt(float(samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9)
-        rate = np.linalg.norm(samples.gyro.mean(axis=0) - before.gyro.mean(axis=0))
+        earlier, later = before.gyro.mean(axis=0), samples.gyro.mean(axis=0)
+        rate = np.linalg.norm(np.linalg.norm(later) * later - np.linalg.norm(earlier) * earlier)
         force = np.linalg.norm(samples.accel.mean(axis=0) - before.accel.mean(axis=0))
         return MotionChange(float(rate) / root_s, float(force) / root_s)
 
