@@ -18,8 +18,8 @@ bias at rest. What was learned of a random walk is kept for longer, as it shows 
 All of this takes seconds, in which a start has gone wrong. Vibration shows at once: samples are
 then many times noisier than the calibration says. And what a calibration leaves of the errors of
 scale and alignment adds to the biases, in proportion to the specific force, and to the square of
-the angular rate: that of a gyroscope shows in fast rotation only. So the biases change as the motion
-does, and their random walks are larger there.
+the angular rate: that of a gyroscope shows in fast rotation only. So the biases change as the
+motion does, and their random walks are larger there.
 """
 
 from __future__ import annotations
