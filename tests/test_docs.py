@@ -4,14 +4,11 @@
 
 import importlib.util
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
-from limits import HANG_S
 from test_questions import CODE, file_of, names
 
 from slam_graph.config import algorithm_names, load_config
@@ -196,22 +193,3 @@ def test_the_recipe_for_phones_makes_one_table(tmp_path: Path, monkeypatch: Any)
     Path("phone.yaml").write_text(chain, encoding="utf-8")
     (camera,) = read_kalibr("phone.yaml").cameras
     assert not camera.rotation_known
-
-
-def test_the_pose_selection_of_the_page_on_extending_runs() -> None:
-    """In a process of its own, as a name that is registered stays."""
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```python\n(.+?)^```", page, re.MULTILINE | re.DOTALL)
-    (override,) = re.findall(r'overrides=\["(algorithm\.cost\.past_poses=\w+)"\]', page)
-    use = f"""
-import slam_graph as sg
-config = sg.load_config(overrides=["{override}", "duration_s=8"])
-result = sg.run(sg.open_dataset("demo"), config)
-result.check()
-print(len(result.history))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", block + use], capture_output=True, text=True, timeout=HANG_S
-    )
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split()[-1]) > 100

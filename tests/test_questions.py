@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
+import pytest
 from limits import HANG_S
 from pydantic import BaseModel
 
@@ -75,10 +76,12 @@ def test_settings_exist() -> None:
     assert not sorted(setting for setting in settings if not exists(setting))
 
 
-def test_the_pose_selection_of_the_page_runs() -> None:
+@pytest.mark.parametrize("page", ["questions.md", "extending.md"])
+def test_the_pose_selection_of_the_page_runs(page: str) -> None:
     """In a process of its own, as a name that is registered stays."""
-    (block,) = re.findall(r"^```python\n(.+?)^```", TEXT, re.MULTILINE | re.DOTALL)
-    (override,) = re.findall(r'overrides=\["(algorithm\.cost\.past_poses=\w+)"\]', TEXT)
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.+?)^```", text, re.MULTILINE | re.DOTALL)
+    (override,) = re.findall(r'overrides=\["(algorithm\.cost\.past_poses=\w+)"\]', text)
     use = f"""
 import slam_graph as sg
 config = sg.load_config(overrides=["{override}", "duration_s=8"])
