@@ -374,9 +374,11 @@ def test_a_list_is_run_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monke
     ],
 )
 def test_faults_in_a_list(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "list.yaml").write_text(text)
+    folder = tmp_path / "5"  # a folder that is called as the value at fault hides nothing
+    folder.mkdir()
+    (folder / "list.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        tasks(tmp_path / "list.yaml", tmp_path)
+        tasks(folder / "list.yaml", tmp_path)
 
 
 def test_what_is_searched(flights: Path, tmp_path: Path) -> None:

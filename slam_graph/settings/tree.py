@@ -197,11 +197,12 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
     if fault["type"] == "unused":
         return f"{where}: '{dotted}' {fault['msg']}"
     message = str(fault["msg"]).removeprefix("Value error, ")
-    message = f"{where}: {dotted}: {message[:1].lower()}{message[1:]}"
-    if isinstance(fault["input"], dict | BaseModel):  # a whole table says nothing
-        return message
+    message = f"{message[:1].lower()}{message[1:]}"
     got = repr(fault["input"])
-    return message if got in message else f"{message}, got {got}"
+    # A whole table says nothing; and what the message says already is not said again.
+    if not isinstance(fault["input"], dict | BaseModel) and got not in message:
+        message = f"{message}, got {got}"
+    return f"{where}: {dotted}: {message}"
 
 
 def _table(model: type[BaseModel], path: KeyPath) -> type[Settings] | None:
