@@ -39,6 +39,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.kernels.null_space import triangularize_features
 
 _REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
@@ -295,20 +296,5 @@ def eliminate_points(
     beside = np.zeros((J, M, 2, others.shape[2]))
     beside[obs.feature, slots] = others
     A, B = stacked.reshape(J, 2 * M, 3), beside.reshape(J, 2 * M, -1)
-    _householder(A, B)
+    triangularize_features(A, B)
     return np.triu(A[:, :3]), B
-
-
-def _householder(A: FloatArray, B: FloatArray) -> None:
-    """Triangularise A (J, m, 3) in place and apply the same reflections to B (J, m, n)."""
-    for column in range(3):
-        x = A[:, column:, column]
-        norm = np.linalg.norm(x, axis=1)
-        v = x.copy()
-        v[:, 0] += np.where(x[:, 0] >= 0, norm, -norm)
-        scale = np.einsum("ji,ji->j", v, v)
-        beta = 2.0 / np.where(scale > 0, scale, np.inf)
-        for target in (A, B):
-            part = target[:, column:]
-            projection = (v[:, None, :] @ part) * beta[:, None, None]
-            part -= v[:, :, None] * projection
