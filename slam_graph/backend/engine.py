@@ -70,7 +70,9 @@ class SquareRootEngine:
         policy, calibration = self._policies.gauss_newton, self._context.calibration
         again = calibration.moved_far if calibration.keys else None
         try:
-            return constructed, minimize(constructed.cost, policy, constructed.linear, again)
+            return constructed, minimize(
+                constructed.cost, policy, constructed.linear, again, constructed.predicted
+            )
         except np.linalg.LinAlgError:
             warning = "the features of one frame are not used, and go on waiting"
             self._context.diagnostics.warn("features_degenerate", warning)

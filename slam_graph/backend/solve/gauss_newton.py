@@ -56,6 +56,7 @@ def minimize(
     policy: GaussNewtonPolicy,
     linear: Linearization | None = None,
     again: Again | None = None,
+    predicted: SquareRootInformation | None = None,
 ) -> Minimum:
     """Take steps on a cost.
 
@@ -64,6 +65,7 @@ def minimize(
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
         again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
+        predicted: what is known without images at the current estimates, where that is known.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
@@ -71,7 +73,7 @@ def minimize(
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
     layout, before = cost.layout(), cost.value()
-    posterior, delta = _step(cost, linear or cost.linearize(summed=True), layout)
+    posterior, delta = _step(cost, linear or cost.linearize(summed=True), layout, predicted)
     minimum = Minimum(posterior, (before, cost.value()))
     while _another(policy, minimum, delta, again):
         undo = cost.snapshot()
@@ -96,10 +98,13 @@ def _another(
 
 
 def _step(
-    cost: Cost, linear: Linearization, layout: Layout
+    cost: Cost,
+    linear: Linearization,
+    layout: Layout,
+    predicted: SquareRootInformation | None = None,
 ) -> tuple[SquareRootInformation, FloatArray]:
     """Move a cost by one step: the posterior, at the new estimates, and the step (n,)."""
-    posterior = _system(cost, linear, layout)
+    posterior = _system(cost, linear, layout, predicted)
     delta = posterior.solution()
     cost.apply(delta, linear, layout)
     return posterior.shifted(delta), delta
@@ -110,10 +115,19 @@ def linearized(cost: Cost) -> SquareRootInformation:
     return _system(cost, cost.linearize(summed=True), cost.layout())
 
 
-def _system(cost: Cost, linear: Linearization, layout: Layout) -> SquareRootInformation:
+def _system(
+    cost: Cost,
+    linear: Linearization,
+    layout: Layout,
+    predicted: SquareRootInformation | None = None,
+) -> SquareRootInformation:
     """The linearised cost as a Gaussian over an increment of the estimates."""
-    rows = np.concatenate([cost.factor_rows(layout), cost.rows(linear, layout)])
-    return cost.prior_at_estimate().updated(rows)
+    rows = cost.rows(linear, layout)
+    if predicted is None:
+        rows = np.concatenate([cost.factor_rows(layout), rows])
+        return cost.prior_at_estimate().updated(rows)
+    new = {key: dim for key, dim in layout.dims.items() if key not in predicted.layout}
+    return predicted.extended(new).updated(rows)
 
 
 def _levenberg_marquardt(
