@@ -110,14 +110,14 @@ def in_terminal(*arguments: str) -> str:
 def test_progress_of_an_adjustment_moves_and_never_ends_early(fuses: bool) -> None:
     told: list[int] = []
     progress = SegmentProgress(
-        lambda done, *_: told.append(done), 100, 100, 200, steps=0, passes=5, fuses=fuses
+        lambda done, *_: told.append(done), 100, 100, 200, steps=0, fuses=fuses
     )
     steps = 0
     for rounds in range(4 if fuses else 0):
         for _ in range(6):
             steps += 1
             progress.fusing(steps, rounds)
-    for passes in range(5):
+    for passes in range(3):
         for _ in range(6):
             steps += 1
             progress.solving(steps, passes)

@@ -14,7 +14,12 @@ from benchmarks.policy_product import FLIGHT
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, joint_covariances, solved
+from slam_graph.backend.smoothing.bayes_tree import (
+    Clique,
+    cliques_of,
+    joint_root_covariances,
+    solved,
+)
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_problem import (
@@ -32,6 +37,7 @@ from slam_graph.backend.smoothing.state_covariances import (
     gauge_motion,
     keyframe_covariances,
 )
+from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import dim, stacked_poses
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import mean_bounds
@@ -116,10 +122,12 @@ def test_covariances_of_cliques_are_those_of_the_dense_inverse(problem: Problem)
     graph, values, dense = problem
     ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
     wanted = {key for key in values.keys() if dim(key) != 3 or key >= V(0)}  # noqa: SIM118
-    cliques = cliques_of(graph.linearize(values), ordering, wanted)
+    cliques = cliques_of(graph.linearize(values).eliminateMultifrontal(ordering), wanted)
     covered = set()
-    for clique, P in joint_covariances(cliques):
-        np.testing.assert_allclose(P, dense.joint(list(clique.columns)), rtol=1e-6, atol=1e-9)
+    for clique, U in joint_root_covariances(cliques):
+        assert not np.tril(U, -1).any()
+        expected = dense.joint(list(clique.layout.dims))
+        np.testing.assert_allclose(U @ U.T, expected, rtol=1e-6, atol=1e-9)
         covered |= set(clique.frontals)
     assert covered >= wanted
     right = {X(k): np.random.default_rng(k).normal(size=(6, 2)) for k in range(KEYFRAMES)}
@@ -134,11 +142,11 @@ def test_a_difference_that_is_known_far_better_than_its_parts_is_not_lost() -> N
     rows = np.array([[1e7, -1e7, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     lever = np.zeros((3, 3))
     lever[0, :2] = -1e7, 1e7
-    whole = slice(0, 3)
-    parent = Clique({V(0): whole}, [V(0)], np.linalg.qr(rows)[1], np.zeros((3, 0)), -1, np.r_[:0])
-    child = Clique({V(1): whole, V(0): slice(3, 6)}, [V(1)], np.eye(3), lever, 0, np.r_[whole])
-    _, (_, P) = joint_covariances([parent, child])
-    np.testing.assert_allclose(P[whole, whole], np.diag([2.0, 1.0, 1.0]), atol=1e-6)
+    above, both = Layout({V(0): 3}), Layout({V(1): 3, V(0): 3})
+    parent = Clique(above, [V(0)], np.linalg.qr(rows)[1], np.zeros((3, 0)), -1, np.r_[:0])
+    child = Clique(both, [V(1)], np.eye(3), lever, 0, np.arange(3))
+    _, (_, U) = joint_root_covariances([parent, child])
+    np.testing.assert_allclose((U @ U.T)[:3, :3], np.diag([2.0, 1.0, 1.0]), atol=1e-6)
 
 
 def test_covariances_at_keyframes_and_after_alignment_are_those_of_the_dense_inverse(
@@ -147,7 +155,9 @@ def test_covariances_at_keyframes_and_after_alignment_are_those_of_the_dense_inv
     graph, values, dense = problem
     ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
     weights = np.full(KEYFRAMES, 1.0 / KEYFRAMES)
-    known = keyframe_covariances(graph, values, ordering, weights)
+    tree = graph.linearize(values).eliminateMultifrontal(ordering)
+    wanted = {key(k) for key in (X, V, B) for k in range(KEYFRAMES)}
+    known = keyframe_covariances(cliques_of(tree, wanted), values, weights)
     stamps = np.arange(KEYFRAMES) * 10**8
     frames = FrameInterpolation.of(stamps, np.arange(KEYFRAMES), np.zeros((KEYFRAMES - 1, 2)))
     rotations, positions = stacked_poses(values, range(KEYFRAMES))

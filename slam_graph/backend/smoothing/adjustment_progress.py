@@ -3,9 +3,9 @@
 """How far the bundle adjustment of a recording is, as a number of keyframes.
 
 Nobody knows how many steps a minimisation will take. The number of minimisations is known better:
-rounds of fusion, then one without outliers, the last one, and those that learn the noise of the
-IMU. Each has the same share, of which every step takes a fixed part of what is left. So the
-progress never stands still, never goes back, and reaches the end only at the end.
+rounds of fusion, then one with outliers and one without. Each has the same share, as the
+covariances at the end have, and every step takes a fixed part of what is left of it. So the
+progress never goes back, and reaches the end only at the end.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ Report = Callable[[int, int, int], None]
 
 _FUSION = 0.35
 """Part of the time that fusion takes; measured on recordings of 30 s."""
+_PASSES = 3
+"""Minimisations after fusion, and the covariances, which take about as long as one of them."""
 _ROUND, _STEP = 0.5, 0.4
 """Part of what is left that a round of fusion, and a step of a minimisation, is taken to do."""
 
@@ -30,7 +32,6 @@ class SegmentProgress:
         own: keyframes that this segment adds to them.
         keyframes: number of all keyframes.
         steps: that were taken before this segment.
-        passes: minimisations of the segment without those of fusion.
         fuses: whether fusion comes first.
     """
 
@@ -42,11 +43,10 @@ class SegmentProgress:
         keyframes: int,
         *,
         steps: int,
-        passes: int,
         fuses: bool,
     ) -> None:
         self._report, self._keyframes, self._steps = report, keyframes, steps
-        self._done, self._own, self._passes = done, own, passes
+        self._done, self._own = done, own
         self._fusion = _FUSION if fuses else 0.0
         self._part = 0.0
         self._pass = 0
@@ -69,7 +69,7 @@ class SegmentProgress:
             steps: of this segment so far.
             passes: minimisations after fusion that are complete.
         """
-        part = min((passes + self._within(steps, passes)) / self._passes, 1.0)
+        part = min((passes + self._within(steps, passes)) / _PASSES, 1.0)
         self._tell(steps, self._fusion + (1.0 - self._fusion) * part)
 
     def _within(self, steps: int, number: int) -> float:

@@ -25,7 +25,6 @@ from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProg
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_problem import (
-    NOISE_ROUNDS,
     AdjustedSegment,
     BundleAdjustment,
     SegmentStart,
@@ -261,8 +260,7 @@ def _progress(
         steps: before the segment.
         config: settings, which decide what is done.
     """
-    passes = 2 + (NOISE_ROUNDS if config.learn_imu_noise else 0)
-    return SegmentProgress(report, *extent, steps=steps, passes=passes, fuses=config.fuse_features)
+    return SegmentProgress(report, *extent, steps=steps, fuses=config.fuse_features)
 
 
 def _stamp_ns(state: NavState) -> int:

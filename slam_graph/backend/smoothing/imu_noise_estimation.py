@@ -8,12 +8,17 @@ states. So for the residuals of one kind, all of whose variances are wrong by th
 
     ratio = Σ rᵀ Q⁻¹ r / Σ (dim r - tr Q⁻¹ A P Aᵀ),
 
-whose denominator, the redundancy, is how many of the residuals the images can contradict.
+whose denominator, the redundancy, is how many of the residuals the images can contradict. Its trace
+is estimated by random signs (Hutchinson 1990), which takes solutions of the linear problem in place
+of all covariances: with W_i the rows of Q^-½ A of the residual i and signs z_i, the mean of wᵀ P w
+of w = Σ W_iᵀ z_i is Σ tr W_i P W_iᵀ. The error of the redundancy is at most √(2 redundancy / 16).
 """
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,14 +27,22 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.adaptive_imu_noise import MAX_FACTOR
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import dims_of
 from slam_graph.sensors import ImuNoise
 
 _ROWS = (slice(0, 3), slice(6, 9), slice(9, 12), slice(12, 15))
 """Rows of a residual that show each kind of noise: rotation, velocity, both biases."""
 _SAME_FACTOR = 1.2
 """Noise densities whose ratio is below this are taken for the same."""
+_PROBES = 16
+"""Vectors of random signs for each kind of noise."""
 _PRIOR_REDUNDANCY = 10.0
 """Redundancy that the assumed noise counts for: what the images cannot tell stays as it is."""
+
+TimesCovariance = Callable[[Mapping[int, FloatArray]], Mapping[int, FloatArray]]
+"""The product of a covariance with the (n, m) parts of a matrix by variable; where there is no
+part it is zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,30 +99,44 @@ class ImuNoiseFactors:
 
 
 def variance_ratios(
-    factors: list[gtsam.CombinedImuFactor], values: gtsam.Values, pairs: list[FloatArray]
+    factors: list[gtsam.CombinedImuFactor], values: gtsam.Values, times_covariance: TimesCovariance
 ) -> FloatArray:
     """By how much variances of the IMU are larger than assumed.
 
     Args:
         factors: between neighbouring keyframes, at whose residuals to look.
         values: the minimum.
-        pairs: (30, 30) joint covariance of the states of each of these factors: pose, velocity and
-            bias of the first, then of the second, in the tangents of GTSAM.
+        times_covariance: the product of the covariance of all states with what it is given.
 
     Returns:
         (4,) of white noise of gyroscope and accelerometer, random walk of accelerometer and
         gyroscope.
     """
-    squares, redundancy = np.zeros(len(_ROWS)), np.zeros(len(_ROWS))
-    for factor, P in zip(factors, pairs, strict=True):
+    rng = np.random.default_rng(0)
+    squares, probes = np.zeros(len(_ROWS)), len(_ROWS) * _PROBES
+    right: dict[int, FloatArray] = defaultdict(lambda: np.zeros((1, probes)))
+    for factor in factors:
         r, A, Q = _residual(factor, values)
-        predicted = A @ P @ A.T
+        w = np.empty((A.shape[1], probes))
         for kind, rows in enumerate(_ROWS):
-            inverse = np.linalg.inv(Q[rows, rows])
-            squares[kind] += r[rows] @ inverse @ r[rows]
-            redundancy[kind] += 3.0 - float(np.sum(inverse * predicted[rows, rows]))
-    redundancy = np.maximum(redundancy, 0.0) + _PRIOR_REDUNDANCY
+            white = np.linalg.inv(np.linalg.cholesky(Q[rows, rows]))
+            squares[kind] += float(np.sum((white @ r[rows]) ** 2))
+            signs = rng.choice([-1.0, 1.0], (3, _PROBES))
+            w[:, kind * _PROBES : (kind + 1) * _PROBES] = (white @ A[rows]).T @ signs
+        own = Layout(dims_of(_in_order(factor)))
+        for key, columns in own.columns.items():
+            right[key] = right[key] + w[columns]
+    found = times_covariance(right) if right else {}
+    products = sum((np.sum(w * found[key], axis=0) for key, w in right.items()), np.zeros(probes))
+    predicted = products.reshape(len(_ROWS), _PROBES).mean(axis=1)
+    redundancy = np.maximum(3.0 * len(factors) - predicted, 0.0) + _PRIOR_REDUNDANCY
     return np.asarray((squares + _PRIOR_REDUNDANCY) / redundancy)
+
+
+def _in_order(factor: gtsam.CombinedImuFactor) -> list[int]:
+    """Keys of pose, velocity and bias of the first state of a factor, then of the second."""
+    x, v, y, w, a, b = factor.keys()
+    return [x, v, a, y, w, b]
 
 
 def _residual(
@@ -117,9 +144,8 @@ def _residual(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residual (15,), Jacobian (15, 30) by pose, velocity, bias of both states, and covariance."""
     linear = gtsam.JacobianFactor(factor.linearize(values))
-    x, v, y, w, a, b = factor.keys()
     order = gtsam.Ordering()
-    for key in (x, v, a, y, w, b):
+    for key in _in_order(factor):
         order.push_back(key)
     whitened, d = gtsam.JacobianFactor(_alone(linear), order).jacobian()
     model: Any = factor.noiseModel()

@@ -33,7 +33,11 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
-from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors, variance_ratios
+from slam_graph.backend.smoothing.imu_noise_estimation import (
+    ImuNoiseFactors,
+    TimesCovariance,
+    variance_ratios,
+)
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.sensors import Rig
@@ -208,24 +212,27 @@ class RecordingFactors:
         ]
 
     def learn_noise(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, pairs: FloatArray
+        self,
+        inertial: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times_covariance: TimesCovariance,
     ) -> bool:
         """Estimate the noise of the IMU from the residuals at the minimum.
 
         Intervals of standstill say nothing: the zero-velocity factors are looser than it is.
 
         Args:
-            graph: the cost, with the factors of `inertial`.
+            inertial: the factors of `inertial` in the cost.
             values: the minimum.
-            pairs: (K-1, 30, 30) joint covariances of neighbouring keyframes.
+            times_covariance: the product of the covariance of all states with what it is given.
 
         Returns:
             Whether it is another one than assumed; otherwise what was assumed stays.
         """
-        found = [graph.at(i) for i in range(graph.size())]
+        found = [inertial.at(i) for i in range(inertial.size())]
         factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
         moving = [k for k in range(len(factors)) if not self._in_gap(k) and not self._still(k)]
-        ratios = variance_ratios([factors[k] for k in moving], values, [pairs[k] for k in moving])
+        ratios = variance_ratios([factors[k] for k in moving], values, times_covariance)
         noise = self.noise.times(ratios)
         learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
         if noise.near(self.noise, learned):

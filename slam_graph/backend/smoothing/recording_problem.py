@@ -25,6 +25,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
+from slam_graph.backend.smoothing.learned_imu_noise import SolvedCost, cliques_at_minimum
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
     averaged,
@@ -62,8 +63,6 @@ _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _MAX_LAMBDA = 1e5
 """Steps end when the damping of Levenberg-Marquardt exceeds this."""
-NOISE_ROUNDS = 3
-"""The noise of the IMU is estimated this many times at most, each at the minimum with the last."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -185,36 +184,12 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
         )
         states, aligned = self._states(), None
-        known = self._with_learned_noise(obs, variances)
+        known = self._covariances()
         if known is not None:
             densities = self._factors.densities()
             frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
             states, aligned = with_covariances(states, known, frames)
         return AdjustedSegment(states, figures, aligned)
-
-    def _with_learned_noise(
-        self, obs: Observations, variances: FloatArray
-    ) -> KeyframeCovariances | None:
-        """Covariances at the minimum under the noise of the IMU that residuals show.
-
-        The states that are reported are those under the noise that the causal run learned.
-        """
-        known = self._covariances()
-        for _ in range(NOISE_ROUNDS if self._config.learn_imu_noise else 0):
-            assumed = self._factors.noise
-            if known is None or not self._factors.learn_noise(
-                self._solved[0], self._values, known.pairs
-            ):
-                break
-            points = stacked_points(self._values, obs.ids.tolist())
-            try:
-                self._minimize(obs, points, variances, self._config.tolerance)
-            except (EstimationError, RuntimeError) as error:
-                logger.info("the noise of the IMU is not learned: %s", error)
-                self._factors.noise = assumed
-                break
-            known = self._covariances()
-        return known
 
     def solve_loosely(self) -> list[NavState]:
         """The states of all frames near the minimum, with outliers, to a loose tolerance.
@@ -333,7 +308,7 @@ class BundleAdjustment:
             raise EstimationError("the cost of the bundle adjustment is not finite")
         self._passes += 1
         self._values = optimizer.values()
-        self._solved = graph, ordering
+        self._solved = SolvedCost(graph, inertial, projections, ordering)
         return cost, inertial.error(self._values)
 
     def _cost_before(self, obs: Observations) -> float:
@@ -349,17 +324,19 @@ class BundleAdjustment:
         values = gtsam.Values(self._given)
         for j, point, known in zip(obs.ids.tolist(), points, good, strict=True):
             values.insert(L(j), point if known else self._values.atPoint3(L(j)))
-        return float(self._solved[0].error(values))
+        return float(self._solved.graph.error(values))
 
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""
-        segment, (graph, ordering) = self._segment, self._solved
-        graph = gtsam.NonlinearFactorGraph(graph)
-        graph.push_back(self._factors.gauge(self._values))
+        segment = self._segment
+        self._report(self.iterations, self._passes)
         nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
-            return keyframe_covariances(graph, self._values, ordering, weights)
+            cliques = cliques_at_minimum(
+                self._solved, self._factors, self._values, self._config.learn_imu_noise
+            )
+            return keyframe_covariances(cliques, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None

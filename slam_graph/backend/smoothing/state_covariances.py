@@ -29,7 +29,11 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, joint_covariances, solved
+from slam_graph.backend.smoothing.bayes_tree import (
+    Clique,
+    joint_root_covariances,
+    solved,
+)
 from slam_graph.backend.solve.state import stacked_poses
 from slam_graph.geometry import NavState
 
@@ -99,25 +103,17 @@ class FrameInterpolation:
 
 
 def keyframe_covariances(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    ordering: gtsam.Ordering,
-    weights: FloatArray,
+    cliques: list[Clique], values: gtsam.Values, weights: FloatArray
 ) -> KeyframeCovariances:
     """Covariances of the keyframes 0 to K-1.
 
     Args:
-        graph: the cost; its gauge is what the covariances are relative to.
+        cliques: of the linearised cost; its gauge is what the covariances are relative to.
         values: the minimum.
-        ordering: of the elimination.
         weights: (K,) of the keyframes in an alignment; their sum is one.
-
-    Raises:
-        RuntimeError: if the cost does not determine all variables.
     """
     count = len(weights)
     numbers = {key(k): k for key in (X, V, B) for k in range(count)}
-    cliques = cliques_of(graph.linearize(values), ordering, numbers)
     rotations, positions = stacked_poses(values, range(count))
     pairs = _pairs(cliques, numbers, count)
     centre = weights @ positions
@@ -138,16 +134,15 @@ def _pairs(cliques: list[Clique], numbers: Mapping[int, int], count: int) -> Flo
     """The joint covariances (K-1, 30, 30) of neighbouring keyframes."""
     pairs = np.full((count - 1, 2 * _ERROR, 2 * _ERROR), np.nan)
     missing = np.ones(len(pairs), np.bool_)
-    for clique, P in joint_covariances(cliques):
+    for clique, root in joint_root_covariances(cliques):
         ours = {numbers[key] for key in clique.frontals if key in numbers}
         for k in sorted({k - 1 for k in ours} | ours):
             if not 0 <= k < len(pairs) or not missing[k]:
                 continue
             keys = [key(i) for i in (k, k + 1) for key in (X, V, B)]
-            if all(key in clique.columns for key in keys):
-                own = [clique.columns[key] for key in keys]
-                rows = np.concatenate([np.arange(c.start, c.stop) for c in own])
-                pairs[k] = P[np.ix_(rows, rows)]
+            if all(key in clique.layout for key in keys):
+                rows = root[clique.layout.indices(keys)]
+                pairs[k] = rows @ rows.T
                 missing[k] = False
     return pairs
 
