@@ -118,7 +118,7 @@ def test_progress_of_an_adjustment_moves_and_never_ends_early(fuses: bool) -> No
             steps += 1
             progress.fusing(steps, rounds)
     for passes in range(3):
-        for _ in range(6):
+        for _ in range(10):
             steps += 1
             progress.solving(steps, passes)
     assert told == sorted(told)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -37,7 +38,11 @@ class SolvedCost:
 
 
 def cliques_at_minimum(
-    cost: SolvedCost, factors: RecordingFactors, values: gtsam.Values, learn: bool
+    cost: SolvedCost,
+    factors: RecordingFactors,
+    values: gtsam.Values,
+    learn: bool,
+    count_step: Callable[[], None],
 ) -> list[Clique]:
     """The linearised cost with its gauge fixed, which its covariances follow from.
 
@@ -49,6 +54,7 @@ def cliques_at_minimum(
         factors: of the IMU; their noise becomes what was learned.
         values: the minimum.
         learn: whether to estimate the noise of the IMU.
+        count_step: is called after each step.
 
     Raises:
         RuntimeError: if the cost does not determine all variables.
@@ -69,6 +75,7 @@ def cliques_at_minimum(
             factors.noise = assumed
             break
         values, cliques = moved, cliques_of(tree, wanted)
+        count_step()
     return cliques
 
 

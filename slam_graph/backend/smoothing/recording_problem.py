@@ -132,7 +132,7 @@ class BundleAdjustment:
         report: is given the progress after each step.
 
     Attributes:
-        iterations: Levenberg-Marquardt steps so far.
+        iterations: steps so far.
     """
 
     def __init__(self, start: SegmentStart, task: SmoothingTask, report: Report) -> None:
@@ -298,10 +298,9 @@ class BundleAdjustment:
         cost = optimizer.error()
         for _ in range(self._config.max_iterations):
             optimizer.iterate()
-            self.iterations += 1
+            self._count_step()
             decrease = cost - optimizer.error()
             cost = optimizer.error()
-            self._report(self.iterations, self._passes)
             if decrease <= tolerance * cost or optimizer.lambda_() > _MAX_LAMBDA:
                 break
         if not math.isfinite(cost):
@@ -310,6 +309,10 @@ class BundleAdjustment:
         self._values = optimizer.values()
         self._solved = SolvedCost(graph, inertial, projections, ordering)
         return cost, inertial.error(self._values)
+
+    def _count_step(self) -> None:
+        self.iterations += 1
+        self._report(self.iterations, self._passes)
 
     def _cost_before(self, obs: Observations) -> float:
         """What the cost that was minimised last is at the states before the adjustment.
@@ -329,12 +332,15 @@ class BundleAdjustment:
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""
         segment = self._segment
-        self._report(self.iterations, self._passes)
         nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
             cliques = cliques_at_minimum(
-                self._solved, self._factors, self._values, self._config.learn_imu_noise
+                self._solved,
+                self._factors,
+                self._values,
+                self._config.learn_imu_noise,
+                self._count_step,
             )
             return keyframe_covariances(cliques, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
