@@ -31,7 +31,7 @@ def chain(rng: np.random.Generator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.V
         values.insert(X(k), state.pose())
         values.insert(V(k), state.velocity())
         values.insert(B(k), bias)
-        gyro, accel = rng.normal(0.0, 0.5, 3), rng.normal(0.0, 1.0, 3) + [0.0, 0.0, 9.81]
+        gyro, accel = rng.normal(0.0, 0.5, 3), rng.normal([0.0, 0.0, 9.81], 1.0)
         count = len(stamps_ns)
         data = ImuData(stamps_ns, np.tile(gyro, (count, 1)), np.tile(accel, (count, 1)))
         pim = data.preintegrated(bias, params)
