@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
-from benchmarks.suite import PEERS, RECURSIVE
+from benchmarks.suite import CORE, PEERS, RECURSIVE
 from slam_graph.errors import DataError
 
 
@@ -80,6 +80,46 @@ def speed(figures: Figures) -> Iterator[str]:
     yield line("", "peak memory [MB]", *memory, width=7)
 
 
+def performance(figures: Figures) -> Iterator[str]:
+    """Cost of a frame of every algorithm of the engine."""
+    yield "| | two cameras [flows] | one camera [flows] | memory [MB] | × real time, one core |"
+    yield "|---|---:|---:|---:|---:|"
+    for name in RECURSIVE:
+        stereo, mono = (f"speed_mh01_{kind}.{name}" for kind in ("stereo", "mono"))
+        yield line(
+            f"`{name}`",
+            figures(f"{stereo}.cost_mean", 1),
+            figures(f"{mono}.cost_mean", 1),
+            figures(f"{stereo}.peak_memory", 0),
+            figures(f"{stereo}.real_time_factor_cpu", 2),
+        )
+
+
+def performance_parts(figures: Figures) -> Iterator[str]:
+    """What a frame with two cameras is spent on."""
+    yield "| [flows] | " + " | ".join(f"`{name}`" for name in CORE) + " |"
+    yield "|---|" + "---:|" * len(CORE)
+    for part, label in PARTS.items():
+        keys = [f"speed_mh01_stereo.{name}.part_{part}" for name in CORE]
+        yield line(label, *(figures(key, 2) for key in keys))
+
+
+PARTS = {
+    "decoding": "decoding of images",
+    "frontend_temporal": "front end: tracking in time",
+    "frontend_ransac": "RANSAC",
+    "frontend_detect": "detection",
+    "frontend_stereo": "matching between cameras",
+    "frontend_other": "rest of the front end",
+    "backend_propagation": "back end: propagation",
+    "backend_cost": "cost construction",
+    "backend_gauss_newton": "Gauss-Newton steps",
+    "backend_marginalization": "marginalization",
+    "backend_other": "rest of the back end, start-up",
+    "other": "notes of the run",
+}
+
+
 def monte_carlo(figures: Figures) -> Iterator[str]:
     """NEES with and without first-estimates Jacobians."""
     yield "| | NEES pose | orientation | position | without: pose | orientation | position |"
@@ -137,5 +177,7 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "monte_carlo": monte_carlo,
     "real_imu": real_imu,
     "held_out": held_out,
+    "performance": performance,
+    "performance_parts": performance_parts,
 }
 """By the name in the marker of a document."""

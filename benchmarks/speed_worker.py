@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One timed run on one core, in a process of its own; prints what it measured as JSON.
 
-python -m benchmarks.speed_worker shipped|interleaved|complete RECORDING ALGORITHM
+python -m benchmarks.speed_worker MODE RECORDING ALGORITHM [CAMERAS [SECONDS]], the mode as in `MODES`
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
 from slam_graph.pipeline.stage import EstimatedFrame
 
-CAMERAS = 2
-
 REFERENCE_POINTS = 200
 REFERENCE_WINDOW = (21, 21)
 REFERENCE_LEVELS = 3
@@ -42,7 +40,7 @@ Table = dict[str, Any]
 
 def shipped(recording: Path, config: RunConfig) -> Table:
     """The run as it ships, with all files written at the end: its time and its peak of memory."""
-    sequence = open_dataset(recording, cameras=CAMERAS)
+    sequence = open_dataset(recording, cameras=config.cameras)
     began_s = time.process_time()
     result = run(sequence, config)
     cpu_s = time.process_time() - began_s
@@ -63,7 +61,7 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
     Front end and back end take turns here, so that one thread's time is that of both.
     """
     config = config.model_copy(update={"overlap": False})
-    sequence = DecodedInTurn(recording, cameras=CAMERAS)
+    sequence = DecodedInTurn(recording, cameras=config.cameras)
     reference = Reference()
     began_s = time.process_time()
     result = run(sequence, config, viewer=reference, progress=reference)
@@ -205,12 +203,16 @@ MODES: dict[str, Callable[[Path, RunConfig], Table]] = {
 }
 
 
-def main(mode: str, recording: str, algorithm: str) -> None:
+def main(mode: str, recording: str, algorithm: str, cameras: str = "2", seconds: str = "") -> None:
     """Measure and print."""
     hold_to_one_core()
     # `complete` has the bundle adjustment at its end; the others are of the causal part alone
-    adjusted = f"final_ba.enabled={str(mode == 'complete').lower()}"
-    config = load_config(overrides=[adjusted], algorithm=algorithm, cameras=CAMERAS)
+    config = load_config(
+        overrides=[f"final_ba.enabled={str(mode == 'complete').lower()}"],
+        algorithm=algorithm,
+        cameras=int(cameras),
+        duration_s=float(seconds) if seconds else None,
+    )
     with threadpool_limits(limits=1):
         print(json.dumps(MODES[mode](Path(recording), config)))
 

@@ -14,9 +14,6 @@ from slam_graph.errors import DataError
 
 DATA_VARIABLE = "SLAM_GRAPH_DATA"
 
-ALGORITHMS = ("msckf", "swf")
-"""The algorithms whose speed is measured in detail."""
-
 RECURSIVE = ("msckf", "swf", "okvis", "ekf", "iekf")
 """The algorithms of the engine."""
 
