@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One timed run on one core, in a process of its own; prints what it measured as JSON.
 
-python -m benchmarks.speed_worker MODE RECORDING ALGORITHM [CAMERAS [SECONDS]], the mode as in `MODES`
+python -m benchmarks.speed_worker MODE RECORDING ALGORITHM [CAMERAS [SECONDS]]
 """
 
 from __future__ import annotations
