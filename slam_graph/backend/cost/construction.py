@@ -318,14 +318,12 @@ class CostConstruction:
     # --- what stays ------------------------------------------------------------------------------
 
     def _in_state(self, window: Window, cost: Cost) -> IntArray:
-        """The features that stay in the state: those that are tracked, old and new, or all."""
+        """The features that stay in the state: those that are tracked, old and new."""
         ids = np.zeros(0, np.int64)
         if cost.landmarks is not None:
             ids = np.unique(cost.landmarks.ids[cost.landmarks.feature])
         if self.policy.keep_lost_features:
-            ids = window.state_features
-            if window.lost_features.open:
-                ids = ids[is_in(ids, window.tracks.seen)]
+            ids = window.state_features[is_in(window.state_features, window.tracks.seen)]
         if cost.tracks is not None:
             ids = np.union1d(ids, cost.tracks.obs.ids[cost.tracks.in_state])
         return ids

@@ -10,8 +10,10 @@ and not as one dense matrix, whose update is O(n²) in the number n of all featu
 
 When a feature is seen again, its conditional is multiplied with those stored after it, and the
 variables that these eliminated are eliminated from the product. That pays as long as lost features
-stay lost, as those of a tracker do. Where identities return all the time, everything is recalled
-once and the store is closed: from then on the filter keeps all features in one dense matrix.
+stay lost, as those of a tracker do. Where identities return all the time, each frame would reorder
+all that was stored: then the store is closed. From then on lost features are marginalised for good,
+and one that comes back is a new one. What was measured of it before stays in the prior of the
+others; that it is the same point is no longer used.
 """
 
 from __future__ import annotations
@@ -97,11 +99,12 @@ class LandmarkStore:
         return np.concatenate([np.zeros(0), *parts])
 
     def due(self, seen: IntArray) -> IntArray:
-        """Which features must become variables again: of those seen; all if the store closes."""
-        again = [j for j in seen.tolist() if j in self._places]
-        if again and self._exchanges > _MAX_EXCHANGES:
-            again = list(self._places)
-        return np.array(again, dtype=np.int64)
+        """Which features must become variables again: of those seen; none once the store closes."""
+        if self._exchanges > _MAX_EXCHANGES:
+            self.open = False
+            self._conditionals.clear()
+            self._places.clear()
+        return np.array([j for j in seen.tolist() if j in self._places], dtype=np.int64)
 
     def recall(
         self, features: IntArray, prior: SquareRootInformation, state: State
@@ -123,9 +126,6 @@ class LandmarkStore:
         self._exchanges += len(self._conditionals) - first
         for k in range(first, len(self._conditionals)):
             self._conditionals[k], carried = _exchanged(self._conditionals[k], carried, wanted)
-        if not self._places and self._exchanges > _MAX_EXCHANGES:
-            self.open = False
-            self._conditionals.clear()
         carried = carried.shifted(self._bases(carried))
         for j, place in places.items():
             state.insert_point(j, place.first)
