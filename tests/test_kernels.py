@@ -2,9 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every compiled kernel does what its NumPy form does."""
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
+from slam_graph.kernels.projection import (
+    chain_rule,
+    chain_rule_numpy,
+    distort_radtan,
+    to_cameras,
+    to_cameras_numpy,
+)
+from slam_graph.sensors import Camera
 
 EQUAL = 1e-12
 """Largest difference, relative to the largest value."""
@@ -24,3 +35,39 @@ def test_triangularize_features() -> None:
     triangularize_features(A, B)
     assert same(A, expected[0])
     assert same(B, expected[1])
+
+
+def test_projection() -> None:
+    rng = np.random.default_rng(2)
+    rotations, mount_R = (Rotation.random(k, random_state=k).as_matrix() for k in (4, 2))
+    positions, mount_p, points = (rng.normal(size=(k, 3)) for k in (4, 2, 9))
+    frame, feature, mount = (rng.integers(0, k, 40) for k in (4, 9, 2))
+    scene = rotations, positions, points, mount_R, mount_p, frame, feature, mount, 1e-3
+
+    def filled(
+        kernel: Callable[..., None], shapes: list[tuple[int, ...]], *given: object
+    ) -> list[np.ndarray]:
+        results = [np.empty((40, *shape)) for shape in shapes]
+        kernel(*given, *results)
+        return results
+
+    seen, expected = (filled(f, [(3,), (3,), (2,)], *scene) for f in (to_cameras, to_cameras_numpy))
+    assert all(same(a, b) for a, b in zip(seen, expected, strict=True))
+    assert np.any(seen[1][:, 2] < 0.0)  # behind the camera, too
+    given = *expected[:2], rng.normal(size=(40, 2, 2)), rotations, mount_R, frame, mount, 1e-3
+    shapes = [(2, 3), (2, 6), (2, 3)]
+    derivatives = (filled(f, shapes, *given) for f in (chain_rule, chain_rule_numpy))
+    assert all(same(a, b) for a, b in zip(*derivatives, strict=True))
+
+
+def test_brown_distortion() -> None:
+    rng = np.random.default_rng(3)
+    m, camera = rng.uniform(-0.8, 0.8, (30, 2)), np.repeat([0, 1], 15)
+    lenses = np.array([[458, 457, 367, 248, -0.28, 0.07, 2e-4, 2e-5], [1, 2, 3, 4, 0, 0, 0, 0]])
+    pixels, slopes = np.empty((30, 2)), np.empty((30, 2, 2))
+    distort_radtan(m, camera, lenses, pixels, slopes)
+    for rows, lens, model in (camera == 0, lenses[0], "radtan"), (camera == 1, lenses[1], "none"):
+        coefficients = tuple(lens[4:]) if model == "radtan" else ()
+        expected = Camera(*lens[:4], model, coefficients, 752, 480).distort(m[rows])
+        assert same(pixels[rows], expected[0])
+        assert same(slopes[rows], expected[1])

@@ -179,10 +179,11 @@ def observed(
     zeros, nothing = np.zeros(n, np.int64), np.zeros((n, 2))
     ids, numbers = np.arange(count), tuple(range(frames))
     obs = Observations(ids, numbers, feature, frame, zeros, nothing, nothing)
-    in_camera = projection.in_camera(obs, projection.in_body(obs, at))
+    views = projection.views(obs, at)
+    in_camera = views.in_camera
     seen = in_camera[:, 2] > np.cos(np.deg2rad(82)) * np.linalg.norm(in_camera, axis=1)
     pixels = rng.normal(0.0, noise_px, (n, 2))
-    pixels[seen] += projection.pixels(obs.rows(seen), in_camera[seen])[0]
+    pixels[seen] += views.pixels[seen]
     normalized = np.zeros((n, 2))
     normalized[seen] = camera.undistort(pixels[seen])
     return projection, replace(obs, pixels=pixels, normalized=normalized).rows(seen)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import MIN_DEPTH, Geometry, RigProjection
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import (
@@ -112,11 +112,10 @@ class CalibratedProjection(RigProjection):
             obs: N observations.
             at: poses of the body when the frames were taken, as `poses` gives them.
         """
-        by_pose, by_point = self.jacobians(obs, at)
+        views = self.views(obs, at)
+        by_pose, by_point, by_camera_point = self.derivatives(obs, at, views)
         by_calibration = np.zeros((len(obs), 2, sum(dims_of(self.calibration_keys).values())))
-        in_camera = self.in_camera(obs, self.in_body(obs, at))
-        by_camera_point = self.by_camera_point(obs, in_camera)
-        normalized = in_camera[:, :2] / np.maximum(in_camera[:, 2:3], MIN_DEPTH)
+        in_camera, normalized = views.in_camera, views.normalized
         for c, camera in enumerate(self.cameras):
             rows = obs.camera == c
             if E(c) in self._columns:

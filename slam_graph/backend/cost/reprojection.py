@@ -19,17 +19,18 @@ by 0.05 m/s moves the first and the last row by 0.1 px at 3 m, with a readout of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.solve.state import FrameMotion, State, stacked_poses
-from slam_graph.sensors import FeatureFrame, Rig
+from slam_graph.kernels.projection import chain_rule, distort_radtan, to_cameras
+from slam_graph.sensors import Camera, FeatureFrame, Rig
 
 _STILL = FrameMotion(np.zeros(6), 0.0)
 
@@ -50,6 +51,25 @@ class Geometry:
     rotations: FloatArray
     positions: FloatArray
     points: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Where cameras see features, N observations of them.
+
+    Attributes:
+        in_body: (N, 3) the features in the body frame of the observing pose.
+        in_camera: (N, 3) in the frame of the observing camera.
+        normalized: (N, 2) on the plane z = 1.
+        pixels: (N, 2).
+        slopes: (N, 2, 2) derivatives of the pixels by the normalised points.
+    """
+
+    in_body: FloatArray
+    in_camera: FloatArray
+    normalized: FloatArray
+    pixels: FloatArray
+    slopes: FloatArray
 
 
 class RigProjection:
@@ -88,6 +108,7 @@ class RigProjection:
         self.body_p_camera = matrices[:, :3, 3]
         self.rolling = rig.rolling
         self.wide = any(camera.model.sees_sideways for camera in self.cameras)
+        self._lenses = _radtan_lenses(self.cameras)
         self._rig = rig
         self._motions = motions or {}
         self._mounts: tuple[Observations, tuple[FloatArray, FloatArray]] | None = None  # the last
@@ -194,38 +215,51 @@ class RigProjection:
         change = np.array([motion.change for motion in motions])[obs.frame]
         return FrameMotion(rate, 0.0, change)
 
-    def _camera_R_body(self, obs: Observations) -> FloatArray:
-        """Rotations (N, 3, 3) from the body at the pose to the camera at the observed row."""
-        if self.rolling:
-            return np.ascontiguousarray(self.mounts(obs)[0].transpose(0, 2, 1))
-        camera_R_body = np.ascontiguousarray(self.body_R_camera.transpose(0, 2, 1))
-        return camera_R_body[obs.camera]
-
     # --- geometry ---------------------------------------------------------------------------------
 
-    def in_body(self, obs: Observations, at: Geometry) -> FloatArray:
-        """The observed features (N, 3) in the body frame of the observing pose."""
-        difference = at.points[obs.feature] - at.positions[obs.frame]
-        points: FloatArray = np.einsum("nji,nj->ni", at.rotations[obs.frame], difference)
-        return points
+    def views(self, obs: Observations, at: Geometry) -> Views:
+        """Where the cameras see the observed features."""
+        mount_R, mount_p, mount = self._mount_table(obs)
+        count = len(obs)
+        in_body, in_camera, normalized = (
+            np.empty((count, 3)),
+            np.empty((count, 3)),
+            np.empty((count, 2)),
+        )
+        to_cameras(
+            at.rotations,
+            at.positions,
+            at.points,
+            mount_R,
+            mount_p,
+            obs.frame,
+            obs.feature,
+            mount,
+            MIN_DEPTH,
+            in_body,
+            in_camera,
+            normalized,
+        )
+        return Views(in_body, in_camera, normalized, *self._distorted(obs, normalized))
 
-    def in_camera(self, obs: Observations, in_body: FloatArray) -> FloatArray:
-        """Points (N, 3) of the body frame in the frame of the observing camera."""
-        R, p = self.mounts(obs)
-        points: FloatArray = np.einsum("nji,nj->ni", R, in_body - p)
-        return points
+    def _mount_table(self, obs: Observations) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Rotations (M, 3, 3) and positions (M, 3) of cameras in the body, and whose are whose."""
+        if self.rolling:
+            return *self.mounts(obs), np.arange(len(obs))
+        return self.body_R_camera, self.body_p_camera, obs.camera
 
-    def pixels(self, obs: Observations, in_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (N, 2) of points in the camera frame, and d pixel / d normalised (N, 2, 2)."""
-        depth = np.maximum(in_camera[:, 2:3], MIN_DEPTH)
-        normalized = in_camera[:, :2] / depth
-        if len(self.cameras) == 1:
-            return self.cameras[0].distort(normalized)
-        pixels, slope = np.empty((len(obs), 2)), np.empty((len(obs), 2, 2))
+    def _distorted(
+        self, obs: Observations, normalized: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (N, 2) of normalised points, and d pixel / d normalised (N, 2, 2)."""
+        pixels, slopes = np.empty((len(obs), 2)), np.empty((len(obs), 2, 2))
+        if self._lenses is not None:
+            distort_radtan(normalized, obs.camera, self._lenses, pixels, slopes)
+            return pixels, slopes
         for number, camera in enumerate(self.cameras):
-            rows = obs.camera == number
-            pixels[rows], slope[rows] = camera.distort(normalized[rows])
-        return pixels, slope
+            rows = np.flatnonzero(obs.camera == number)
+            pixels[rows], slopes[rows] = camera.distort(normalized[rows])
+        return pixels, slopes
 
     def residuals(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
         """Residuals z - π(f) (N, 2) in pixels, and depths (N,) in metres.
@@ -233,11 +267,15 @@ class RigProjection:
         With a wide lens near points have small depths at the edge of the image. There a depth is
         the distance from the camera, negative behind it.
         """
-        in_camera = self.in_camera(obs, self.in_body(obs, at))
-        depths = in_camera[:, 2]
+        views = self.views(obs, at)
+        return obs.pixels - views.pixels, self.depths(views)
+
+    def depths(self, views: Views) -> FloatArray:
+        """Depths (N,) as `residuals` gives them."""
+        depths = views.in_camera[:, 2]
         if self.wide:
-            depths = np.copysign(np.linalg.norm(in_camera, axis=1), depths)
-        return obs.pixels - self.pixels(obs, in_camera)[0], depths
+            depths = np.copysign(np.linalg.norm(views.in_camera, axis=1), depths)
+        return depths
 
     def pixel_slopes(self, obs: Observations) -> FloatArray:
         """Derivatives (N, 2, 2) of the observed pixels by their normalised coordinates.
@@ -246,11 +284,7 @@ class RigProjection:
         pixels do, whose noise is the same everywhere: on that plane it grows with 1 / cos² of the
         angle to the axis.
         """
-        slopes = np.empty((len(obs), 2, 2))
-        for number, camera in enumerate(self.cameras):
-            rows = obs.camera == number
-            slopes[rows] = camera.distort(obs.normalized[rows])[1]
-        return slopes / self.cameras[0].fx
+        return self._distorted(obs, obs.normalized)[1] / self.cameras[0].fx
 
     def jacobians(self, obs: Observations, at: Geometry) -> tuple[FloatArray, FloatArray]:
         """Derivatives of π, not of the residual.
@@ -259,23 +293,37 @@ class RigProjection:
             by_pose: (N, 2, 6).
             by_point: (N, 2, 3).
         """
-        in_body = self.in_body(obs, at)
-        by_camera_point = self.by_camera_point(obs, self.in_camera(obs, in_body))
-        by_body_point = by_camera_point @ self._camera_R_body(obs)
-        by_pose = np.empty((len(obs), 2, 6))
-        # rotating the body by θ moves the point by p × θ in the body frame
-        by_pose[:, :, :3] = np.cross(by_body_point, in_body[:, None, :])
-        by_pose[:, :, 3:] = -by_body_point
-        body_R_world = np.ascontiguousarray(at.rotations.transpose(0, 2, 1))
-        by_point = by_body_point @ body_R_world[obs.frame]
-        return by_pose, by_point
+        return self.derivatives(obs, at, self.views(obs, at))[:2]
 
-    def by_camera_point(self, obs: Observations, in_camera: FloatArray) -> FloatArray:
-        """Derivatives (N, 2, 3) of the pixels of points (N, 3) by these, in the camera frame."""
-        depth = np.maximum(in_camera[:, 2], MIN_DEPTH)
-        _, slope = self.pixels(obs, in_camera)
-        derivative = np.empty((len(obs), 2, 3))
-        derivative[:, :, :2] = slope / depth[:, None, None]
-        ratio = in_camera[:, :2] / depth[:, None] ** 2
-        derivative[:, :, 2] = -np.einsum("nij,nj->ni", slope, ratio)
-        return derivative
+    def derivatives(
+        self, obs: Observations, at: Geometry, views: Views
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Derivatives by pose (N, 2, 6), point (N, 2, 3) and point in the camera (N, 2, 3)."""
+        mount_R, _, mount = self._mount_table(obs)
+        count = len(obs)
+        by_pose = np.empty((count, 2, 6))
+        by_point, by_camera_point = np.empty((count, 2, 3)), np.empty((count, 2, 3))
+        chain_rule(
+            views.in_body,
+            views.in_camera,
+            views.slopes,
+            at.rotations,
+            mount_R,
+            obs.frame,
+            mount,
+            MIN_DEPTH,
+            by_camera_point,
+            by_pose,
+            by_point,
+        )
+        return by_pose, by_point, by_camera_point
+
+
+def _radtan_lenses(cameras: Sequence[Camera]) -> FloatArray | None:
+    """Intrinsics and coefficients (C, 8) of cameras with Brown's model or none; None for others."""
+    if not all(camera.distortion in ("radtan", "none") for camera in cameras):
+        return None
+    straight = (0.0, 0.0, 0.0, 0.0)
+    return np.array(
+        [[*camera.intrinsics, *(camera.coefficients or straight)] for camera in cameras]
+    )
