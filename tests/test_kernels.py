@@ -5,6 +5,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
@@ -15,6 +16,7 @@ from slam_graph.kernels.projection import (
     to_cameras,
     to_cameras_numpy,
 )
+from slam_graph.kernels.triangulation import triangulate_rays, triangulate_rays_numpy
 from slam_graph.sensors import Camera
 
 EQUAL = 1e-12
@@ -71,3 +73,28 @@ def test_brown_distortion() -> None:
         expected = Camera(*lens[:4], model, coefficients, 752, 480).distort(m[rows])
         assert same(pixels[rows], expected[0])
         assert same(slopes[rows], expected[1])
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_triangulation(weighted: bool) -> None:
+    rng = np.random.default_rng(4)
+    counts = np.array([2, 5, 9, 4, 6])
+    starts = np.append(0, np.cumsum(counts))
+    truth = np.repeat(rng.uniform([-2, -2, 4], [2, 2, 9], (5, 3)), counts, axis=0)
+    positions = rng.normal(0.0, 0.5, truth.shape)
+    turns = Rotation.from_rotvec(rng.normal(0.0, 0.2, truth.shape))
+    seen = turns.inv().apply(truth - positions)
+    normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, 2e-3, (len(seen), 2))
+    normalized[starts[4] :] *= -1.0  # rays that meet behind the cameras
+    weights = (
+        np.eye(2) + rng.normal(0.0, 0.1, (len(seen), 2, 2)) if weighted else np.ones((0, 2, 2))
+    )
+    found = []
+    for kernel in triangulate_rays, triangulate_rays_numpy:
+        points, depth_error, parallax = np.empty((5, 3)), np.empty(5), np.empty(5)
+        kernel(
+            turns.as_matrix(), positions, normalized, weights, starts, points, depth_error, parallax
+        )
+        found.append((points, depth_error, parallax))
+    assert all(same(a, b) for a, b in zip(*found, strict=True))
+    np.testing.assert_allclose(found[0][0][:4], truth[starts[:4]], atol=0.5)

@@ -1,0 +1,323 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Triangulation of features from rays: the point nearest to them, then Gauss-Newton.
+
+Gauss-Newton is on the error on the plane z = 1, over (α, β, ρ): the feature is at (α, β, 1) / ρ in
+the camera that saw it first, its anchor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.kernels.compilation import compiled
+
+__all__ = ["triangulate_rays", "triangulate_rays_numpy"]
+
+STEPS = 5
+"""Damped Gauss-Newton steps that refine the linear solution, at most."""
+_REGULARISATION = 1e-9
+"""Added to diagonals, so that features without parallax have a solution too (which is refused)."""
+_NEAREST = 1e-3
+"""Points nearer than this, in units of their distance to the anchor, are projected as if there."""
+_CONVERGED = 1e-7
+"""Steps of all features that are smaller are the last."""
+
+
+@compiled()
+def _solve(A: FloatArray, b: FloatArray, x: FloatArray) -> None:
+    """The solution x (3,) of A x = b for a positive definite A (3, 3), by LDLᵀ."""
+    l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
+    d1 = A[1, 1] - l10 * A[1, 0]
+    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
+    d2 = A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1
+    y1 = b[1] - l10 * b[0]
+    x[2] = (b[2] - l20 * b[0] - l21 * y1) / d2
+    x[1] = y1 / d1 - l21 * x[2]
+    x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
+
+
+@compiled()
+def _nearest_to_rays(
+    R: FloatArray, p: FloatArray, normalized: FloatArray, first: int, last: int, point: FloatArray
+) -> None:
+    """The point (3,) with the least sum of squared distances to the rays of one feature."""
+    lhs, rhs, b, offset = np.zeros((3, 3)), np.zeros(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        lhs[i, i] = _REGULARISATION
+    for n in range(first, last):
+        u, v = normalized[n]
+        length = math.sqrt(u * u + v * v + 1.0)
+        for i in range(3):
+            b[i] = (R[n, i, 0] * u + R[n, i, 1] * v + R[n, i, 2]) / length
+            offset[i] = p[n, i] - p[first, i]
+        for i in range(3):
+            for k in range(3):
+                A = (1.0 if i == k else 0.0) - b[i] * b[k]
+                lhs[i, k] += A
+                rhs[i] += A * offset[k]
+    _solve(lhs, rhs, point)
+    for i in range(3):
+        point[i] += p[first, i]
+
+
+@compiled()
+def _normal_equations(
+    R: FloatArray,
+    t: FloatArray,
+    normalized: FloatArray,
+    weights: FloatArray,
+    first: int,
+    last: int,
+    x: FloatArray,
+    lhs: FloatArray,
+    rhs: FloatArray,
+) -> float:
+    """Squared error, JᵀJ (3, 3) and Jᵀr (3,) of one feature at x (3,)."""
+    lhs[:], rhs[:] = 0.0, 0.0
+    error = 0.0
+    J, r, p = np.empty((2, 3)), np.empty(2), np.empty(3)
+    for n in range(first, last):
+        for i in range(3):
+            p[i] = R[n, i, 0] * x[0] + R[n, i, 1] * x[1] + R[n, i, 2] + x[2] * t[n, i]
+        z = max(p[2], _NEAREST)
+        for i in range(2):
+            m = p[i] / z
+            r[i] = normalized[n, i] - m
+            J[i, 0] = (R[n, i, 0] - m * R[n, 2, 0]) / z
+            J[i, 1] = (R[n, i, 1] - m * R[n, 2, 1]) / z
+            J[i, 2] = (t[n, i] - m * t[n, 2]) / z
+        if len(weights):
+            w = weights[n]
+            for k in range(3):
+                a, b = J[0, k], J[1, k]
+                J[0, k], J[1, k] = w[0, 0] * a + w[0, 1] * b, w[1, 0] * a + w[1, 1] * b
+            a, b = r[0], r[1]
+            r[0], r[1] = w[0, 0] * a + w[0, 1] * b, w[1, 0] * a + w[1, 1] * b
+        error += r[0] * r[0] + r[1] * r[1]
+        for i in range(3):
+            rhs[i] += J[0, i] * r[0] + J[1, i] * r[1]
+            for k in range(3):
+                lhs[i, k] += J[0, i] * J[0, k] + J[1, i] * J[1, k]
+    return error
+
+
+@compiled()
+def _start(
+    R: FloatArray, p: FloatArray, seen: FloatArray, point: FloatArray, x: FloatArray
+) -> None:
+    """(α, β, ρ) of a point in its anchor, where that saw it at `seen` (2,)."""
+    local = np.empty(3)
+    for i in range(3):
+        local[i] = (
+            R[0, i] * (point[0] - p[0]) + R[1, i] * (point[1] - p[1]) + R[2, i] * (point[2] - p[2])
+        )
+    z = local[2] if abs(local[2]) > 1e-3 else 1e-3
+    if z < 0.0:  # behind the camera: a distant point and noise
+        z = 1e3
+    x[0], x[1], x[2] = local[0] / z, local[1] / z, 1.0 / z
+    if local[2] <= 1e-3:
+        x[0], x[1] = seen[0], seen[1]
+
+
+@compiled()
+def _refine(
+    R: FloatArray,
+    t: FloatArray,
+    normalized: FloatArray,
+    weights: FloatArray,
+    starts: IntArray,
+    x: FloatArray,
+    lhs: FloatArray,
+) -> None:
+    """Move x (J, 3) by damped steps; JᵀJ (J, 3, 3) there is filled."""
+    count = len(x)
+    rhs, error = np.empty((count, 3)), np.empty(count)
+    damping = np.full(count, 1e-3)
+    damped, step, trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+    trial_lhs, trial_rhs = np.empty((3, 3)), np.empty(3)
+    for j in range(count):
+        first, last = starts[j], starts[j + 1]
+        error[j] = _normal_equations(R, t, normalized, weights, first, last, x[j], lhs[j], rhs[j])
+    for _ in range(STEPS):
+        converged = True
+        for j in range(count):
+            damped[:] = lhs[j]
+            for i in range(3):
+                damped[i, i] += lhs[j, i, i] * damping[j] + _REGULARISATION
+            _solve(damped, rhs[j], step)
+            for i in range(3):
+                trial[i] = x[j, i] + step[i]
+                if not abs(step[i]) < _CONVERGED:
+                    converged = False
+            trial[2] = max(trial[2], 1e-6)
+            first, last = starts[j], starts[j + 1]
+            trial_error = _normal_equations(
+                R, t, normalized, weights, first, last, trial, trial_lhs, trial_rhs
+            )
+            if trial_error < error[j]:
+                x[j], lhs[j], rhs[j], error[j] = trial, trial_lhs, trial_rhs, trial_error
+                damping[j] *= 0.1
+            else:
+                damping[j] *= 10.0
+        if converged:
+            break
+
+
+@compiled(
+    "void(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], i8[::1],"
+    " f8[:, ::1], f8[::1], f8[::1])"
+)
+def triangulate_rays(
+    world_R_camera: FloatArray,
+    world_p_camera: FloatArray,
+    normalized: FloatArray,
+    weights: FloatArray,
+    starts: IntArray,
+    points: FloatArray,
+    depth_error: FloatArray,
+    parallax: FloatArray,
+) -> None:
+    """Triangulate J features from N observations, those of one feature after the other.
+
+    Args:
+        world_R_camera: (N, 3, 3) of the observing cameras.
+        world_p_camera: (N, 3) of the same.
+        normalized: (N, 2) where they saw the feature.
+        weights: (N, 2, 2) of errors on the plane z = 1; (0, 2, 2) where all count the same.
+        starts: (J + 1,) first observation of each feature, and N.
+        points: (J, 3) in the world, filled.
+        depth_error: (J,), filled: relative standard deviation of the inverse depth, for known poses
+            and a standard deviation of the errors of 1.
+        parallax: (J,), filled: largest angle in rad between the first ray and any other, from the
+            point to the cameras.
+    """
+    R, t = np.empty_like(world_R_camera), np.empty_like(world_p_camera)
+    x, lhs = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+    for j in range(len(points)):
+        home = starts[j]
+        for n in range(home, starts[j + 1]):
+            for i in range(3):
+                t[n, i] = 0.0
+                for k in range(3):
+                    away = world_p_camera[home, k] - world_p_camera[n, k]
+                    t[n, i] += world_R_camera[n, k, i] * away
+                    R[n, i, k] = 0.0
+                    for m in range(3):
+                        R[n, i, k] += world_R_camera[n, m, i] * world_R_camera[home, m, k]
+        _nearest_to_rays(world_R_camera, world_p_camera, normalized, home, starts[j + 1], points[j])
+        _start(world_R_camera[home], world_p_camera[home], normalized[home], points[j], x[j])
+    _refine(R, t, normalized, weights, starts, x, lhs)
+    known, unit, toward = np.empty(3), np.array([0.0, 0.0, 1.0]), np.empty((2, 3))
+    for j in range(len(points)):
+        home = starts[j]
+        for i in range(3):
+            A = world_R_camera[home, i]
+            points[j, i] = (
+                world_p_camera[home, i] + (A[0] * x[j, 0] + A[1] * x[j, 1] + A[2]) / x[j, 2]
+            )
+            lhs[j, i, i] += _REGULARISATION
+        _solve(lhs[j], unit, known)
+        depth_error[j] = math.sqrt(known[2]) / x[j, 2]
+        smallest = 1.0
+        for n in range(home, starts[j + 1]):
+            row = 0 if n == home else 1
+            length = 0.0
+            for i in range(3):
+                toward[row, i] = points[j, i] - world_p_camera[n, i]
+                length += toward[row, i] ** 2
+            cosine = 0.0
+            for i in range(3):
+                toward[row, i] /= math.sqrt(length) + 1e-12
+                cosine += toward[row, i] * toward[0, i]
+            smallest = min(smallest, cosine)
+        parallax[j] = math.acos(max(smallest, -1.0))
+
+
+def triangulate_rays_numpy(
+    world_R_camera: FloatArray,
+    world_p_camera: FloatArray,
+    normalized: FloatArray,
+    weights: FloatArray,
+    starts: IntArray,
+    points: FloatArray,
+    depth_error: FloatArray,
+    parallax: FloatArray,
+) -> None:
+    """`triangulate_rays` in NumPy."""
+    anchor, feature = starts[:-1], np.repeat(np.arange(len(points)), np.diff(starts))
+    home = anchor[feature]
+    camera_R_world = world_R_camera.transpose(0, 2, 1)
+    R = camera_R_world @ world_R_camera[home]
+    offset = world_p_camera - world_p_camera[home]
+    t = -np.einsum("nij,nj->ni", camera_R_world, offset)
+    bearings = np.concatenate([normalized, np.ones((len(normalized), 1))], axis=1)
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    b = np.einsum("nij,nj->ni", world_R_camera, bearings)
+    A = np.eye(3) - b[:, :, None] * b[:, None, :]
+    lhs = np.add.reduceat(A, anchor) + _REGULARISATION * np.eye(3)
+    rhs = np.add.reduceat(np.einsum("nij,nj->ni", A, offset), anchor)
+    linear = np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
+    local = np.einsum("jik,ji->jk", world_R_camera[anchor], linear)
+    z = np.where(np.abs(local[:, 2]) > 1e-3, local[:, 2], 1e-3)
+    z = np.where(z < 0, 1e3, z)
+    x = np.stack([local[:, 0] / z, local[:, 1] / z, 1.0 / z], axis=1)
+    behind: BoolArray = local[:, 2] <= 1e-3
+    x[behind, :2] = normalized[anchor][behind]
+    x, lhs = _refine_numpy(R, t, normalized, weights, anchor, feature, x)
+    local = np.concatenate([x[:, :2], np.ones((len(x), 1))], axis=1) / x[:, 2:]
+    points[:] = world_p_camera[anchor] + np.einsum("jik,jk->ji", world_R_camera[anchor], local)
+    variance = np.linalg.inv(lhs + _REGULARISATION * np.eye(3))[:, 2, 2]
+    depth_error[:] = np.sqrt(variance) / x[:, 2]
+    toward = points[feature] - world_p_camera
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True) + 1e-12
+    cosine = np.sum(toward * toward[home], axis=1)
+    parallax[:] = np.arccos(np.clip(np.minimum.reduceat(cosine, anchor), -1.0, 1.0))
+
+
+def _refine_numpy(
+    R: FloatArray,
+    t: FloatArray,
+    normalized: FloatArray,
+    weights: FloatArray,
+    anchor: IntArray,
+    feature: IntArray,
+    x: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """The refined x (J, 3), and JᵀJ (J, 3, 3) there."""
+
+    def normal_equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        xi = x[feature]
+        direction = np.concatenate([xi[:, :2], np.ones((len(xi), 1))], axis=1)
+        p = np.einsum("nij,nj->ni", R, direction) + xi[:, 2:] * t
+        z = np.maximum(p[:, 2:], _NEAREST)
+        m = p[:, :2] / z
+        r = normalized - m
+        by_x = np.concatenate([R[:, :, :2], t[:, :, None]], axis=2)
+        J = (by_x[:, :2, :] - m[:, :, None] * by_x[:, 2:, :]) / z[:, :, None]
+        if len(weights):
+            J, r = weights @ J, np.einsum("nij,nj->ni", weights, r)
+        lhs = np.add.reduceat(J.transpose(0, 2, 1) @ J, anchor)
+        rhs = np.add.reduceat(np.einsum("nij,ni->nj", J, r), anchor)
+        return np.add.reduceat(np.sum(r * r, axis=1), anchor), lhs, rhs
+
+    damping = np.full(len(x), 1e-3)
+    error, lhs, rhs = normal_equations(x)
+    for _ in range(STEPS):
+        diagonal = np.einsum("jii->ji", lhs) * damping[:, None] + _REGULARISATION
+        step = np.linalg.solve(lhs + diagonal[:, :, None] * np.eye(3), rhs[:, :, None])[:, :, 0]
+        trial = x + step
+        trial[:, 2] = np.maximum(trial[:, 2], 1e-6)
+        trial_error, trial_lhs, trial_rhs = normal_equations(trial)
+        better = trial_error < error
+        x = np.where(better[:, None], trial, x)
+        lhs = np.where(better[:, None, None], trial_lhs, lhs)
+        rhs = np.where(better[:, None], trial_rhs, rhs)
+        error = np.where(better, trial_error, error)
+        damping = np.where(better, damping * 0.1, damping * 10.0)
+        if np.max(np.abs(step), initial=0.0) < _CONVERGED:
+            break
+    return x, lhs
