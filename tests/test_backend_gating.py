@@ -15,8 +15,14 @@ from scipy.stats import chi2, kstest
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, GatingConfig, NoiseConfig
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
+from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.gating import Innovations, squared_mahalanobis, threshold
+from slam_graph.backend.cost.gating import (
+    Innovations,
+    distances_of_tracks,
+    squared_mahalanobis,
+    threshold,
+)
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
@@ -107,10 +113,9 @@ def quantiles(solved: list[tuple[Trial, Cost, Linearization]], scale: float) -> 
     """Of one feature of each scene, because those of one scene share the errors of its poses."""
     found = []
     for case, _, linear in solved:
-        assert linear.tracks is not None
-        tracks = linear.tracks
-        distances = squared_mahalanobis(tracks.r_2, tracks.N, scale * case.covariance)
-        found.append(float(chi2.cdf(distances[0], tracks.dof[0])))
+        assert isinstance(linear.tracks, WhitenedObservations)
+        distances = distances_of_tracks(case.obs, linear.tracks, scale * case.covariance)
+        found.append(float(chi2.cdf(distances[0], 2 * case.obs.counts[0] - 3)))
     return found
 
 

@@ -182,7 +182,7 @@ def test_a_cost_is_restored_with_its_features() -> None:
     cost = Cost(state, RigProjection(cameras), BackendConfig(), SquareRootInformation.empty())
     cost.prior = cost.prior.extended(dims_of(X(i) for i in range(4)))
     cost.tracks = TrackFeatures(obs, truth.points, np.zeros(len(obs.ids), np.bool_))
-    linear = cost.linearize()
+    linear = cost.linearize(summed=True)
     error = cost.value()
     before, estimate = cost.snapshot(), gtsam.Values(state.estimate)
     cost.apply(delta([X(i) for i in range(4)]), linear, cost.layout())

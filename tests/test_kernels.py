@@ -8,6 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.kernels.feature_sums import sum_of_features, sum_of_features_numpy
+from slam_graph.kernels.gate import (
+    observation_distances,
+    observation_distances_numpy,
+    track_distances,
+    track_distances_numpy,
+)
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
@@ -95,6 +102,41 @@ def test_triangulation(weighted: bool) -> None:
         kernel(
             turns.as_matrix(), positions, normalized, weights, starts, points, depth_error, parallax
         )
-        found.append((points, depth_error, parallax))
+        found.append((points, depth_error, np.cos(parallax)))
     assert all(same(a, b) for a, b in zip(*found, strict=True))
     np.testing.assert_allclose(found[0][0][:4], truth[starts[:4]], atol=0.5)
+
+
+def tracks(rng: np.random.Generator, calibration: int) -> tuple[np.ndarray, ...]:
+    """Linearised observations of four features by five poses, as the kernels take them."""
+    counts = np.array([2, 5, 9, 3])
+    starts, total = np.append(0, np.cumsum(counts)), counts.sum()
+    shapes = [(total, 2), (total, 2, 6), (total, 2, 3), (total, 2, calibration)]
+    return *(rng.normal(size=shape) for shape in shapes), rng.integers(0, 5, total), starts
+
+
+@pytest.mark.parametrize("calibration", [0, 4])
+def test_gate(calibration: int) -> None:
+    rng = np.random.default_rng(5)
+    given, size = tracks(rng, calibration), 30 + calibration
+    root = np.asfortranarray(rng.normal(size=(size, size)))
+    found = np.empty((2, 4))
+    track_distances(*given, root.T @ root, found[0])
+    track_distances_numpy(*given, root.T @ root, found[1])
+    assert same(*found)
+    r, H, columns = given[0], given[1], rng.integers(0, size, (len(given[0]), 6))
+    found = np.empty((2, len(r)))
+    observation_distances(r, H, root, columns, found[0])
+    observation_distances_numpy(r, H, root, columns, found[1])
+    assert same(*found)
+
+
+@pytest.mark.parametrize("calibration", [0, 4])
+def test_sum_of_features(calibration: int) -> None:
+    given, width = tracks(np.random.default_rng(6), calibration), 31 + calibration
+    found = []
+    for kernel in sum_of_features, sum_of_features_numpy:
+        shapes = (4, 3, 3), (4, 3, width), (width, width)
+        found.append([np.empty(shape) for shape in shapes])
+        kernel(*given, *found[-1])
+    assert all(same(a, b) for a, b in zip(*found, strict=True))

@@ -20,6 +20,7 @@ from gtsam.symbol_shorthand import L
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
+from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
 from slam_graph.backend.cost.feature_tracks import (
     Observations,
@@ -301,19 +302,25 @@ class CostConstruction:
     ) -> Linearization:
         """Leave out what the gate rejects, and make variables of the features that stay."""
         self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
-        if linear.landmarks is not None and cost.landmarks is not None:
+        landmarks, tracks = linear.landmarks, None
+        if landmarks is not None and cost.landmarks is not None:
             bad = cost.landmarks.rows(~gate.landmarks)
             self.rejected = np.union1d(self.rejected, bad.ids[bad.feature])
             removals.add_observations(Outcome.GATED, bad)
             cost.landmarks = cost.landmarks.rows(gate.landmarks)
+            landmarks = landmarks.subset(gate.landmarks)
         if linear.tracks is not None and cost.tracks is not None:
+            assert isinstance(linear.tracks, WhitenedObservations)
+            passed = linear.tracks.subset(gate.tracks[cost.tracks.obs.feature])
             bad_ids = cost.tracks.obs.ids[~gate.tracks]
             self.rejected = np.union1d(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
             cost.tracks = cost.tracks.subset(gate.tracks)
+            if len(cost.tracks.obs):
+                tracks = sum_features(cost.tracks.obs, passed)
             for row in np.flatnonzero(cost.tracks.in_state):
                 cost.state.insert_point(int(cost.tracks.obs.ids[row]), cost.tracks.points[row])
-        return linear.subset(gate.landmarks, gate.tracks)
+        return Linearization(landmarks, tracks)
 
     # --- what stays ------------------------------------------------------------------------------
 

@@ -20,18 +20,22 @@ from numpy.typing import NDArray
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
-    ReducedFeatures,
     SummedFeatures,
     WhitenedObservations,
-    reduce_features,
     sum_features,
     whiten,
 )
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.gating import Gate, Innovations, squared_mahalanobis, threshold
+from slam_graph.backend.cost.gating import (
+    Gate,
+    Innovations,
+    distances_of_observations,
+    distances_of_tracks,
+    threshold,
+)
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
 
 
@@ -60,19 +64,11 @@ class Linearization:
 
     Attributes:
         landmarks: observations of the features of the state.
-        tracks: features outside the state: their rows apart, as the gate needs them, or summed up.
+        tracks: features outside the state: each observation, as the gate needs them, or summed up.
     """
 
     landmarks: WhitenedObservations | None
-    tracks: ReducedFeatures | SummedFeatures | None
-
-    def subset(self, landmarks: BoolArray, tracks: BoolArray) -> Linearization:
-        """Some of the landmark observations (N,) and of the tracks (J,), not summed up."""
-        assert not isinstance(self.tracks, SummedFeatures)
-        return Linearization(
-            self.landmarks.subset(landmarks) if self.landmarks is not None else None,
-            self.tracks.subset(tracks) if self.tracks is not None else None,
-        )
+    tracks: WhitenedObservations | SummedFeatures | None
 
 
 @dataclass(eq=False)
@@ -183,17 +179,17 @@ class Cost:
         """Linearise all observations.
 
         Args:
-            summed: whether new features are summed up; else their rows stay apart, as the gate
-                needs them.
+            summed: whether new features are summed up; else their observations stay apart, as the
+                gate needs them.
         """
         self.state.relinearize()
         landmarks = tracks = None
         if self.landmarks is not None and len(self.landmarks):
             landmarks = self._whitened(self.landmarks, None)
         if self.tracks is not None and len(self.tracks.obs):
-            whitened = self._whitened(self.tracks.obs, self.tracks.points)
-            reduce = sum_features if summed else reduce_features
-            tracks = reduce(self.tracks.obs, whitened)
+            tracks = self._whitened(self.tracks.obs, self.tracks.points)
+            if summed:
+                return Linearization(landmarks, sum_features(self.tracks.obs, tracks))
         return Linearization(landmarks, tracks)
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
@@ -236,6 +232,7 @@ class Cost:
             columns = self._state_columns(self.landmarks, layout)
             parts.append(_state_rows(linear.landmarks, columns, layout))
         if linear.tracks is not None and self.tracks is not None:
+            assert isinstance(linear.tracks, SummedFeatures)
             columns = layout.indices(self.rig.keys_of(self.tracks.obs))
             parts.append(_null_space_rows(linear.tracks, columns, layout))
             parts.append(_new_variable_rows(self.tracks, linear.tracks, columns, layout))
@@ -246,6 +243,7 @@ class Cost:
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the estimates by an increment (n,), and the new features with them."""
         if self.tracks is not None and linear.tracks is not None:
+            assert isinstance(linear.tracks, SummedFeatures)
             columns = layout.indices(self.rig.keys_of(self.tracks.obs))
             step = linear.tracks.point_increments(delta[columns])
             self.tracks = replace(self.tracks, points=self.tracks.points + step)
@@ -276,8 +274,8 @@ class Cost:
             keys = self.rig.keys_of(self.landmarks)
             keys += [L(int(j)) for j in np.unique(self.landmarks.ids[self.landmarks.feature])]
             columns = self._state_columns(self.landmarks, Layout(dims_of(keys)))
-            P = predicted.covariance_blocks(keys, columns)
-            distance = squared_mahalanobis(linear.landmarks.r, linear.landmarks.H, P)
+            root = predicted.columns_of_root(keys)
+            distance = distances_of_observations(linear.landmarks, root, columns)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
@@ -285,12 +283,12 @@ class Cost:
             landmarks = (distance < largest) & ~near
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if linear.tracks is not None and self.tracks is not None:
-            assert isinstance(linear.tracks, ReducedFeatures), "summed up, they are not told apart"
-            P = predicted.covariance_of(self.rig.keys_of(self.tracks.obs))
-            distance = squared_mahalanobis(linear.tracks.r_2, linear.tracks.N, P)
-            largest = threshold(linear.tracks.dof, confidence)
+            assert not isinstance(linear.tracks, SummedFeatures), "these are not told apart"
+            P, obs = predicted.covariance_of(self.rig.keys_of(self.tracks.obs)), self.tracks.obs
+            distance, dof = distances_of_tracks(obs, linear.tracks, P), 2 * obs.counts - POINT_DIM
+            largest = threshold(dof, confidence)
             tracks = distance < largest
-            innovations += Innovations.of(distance, linear.tracks.dof, largest, tracks)
+            innovations += Innovations.of(distance, dof, largest, tracks)
         return Gate(landmarks, tracks, innovations)
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
@@ -320,12 +318,10 @@ def _state_rows(
 
 
 def _null_space_rows(
-    linear: ReducedFeatures | SummedFeatures, columns: NDArray[np.intp], layout: Layout
+    linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
     """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
-    compact = linear.null_space_rows()
-    if len(compact) > len(columns):
-        compact = triangularize(compact)
+    compact = linear.rows
     Ab = np.zeros((len(compact), layout.size + 1))
     Ab[:, columns] = compact[:, :-1]
     Ab[:, -1] = compact[:, -1]
@@ -334,7 +330,7 @@ def _null_space_rows(
 
 def _new_variable_rows(
     tracks: TrackFeatures,
-    linear: ReducedFeatures | SummedFeatures,
+    linear: SummedFeatures,
     columns: NDArray[np.intp],
     layout: Layout,
 ) -> FloatArray:

@@ -39,6 +39,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
 _REGULARISATION = 1e-15
@@ -79,11 +80,10 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
         obs: N observations of J features, each seen at least twice.
         linear: their linearisation.
     """
-    by_point, by_view = _tables(obs, linear)
-    Q, R_f = orthonormal_columns(by_point)
-    T = _along(Q, by_view)
-    stacked = T.reshape(-1, T.shape[2])
-    information = _view_information(by_view) - stacked.T @ stacked
+    J, width = len(obs.ids), POSE_DIM * len(obs.frames) + linear.by_calibration.shape[2] + 1
+    R_f, T, information = np.empty((J, 3, 3)), np.empty((J, 3, width)), np.empty((width, width))
+    parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
+    sum_of_features(*parts, obs.frame, obs.starts, R_f, T, information)
     return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
 
 
@@ -106,25 +106,6 @@ def information_root(information: FloatArray) -> FloatArray:
     return rows
 
 
-def _tables(obs: Observations, linear: WhitenedObservations) -> tuple[FloatArray, FloatArray]:
-    """All rows in their places, zero where a feature was not seen.
-
-    A view is what all C cameras of one frame see of a feature, m = 2 C rows.
-
-    Returns:
-        by_point: (J, F m, 3).
-        by_view: (J, F, m, 6 + C + 1) derivatives by the pose of the frame and the calibration, and
-            residuals.
-    """
-    J, F, C = len(obs.ids), len(obs.frames), int(obs.camera.max()) + 1
-    by_point = np.zeros((J, F, C, 2, 3))
-    by_point[obs.feature, obs.frame, obs.camera] = linear.by_point
-    rows = np.concatenate([linear.by_pose, linear.by_calibration, linear.r[:, :, None]], axis=2)
-    by_view = np.zeros((J, F, C, 2, rows.shape[2]))
-    by_view[obs.feature, obs.frame, obs.camera] = rows
-    return by_point.reshape(J, -1, 3), by_view.reshape(J, F, 2 * C, -1)
-
-
 def orthonormal_columns(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Q (J, m, 3) with orthonormal columns and R_f (J, 3, 3) of the m rows of each feature."""
     Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(by_point), 3, 3))
@@ -135,27 +116,6 @@ def orthonormal_columns(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
         R = np.linalg.cholesky(squares).transpose(0, 2, 1)
         Q, R_f = Q @ np.linalg.inv(R), R @ R_f
     return Q, R_f
-
-
-def _along(Q: FloatArray, by_view: FloatArray) -> FloatArray:
-    """Qᵀ [H_x r] of each feature, (J, 3, 6 F + C + 1)."""
-    J, F, m, _ = by_view.shape
-    views = Q.reshape(J, F, m, 3).transpose(0, 1, 3, 2) @ by_view
-    poses = views[:, :, :, :POSE_DIM].transpose(0, 2, 1, 3).reshape(J, 3, POSE_DIM * F)
-    return np.concatenate([poses, views[:, :, :, POSE_DIM:].sum(axis=1)], axis=2)
-
-
-def _view_information(by_view: FloatArray) -> FloatArray:
-    """Σ [H_x r]ᵀ [H_x r], (6 F + C + 1)²: a block for each pose, and all else."""
-    _, F, _, width = by_view.shape
-    size = POSE_DIM * F
-    information = np.zeros((size + width - POSE_DIM, size + width - POSE_DIM))
-    rest = np.arange(size, len(information))
-    for frame in range(F):
-        seen = np.ascontiguousarray(by_view[:, frame]).reshape(-1, width)
-        columns = np.append(np.arange(POSE_DIM * frame, POSE_DIM * (frame + 1)), rest)
-        information[np.ix_(columns, columns)] += seen.T @ seen
-    return information
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -51,6 +51,11 @@ class Observations:
         return np.bincount(self.feature, minlength=len(self.ids))
 
     @property
+    def starts(self) -> IntArray:
+        """(J + 1,) first observation of each feature, and N."""
+        return np.searchsorted(self.feature, np.arange(len(self.ids) + 1))
+
+    @property
     def slots(self) -> IntArray:
         """(N,) running number of each observation within its feature."""
         counts = self.counts

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv
 
 from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.cost.feature_factors import WhitenedObservations
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.kernels.gate import observation_distances, track_distances
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +107,37 @@ def squared_mahalanobis(r: FloatArray, H: FloatArray, covariance: FloatArray) ->
     """
     S = H @ covariance @ H.transpose(0, 2, 1) + np.eye(H.shape[1])
     distances: FloatArray = np.einsum("ji,ji->j", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+    return distances
+
+
+def distances_of_observations(
+    linear: WhitenedObservations, root: FloatArray, columns: NDArray[np.intp]
+) -> FloatArray:
+    """Squared Mahalanobis distances (N,) of observations of features of the state.
+
+    Args:
+        linear: N of them.
+        root: (m, n) of the covariance of the state, P = rootᵀ root.
+        columns: (N, 9 + C) of `root`, for pose, feature and calibration of each.
+    """
+    distances = np.empty(len(linear.r))
+    observation_distances(linear.r, linear.H, np.asfortranarray(root), columns, distances)
+    return distances
+
+
+def distances_of_tracks(
+    obs: Observations, linear: WhitenedObservations, covariance: FloatArray
+) -> FloatArray:
+    """Squared Mahalanobis distances (J,) of whole features, whatever their positions are.
+
+    Args:
+        obs: N observations of J features.
+        linear: their linearisation.
+        covariance: (6 F + C, 6 F + C) of poses and calibration.
+    """
+    distances = np.empty(len(obs.ids))
+    parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
+    track_distances(*parts, obs.frame, obs.starts, covariance, distances)
     return distances
 
 

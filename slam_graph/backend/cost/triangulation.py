@@ -64,7 +64,7 @@ def triangulate(
             larger.
     """
     count = len(obs.ids)
-    starts = np.searchsorted(obs.feature, np.arange(count + 1))
+    starts = obs.starts
     cameras = _world_cameras(obs, rig, rotations, positions)
     weights = rig.pixel_slopes(obs) if rig.wide else np.zeros((0, 2, 2))
     points, depth_error, parallax = np.empty((count, 3)), np.empty(count), np.empty(count)

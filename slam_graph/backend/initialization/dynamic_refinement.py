@@ -23,7 +23,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import PriorConfig, UnknownScale
 from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
-from slam_graph.backend.cost.feature_factors import ReducedFeatures
+from slam_graph.backend.cost.feature_factors import SummedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.cost.robust_loss import RobustLoss
@@ -44,7 +44,7 @@ from slam_graph.backend.marginalization.marginalize import (
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.gauss_newton import linearized, minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
-from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 
@@ -139,7 +139,7 @@ class DynamicRefinement:
             minimize(cost, _BATCH)
             self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
-            posterior, linear = linearized(cost), cost.linearize()
+            posterior, linear = linearized(cost), cost.linearize(summed=True)
             self.scale_sigma = _scale_sigma(cost, linear, posterior)
         except np.linalg.LinAlgError:
             return Refusal("motion", "motion that determines gravity and scale")
@@ -160,7 +160,7 @@ class DynamicRefinement:
             state_features=features,
             calibration=calibration,
         )
-        return self._doubt(_normalized_cost(linear), start) or start
+        return self._doubt(_normalized_cost(cost, linear), start) or start
 
     def _doubt(self, normalized_cost: float, start: Window) -> Refusal | None:
         """What is missing if a solution cannot be trusted; None if it can.
@@ -281,12 +281,13 @@ def _lasting(frames: StartFrames) -> Observations:
     return tracks.observations(ids[lengths >= 3])
 
 
-def _normalized_cost(linear: Linearization) -> float:
+def _normalized_cost(cost: Cost, linear: Linearization) -> float:
     """Mean squared residual of the features after their positions are eliminated, σ²."""
     tracks = linear.tracks
-    if not isinstance(tracks, ReducedFeatures):
+    if not isinstance(tracks, SummedFeatures) or cost.tracks is None:
         return float("inf")
-    return float(np.sum(tracks.r_2**2)) / max(int(np.sum(tracks.dof)), 1)
+    dof = int(np.sum(2 * cost.tracks.obs.counts - POINT_DIM))
+    return float(np.sum(tracks.rows[:, -1] ** 2)) / max(dof, 1)
 
 
 def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInformation) -> float:
@@ -296,7 +297,7 @@ def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInforma
     the scale. Absolute errors are no measure: if the scale is estimated too small, so are they.
     """
     tracks, features = linear.tracks, cost.tracks
-    if not isinstance(tracks, ReducedFeatures) or features is None or not len(features.points):
+    if not isinstance(tracks, SummedFeatures) or features is None or not len(features.points):
         return float("inf")
     keys = cost.rig.keys_of(features.obs)
     last = X(features.obs.frames[-1])

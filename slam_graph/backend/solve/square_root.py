@@ -187,24 +187,11 @@ class SquareRootInformation:
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The covariance of some variables only, in the order given."""
-        root = self._root_covariance_of(keys)
+        root = self.columns_of_root(keys)
         return np.asarray(root.T @ root, dtype=np.float64)
 
-    def covariance_blocks(self, keys: Sequence[int], columns: NDArray[np.intp]) -> FloatArray:
-        """Small blocks of the covariance of some variables, without forming the whole.
-
-        Args:
-            keys: the variables.
-            columns: (N, k) places in their stacked tangent.
-
-        Returns:
-            (N, k, k) the covariance of each row of `columns`.
-        """
-        root = np.ascontiguousarray(self._root_covariance_of(keys).T)[columns]
-        return np.asarray(root @ root.transpose(0, 2, 1), dtype=np.float64)
-
-    def _root_covariance_of(self, keys: Sequence[int]) -> FloatArray:
-        """Rows (m, k) of R⁻ᵀ, the columns of the variables; zero rows are left out."""
+    def columns_of_root(self, keys: Sequence[int]) -> FloatArray:
+        """A root (m, k) of the covariance of some variables: columns of R⁻ᵀ, without zero rows."""
         columns = self.layout.indices(keys)
         first = int(columns.min(initial=self.layout.size))
         right = np.zeros((self.layout.size - first, len(columns)), order="F")
