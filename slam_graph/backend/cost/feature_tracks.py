@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.sensors import FeatureFrame
 
 
@@ -144,10 +144,9 @@ class Removals:
 
     def apply(self, tracks: FeatureTracks) -> None:
         """Take the observations away: single ones first, then features in the order of adding."""
-        for outcome, obs in self._observations:
-            tracks.remove_observations(outcome, obs)
-        for outcome, ids in self._features:
-            tracks.remove(outcome, ids)
+        parts = [(outcome, tracks.rows_of(obs)) for outcome, obs in self._observations if len(obs)]
+        parts += [(outcome, tracks.rows_of_features(ids)) for outcome, ids in self._features]
+        tracks.remove_rows(parts)
 
 
 class FeatureTracks:
@@ -199,16 +198,28 @@ class FeatureTracks:
 
     def remove(self, outcome: Outcome, ids: IntArray) -> None:
         """Take away all observations of some features (ascending ids)."""
-        if len(ids):
-            self._keep(~is_in(self._ids, ids), outcome)
+        self._keep(~self.rows_of_features(ids), outcome)
 
-    def remove_observations(self, outcome: Outcome, obs: Observations) -> None:
-        """Take away single observations."""
-        if len(obs):
-            frames = np.array(obs.frames)[obs.frame]
-            key = self._key(obs.ids[obs.feature], frames, obs.camera)
-            rows = ~np.isin(self._key(self._ids, self._frames, self._cameras), key)
-            self._keep(rows, outcome)
+    def remove_rows(self, parts: Sequence[tuple[Outcome, BoolArray]]) -> None:
+        """Take away observations (N,); the first outcome that has an observation counts."""
+        left = np.ones(len(self), np.bool_)
+        for outcome, rows in parts:
+            gone = rows & left
+            count = int(np.count_nonzero(gone))
+            if count:
+                self.outcomes[outcome] += count
+                left &= ~gone
+        self._select(left)
+
+    def rows_of_features(self, ids: IntArray) -> BoolArray:
+        """Which observations (N,) are of some features (ascending ids)."""
+        return is_in(self._ids, ids)
+
+    def rows_of(self, obs: Observations) -> BoolArray:
+        """Which observations (N,) are among some."""
+        frames = np.array(obs.frames)[obs.frame]
+        key = self._key(obs.ids[obs.feature], frames, obs.camera)
+        return np.isin(self._key(self._ids, self._frames, self._cameras), key)
 
     def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
         """A number (N,) for each observation that no other one has."""
@@ -218,9 +229,11 @@ class FeatureTracks:
         return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
 
     def _keep(self, rows: NDArray[np.bool_], outcome: Outcome) -> None:
+        self.remove_rows([(outcome, ~rows)])
+
+    def _select(self, rows: NDArray[np.bool_]) -> None:
         if rows.all():
             return
-        self.outcomes[outcome] += int(np.sum(~rows))
         self._ids, self._frames, self._cameras = (
             self._ids[rows],
             self._frames[rows],

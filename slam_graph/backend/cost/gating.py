@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -76,7 +76,7 @@ class Innovations:
         return Innovations(passed_dof=total, expected=float(total))
 
     def __add__(self, other: Innovations) -> Innovations:
-        return Innovations(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+        return Innovations(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

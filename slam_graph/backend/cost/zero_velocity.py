@@ -23,6 +23,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import ZeroVelocityConfig
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0
@@ -102,7 +103,7 @@ class StandstillDetector:
             frame: compared by the features of its first camera.
         """
         start_ns = stamp_ns - round(self._config.window_s * 1e9)
-        self._recent.append((stamp_ns, frame.cameras[0]))
+        self._recent.append((stamp_ns, _by_id(frame.cameras[0])))
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
         self._measure_noise(start_ns)
@@ -112,7 +113,7 @@ class StandstillDetector:
             and self._images_are_still()
             and self._imu_is_still(imu, start_ns, stamp_ns)
         )
-        self.dynamic = np.intersect1d(self.dynamic, frame.cameras[0].ids)
+        self.dynamic = self.dynamic[is_in(self.dynamic, self._recent[-1][1].ids)]
         if still:
             self._find_dynamic()
         if not still:
@@ -128,7 +129,9 @@ class StandstillDetector:
     @property
     def noise_px(self) -> float:
         """Standard deviation of a coordinate of a feature over the window; 0 if not known."""
-        return float(np.median([sigma for _, sigma in self._noise_px])) if self._noise_px else 0.0
+        if not self._noise_px:
+            return 0.0
+        return float(_median(np.array([sigma for _, sigma in self._noise_px])))
 
     def _measure_noise(self, start_ns: int) -> None:
         """Measure the noise of the tracks by the second differences of the last three frames.
@@ -140,16 +143,17 @@ class StandstillDetector:
         if len(self._recent) < 3:
             return
         frames = [observations for _, observations in list(self._recent)[-3:]]
-        ids = np.intersect1d(frames[0].ids, frames[1].ids, assume_unique=True)
-        ids = np.intersect1d(ids, frames[2].ids, assume_unique=True)
-        ids = np.setdiff1d(ids, self.dynamic, assume_unique=True)
+        ids = frames[0].ids
+        for others in frames[1:]:
+            ids = ids[is_in(ids, others.ids)]
+        ids = ids[~is_in(ids, self.dynamic)]
         if len(ids) < MIN_FEATURES:
             return
-        first, second, third = (_pixels_of(ids, frame) for frame in frames)
+        first, second, third = (frame.pixels[np.searchsorted(frame.ids, ids)] for frame in frames)
         change = third - 2.0 * second + first
-        change -= np.median(change, axis=0)
+        change -= _median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
-        sigma = float(np.median(np.abs(change))) / (_NORMAL_MEDIAN * np.sqrt(6.0))
+        sigma = float(_median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * np.sqrt(6.0))
         self._noise_px.append((self._recent[-1][0], sigma))
 
     def _limit_px(self, motion_px: float, share: float, features: int) -> float:
@@ -164,7 +168,8 @@ class StandstillDetector:
         """Whether the last frame shows what the first and the last but one of the window show."""
         now = self._recent[-1][1]
         references = (self._recent[0][1], self._recent[-2][1])
-        now = now.select(~np.isin(now.ids, self.dynamic))
+        if len(self.dynamic):
+            now = now.select(~is_in(now.ids, self.dynamic))
         return all(self._is_still_between(before, now) for before in references)
 
     def _is_still_between(self, before: FeatureObservations, now: FeatureObservations) -> bool:
@@ -176,9 +181,10 @@ class StandstillDetector:
         ids, motion = _common_motion_px(before, now)
         if len(ids) < MIN_FEATURES or self.noise_px > _MAX_NOISE_PX:
             return False
-        least, median = np.quantile(np.linalg.norm(motion, axis=1), [_STATIC_SHARE, 0.5])
+        lengths = np.linalg.norm(motion, axis=1)
+        median, least = _median(lengths), np.quantile(lengths, _STATIC_SHARE)
         motion_px = self._max_disparity_px
-        common = float(np.linalg.norm(np.median(motion, axis=0)))
+        common = float(np.linalg.norm(_median(motion)))
         # the median of N normal differences has a standard deviation of sqrt(π / 2N) of theirs
         spread = np.sqrt(np.pi / len(ids)) * self.noise_px
         if median < self._limit_px(motion_px, 0.5, len(ids)):
@@ -231,19 +237,29 @@ def _rayleigh(share: float) -> float:
     return float(np.sqrt(-2.0 * np.log(1.0 - share)))
 
 
-def _pixels_of(ids: IntArray, observations: FeatureObservations) -> FloatArray:
-    """Pixels (N, 2) of features (N,) that are all observed."""
+def _by_id(observations: FeatureObservations) -> FeatureObservations:
+    """The same observations in ascending order of their ids."""
     order = np.argsort(observations.ids)
-    pixels: FloatArray = observations.pixels[order[np.searchsorted(observations.ids[order], ids)]]
-    return pixels
+    ids, pixels = observations.ids[order], observations.pixels[order]
+    return FeatureObservations(ids, pixels, observations.normalized[order])
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """The median of an array along its first axis; NumPy's takes many times as long."""
+    ascending, count = np.sort(values, axis=0), len(values)
+    return np.asarray(0.5 * (ascending[(count - 1) // 2] + ascending[count // 2]))
 
 
 def _common_motion_px(
     before: FeatureObservations, after: FeatureObservations
 ) -> tuple[IntArray, FloatArray]:
-    """Ids (N,) of common features, and how they moved in the image (N, 2)."""
-    ids, i, j = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
-    return ids, after.pixels[j] - before.pixels[i]
+    """Ids (N,) of common features, and how they moved in the image (N, 2).
+
+    Both are in ascending order of ids.
+    """
+    common = is_in(after.ids, before.ids)
+    ids = after.ids[common]
+    return ids, after.pixels[common] - before.pixels[np.searchsorted(before.ids, ids)]
 
 
 def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:
