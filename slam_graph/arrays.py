@@ -1,13 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Array types that all modules share, and the matrix of the cross product."""
+"""Array types that all modules share, the matrix of the cross product, and medians."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "skew"]
+__all__ = ["BoolArray", "FloatArray", "IntArray", "median", "skew"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -17,3 +19,9 @@ BoolArray = NDArray[np.bool_]
 def skew(v: FloatArray) -> FloatArray:
     """[v]ₓ (N, 3, 3) of vectors v (N, 3), so that [v]ₓ u = v × u."""
     return np.cross(v[:, None, :], -np.eye(3))
+
+
+def median(values: NDArray[Any]) -> FloatArray:
+    """The median along the first axis of an array; NumPy's takes many times as long."""
+    ascending, count = np.sort(values, axis=0), len(values)
+    return np.asarray(0.5 * (ascending[(count - 1) // 2] + ascending[count // 2]))

@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, median
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
@@ -213,9 +213,9 @@ class DynamicsNoise:
         recent = imu.data[int(np.searchsorted(imu.data.stamps_ns, since_ns)) :]
         if len(recent) < _FEWEST_SAMPLES:
             return self.vibrates
-        spacing_s = float(np.median(np.diff(recent.stamps_ns))) * 1e-9
-        median = float(np.median(np.abs(np.diff(recent.accel, n=3, axis=0))))
-        sigma = median / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)
+        spacing_s = float(median(np.diff(recent.stamps_ns))) * 1e-9
+        size = float(median(np.abs(np.diff(recent.accel, n=3, axis=0)).ravel()))
+        sigma = size / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)
         density = self._config.imu_scale * self._imu.accel_noise_density
         return bool(sigma > _VIBRATION_RATIO * density / np.sqrt(spacing_s))
 

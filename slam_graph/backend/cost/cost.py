@@ -98,6 +98,7 @@ class Cost:
     tracks: TrackFeatures | None = None
     loss: RobustLoss | None = None
     sigma_px: FloatArray | None = None
+    _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
 
     @property
     def robust(self) -> RobustLoss:
@@ -112,16 +113,24 @@ class Cost:
 
     def layout(self) -> Layout:
         """Columns of the variables: those of the prior, then the new ones."""
+        tracks = self.tracks
+        depends_on: tuple[object, ...] = self.prior, self.landmarks
+        if tracks is not None:
+            depends_on += tracks.obs, tracks.in_state
+        if self._layout is not None and _are_same(self._layout[0], depends_on):
+            return self._layout[1]
         keys = [key for factor in self.factors for key in factor.keys()]  # noqa: SIM118
         if self.landmarks is not None:
             keys += self.rig.keys_of(self.landmarks)
-            keys += [L(j) for j in np.unique(self.landmarks.ids[self.landmarks.feature]).tolist()]
-        if self.tracks is not None:
-            keys += self.rig.keys_of(self.tracks.obs)
-            keys += [L(j) for j in self.tracks.obs.ids[self.tracks.in_state].tolist()]
-        return self.prior.layout.extended(
+            keys += landmark_keys(self.landmarks.ids[self.landmarks.counts > 0])
+        if tracks is not None:
+            keys += self.rig.keys_of(tracks.obs)
+            keys += landmark_keys(tracks.obs.ids[tracks.in_state])
+        layout = self.prior.layout.extended(
             dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
         )
+        self._layout = depends_on, layout
+        return layout
 
     def prior_at_estimate(self) -> SquareRootInformation:
         """The prior as a function of an increment of the current estimates."""
@@ -272,7 +281,7 @@ class Cost:
         innovations, confidence = Innovations(), self.config.gating.confidence
         if linear.landmarks is not None and self.landmarks is not None:
             keys = self.rig.keys_of(self.landmarks)
-            keys += [L(int(j)) for j in np.unique(self.landmarks.ids[self.landmarks.feature])]
+            keys += landmark_keys(self.landmarks.ids[self.landmarks.counts > 0])
             columns = self._state_columns(self.landmarks, Layout(dims_of(keys)))
             root = predicted.columns_of_root(keys)
             distance = distances_of_observations(linear.landmarks, root, columns)
@@ -294,7 +303,7 @@ class Cost:
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
         poses = np.array([layout.columns[X(i)].start for i in obs.frames])
-        keys = [L(j) for j in obs.ids.tolist()]
+        keys = landmark_keys(obs.ids)
         points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
         calibration = layout.indices(self.rig.calibration_keys)
         return np.concatenate(
@@ -305,6 +314,17 @@ class Cost:
             ],
             axis=1,
         )
+
+
+def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:
+    """Whether two tuples hold the very same objects."""
+    return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
+
+
+def landmark_keys(ids: IntArray) -> list[int]:
+    """Keys of features (J,): GTSAM's symbols have their index in the lowest bits."""
+    keys: list[int] = (ids + L(0)).tolist()
+    return keys
 
 
 def _state_rows(

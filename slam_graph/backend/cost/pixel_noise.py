@@ -104,16 +104,18 @@ class PixelNoise:
         self._stamp_ns = stamp_ns
         if tracks is None:
             return
-        moved = _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
-        known = tracks.subset(moved & (tracks.obs.counts >= _MIN_OBSERVATIONS))
+        known = tracks.subset(tracks.obs.counts >= _MIN_OBSERVATIONS)
         if len(known.obs) == 0:
             return
-        residuals, by_point = _whitened(cost, known, self.sigma_px)
+        known = known.subset(_extents_px(known.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX)
+        if len(known.obs) == 0:
+            return
+        try:
+            projected = ProjectedTracks.of(known.obs, *_whitened(cost, known, self.sigma_px))
+        except np.linalg.LinAlgError:  # a point that its observations do not determine
+            return
         for camera in range(len(self.sigma_px)):
-            try:
-                means = block_means(known.obs, residuals, by_point, camera)
-            except np.linalg.LinAlgError:  # a point that its observations do not determine
-                return
+            means = projected.block_means(camera)
             self._dof[camera] += np.sum(means.dof)
             share = float(means.dof @ means.winsorised())
             self._squares[camera] += share * self.sigma_px[camera] ** 2
@@ -144,37 +146,61 @@ def _whitened(
     obs, rig = tracks.obs, cost.rig.at(cost.state)
     at = Geometry(*rig.poses(cost.state.estimate, obs.frames), tracks.points)
     sigma = sigma_px[obs.camera]
-    residuals, _ = rig.residuals(obs, at)
-    _, by_point = rig.jacobians(obs, at)
-    return residuals / sigma[:, None], by_point / sigma[:, None, None]
+    views = rig.views(obs, at)
+    by_point = rig.derivatives(obs, at, views)[1]
+    return (obs.pixels - views.pixels) / sigma[:, None], by_point / sigma[:, None, None]
 
 
-def block_means(
-    obs: Observations, residuals: FloatArray, by_point: FloatArray, camera: int
-) -> BlockMeans:
-    """The squared block means of tracks in one camera.
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectedTracks:
+    """Residuals of J tracks off the directions of their points, in M places for observations.
 
-    Args:
+    Attributes:
         obs: N observations of J features, sorted by feature and frame.
-        residuals: (N, 2) in standard deviations.
-        by_point: (N, 2, 3) derivatives by the position of the feature.
-        camera: whose observations are averaged; those of others only say where the point is.
+        e: (J, M, 2) residuals in standard deviations, off the directions.
+        Q: (J, M, 2, 3) orthonormal directions of the point of each track.
     """
-    J, M = len(obs.ids), int(obs.counts.max(initial=2))
-    e, H = np.zeros((J, M, 2)), np.zeros((J, M, 2, 3))
-    e[obs.feature, obs.slots], H[obs.feature, obs.slots] = residuals, by_point
-    Q, _ = orthonormal_columns(H.reshape(J, 2 * M, 3))
-    e -= (Q @ (Q.transpose(0, 2, 1) @ e.reshape(J, 2 * M, 1))).reshape(e.shape)
-    B = _averages(obs, camera, M)
-    means = B @ e
-    BQ = np.einsum("jbm,jmxq->jbxq", B, Q.reshape(J, M, 2, 3)).reshape(J, -1, 3)
-    S = -BQ @ BQ.transpose(0, 2, 1)
-    each = np.repeat(np.sum(B**2, axis=2), 2, axis=1)
-    S[:, range(S.shape[1]), range(S.shape[1])] += each
-    trace, square = np.trace(S, axis1=1, axis2=2), np.sum(S**2, axis=(1, 2))
-    some = each.any(axis=1) & (trace > 0.0)
-    squares = np.sum(means**2, axis=(1, 2))[some] / trace[some]
-    return BlockMeans(squares, trace[some] ** 2 / square[some])
+
+    obs: Observations
+    e: FloatArray
+    Q: FloatArray
+
+    @staticmethod
+    def of(obs: Observations, residuals: FloatArray, by_point: FloatArray) -> ProjectedTracks:
+        """Those of tracks.
+
+        Args:
+            obs: N observations of J features, sorted by feature and frame.
+            residuals: (N, 2) in standard deviations.
+            by_point: (N, 2, 3) derivatives by the position of the feature.
+
+        Raises:
+            numpy.linalg.LinAlgError: if observations do not determine their point.
+        """
+        J, M, slots = len(obs.ids), int(obs.counts.max(initial=2)), obs.slots
+        e, H = np.zeros((J, M, 2)), np.zeros((J, M, 2, 3))
+        e[obs.feature, slots], H[obs.feature, slots] = residuals, by_point
+        Q, _ = orthonormal_columns(H.reshape(J, 2 * M, 3))
+        e -= (Q @ (Q.transpose(0, 2, 1) @ e.reshape(J, 2 * M, 1))).reshape(e.shape)
+        return ProjectedTracks(obs, e, Q.reshape(J, M, 2, 3))
+
+    def block_means(self, camera: int) -> BlockMeans:
+        """The squared block means of the tracks.
+
+        Args:
+            camera: whose observations are averaged; those of others only say where the point is.
+        """
+        J, M, _ = self.e.shape
+        B = _averages(self.obs, camera, M)
+        means = B @ self.e
+        BQ = (B @ self.Q.reshape(J, M, 6)).reshape(J, -1, 3)
+        S = -BQ @ BQ.transpose(0, 2, 1)
+        each = np.repeat(np.sum(B**2, axis=2), 2, axis=1)
+        S[:, range(S.shape[1]), range(S.shape[1])] += each
+        trace, square = np.trace(S, axis1=1, axis2=2), np.sum(S**2, axis=(1, 2))
+        some = each.any(axis=1) & (trace > 0.0)
+        squares = np.sum(means**2, axis=(1, 2))[some] / trace[some]
+        return BlockMeans(squares, trace[some] ** 2 / square[some])
 
 
 def _averages(obs: Observations, camera: int, slots: int) -> FloatArray:

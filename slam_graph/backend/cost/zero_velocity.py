@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
@@ -131,7 +131,7 @@ class StandstillDetector:
         """Standard deviation of a coordinate of a feature over the window; 0 if not known."""
         if not self._noise_px:
             return 0.0
-        return float(_median(np.array([sigma for _, sigma in self._noise_px])))
+        return float(median(np.array([sigma for _, sigma in self._noise_px])))
 
     def _measure_noise(self, start_ns: int) -> None:
         """Measure the noise of the tracks by the second differences of the last three frames.
@@ -151,9 +151,9 @@ class StandstillDetector:
             return
         first, second, third = (frame.pixels[np.searchsorted(frame.ids, ids)] for frame in frames)
         change = third - 2.0 * second + first
-        change -= _median(change)
+        change -= median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
-        sigma = float(_median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * np.sqrt(6.0))
+        sigma = float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * np.sqrt(6.0))
         self._noise_px.append((self._recent[-1][0], sigma))
 
     def _limit_px(self, motion_px: float, share: float, features: int) -> float:
@@ -182,12 +182,12 @@ class StandstillDetector:
         if len(ids) < MIN_FEATURES or self.noise_px > _MAX_NOISE_PX:
             return False
         lengths = np.linalg.norm(motion, axis=1)
-        median, least = _median(lengths), np.quantile(lengths, _STATIC_SHARE)
+        middle, least = median(lengths), np.quantile(lengths, _STATIC_SHARE)
         motion_px = self._max_disparity_px
-        common = float(np.linalg.norm(_median(motion)))
+        common = float(np.linalg.norm(median(motion)))
         # the median of N normal differences has a standard deviation of sqrt(π / 2N) of theirs
         spread = np.sqrt(np.pi / len(ids)) * self.noise_px
-        if median < self._limit_px(motion_px, 0.5, len(ids)):
+        if middle < self._limit_px(motion_px, 0.5, len(ids)):
             return bool(common < motion_px + _SAMPLING_SIGMAS * spread)
         limit_px = self._limit_px(motion_px / _DYNAMIC_RATIO, _STATIC_SHARE, len(ids))
         return bool(least < limit_px < motion_px)
@@ -242,12 +242,6 @@ def _by_id(observations: FeatureObservations) -> FeatureObservations:
     order = np.argsort(observations.ids)
     ids, pixels = observations.ids[order], observations.pixels[order]
     return FeatureObservations(ids, pixels, observations.normalized[order])
-
-
-def _median(values: FloatArray) -> FloatArray:
-    """The median of an array along its first axis; NumPy's takes many times as long."""
-    ascending, count = np.sort(values, axis=0), len(values)
-    return np.asarray(0.5 * (ascending[(count - 1) // 2] + ascending[count // 2]))
 
 
 def _common_motion_px(
