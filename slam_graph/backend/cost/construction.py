@@ -20,7 +20,7 @@ from gtsam.symbol_shorthand import L
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
-from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
+from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
 from slam_graph.backend.cost.feature_tracks import (
     Observations,
@@ -311,16 +311,14 @@ class CostConstruction:
             landmarks = landmarks.subset(gate.landmarks)
         if linear.tracks is not None and cost.tracks is not None:
             assert isinstance(linear.tracks, WhitenedObservations)
-            passed = linear.tracks.subset(gate.tracks[cost.tracks.obs.feature])
+            tracks = linear.tracks.subset(gate.tracks[cost.tracks.obs.feature])
             bad_ids = cost.tracks.obs.ids[~gate.tracks]
             self.rejected = np.union1d(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
             cost.tracks = cost.tracks.subset(gate.tracks)
-            if len(cost.tracks.obs):
-                tracks = sum_features(cost.tracks.obs, passed)
             for row in np.flatnonzero(cost.tracks.in_state):
                 cost.state.insert_point(int(cost.tracks.obs.ids[row]), cost.tracks.points[row])
-        return Linearization(landmarks, tracks)
+        return Linearization.of(landmarks, tracks, cost.tracks.obs if cost.tracks else None)
 
     # --- what stays ------------------------------------------------------------------------------
 

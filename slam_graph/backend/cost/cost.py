@@ -65,10 +65,26 @@ class Linearization:
     Attributes:
         landmarks: observations of the features of the state.
         tracks: features outside the state: each observation, as the gate needs them, or summed up.
+        errors: (N,) lengths of all residuals of observations, in standard deviations.
     """
 
     landmarks: WhitenedObservations | None
     tracks: WhitenedObservations | SummedFeatures | None
+    errors: FloatArray
+
+    @staticmethod
+    def of(
+        landmarks: WhitenedObservations | None,
+        tracks: WhitenedObservations | None,
+        summed: Observations | None,
+    ) -> Linearization:
+        """That of some observations; the tracks are summed up if they are given as `summed`."""
+        errors = [part.errors for part in (landmarks, tracks) if part is not None]
+        stacked = np.concatenate(errors) if errors else np.zeros(0)
+        if tracks is None or summed is None:
+            return Linearization(landmarks, tracks, stacked)
+        total = sum_features(summed, tracks) if len(summed) else None
+        return Linearization(landmarks, total, stacked)
 
 
 @dataclass(eq=False)
@@ -154,12 +170,18 @@ class Cost:
         """Ids, ascending, of some of the new features (J,)."""
         return self.tracks.obs.ids[tracks] if self.tracks is not None else np.zeros(0, np.int64)
 
-    def value(self) -> float:
-        """The cost at the current estimates: half the squared residuals, under the robust loss."""
+    def value(self, linear: Linearization | None = None) -> float:
+        """The cost at the current estimates: half the squared residuals, under the robust loss.
+
+        Args:
+            linear: the linearisation there, if it is known; it has the residuals of observations.
+        """
         offset = self.state.offset(self.prior.layout)
         total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
         total += 0.5 * self.prior.residual
         total += sum(factor.error(self.state.estimate) for factor in self.factors)
+        if linear is not None:
+            return total + float(np.sum(self.robust.value(linear.errors)))
         if self.landmarks is not None and len(self.landmarks):
             total += self._loss(self.landmarks, None)
         if self.tracks is not None and len(self.tracks.obs):
@@ -197,9 +219,9 @@ class Cost:
             landmarks = self._whitened(self.landmarks, None)
         if self.tracks is not None and len(self.tracks.obs):
             tracks = self._whitened(self.tracks.obs, self.tracks.points)
-            if summed:
-                return Linearization(landmarks, sum_features(self.tracks.obs, tracks))
-        return Linearization(landmarks, tracks)
+        return Linearization.of(
+            landmarks, tracks, self.tracks.obs if summed and self.tracks else None
+        )
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
         rig = self.rig.at(self.state)
@@ -279,11 +301,12 @@ class Cost:
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
         innovations, confidence = Innovations(), self.config.gating.confidence
+        keys = self._gated_keys(linear)
+        if not keys:
+            return Gate(landmarks, tracks, innovations)
+        layout, root = Layout(dims_of(keys)), predicted.columns_of_root(keys)
         if linear.landmarks is not None and self.landmarks is not None:
-            keys = self.rig.keys_of(self.landmarks)
-            keys += landmark_keys(self.landmarks.ids[self.landmarks.counts > 0])
-            columns = self._state_columns(self.landmarks, Layout(dims_of(keys)))
-            root = predicted.columns_of_root(keys)
+            columns = self._state_columns(self.landmarks, layout)
             distance = distances_of_observations(linear.landmarks, root, columns)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
@@ -293,12 +316,24 @@ class Cost:
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if linear.tracks is not None and self.tracks is not None:
             assert not isinstance(linear.tracks, SummedFeatures), "these are not told apart"
-            P, obs = predicted.covariance_of(self.rig.keys_of(self.tracks.obs)), self.tracks.obs
-            distance, dof = distances_of_tracks(obs, linear.tracks, P), 2 * obs.counts - POINT_DIM
+            obs = self.tracks.obs
+            of_poses = root[:, layout.indices(self.rig.keys_of(obs))]
+            distance = distances_of_tracks(obs, linear.tracks, of_poses.T @ of_poses)
+            dof = 2 * obs.counts - POINT_DIM
             largest = threshold(dof, confidence)
             tracks = distance < largest
             innovations += Innovations.of(distance, dof, largest, tracks)
         return Gate(landmarks, tracks, innovations)
+
+    def _gated_keys(self, linear: Linearization) -> list[int]:
+        """Keys of all variables that the observations depend on, without the new features."""
+        keys: list[int] = []
+        if linear.landmarks is not None and self.landmarks is not None:
+            keys += landmark_keys(self.landmarks.ids[self.landmarks.counts > 0])
+            keys += self.rig.keys_of(self.landmarks)
+        if linear.tracks is not None and self.tracks is not None:
+            keys += self.rig.keys_of(self.tracks.obs)
+        return list(dict.fromkeys(keys))
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""

@@ -128,6 +128,7 @@ class WhitenedObservations:
         by_point: (N, 2, 3).
         by_calibration: (N, 2, C), by the parameters of the rig that are estimated.
         depths: (N,) in metres.
+        errors: (N,) lengths of the residuals before the robust loss reduced their weight.
     """
 
     r: FloatArray
@@ -135,6 +136,7 @@ class WhitenedObservations:
     by_point: FloatArray
     by_calibration: FloatArray
     depths: FloatArray
+    errors: FloatArray
 
     @property
     def H(self) -> FloatArray:
@@ -149,6 +151,7 @@ class WhitenedObservations:
             self.by_point[keep],
             self.by_calibration[keep],
             self.depths[keep],
+            self.errors[keep],
         )
 
 
@@ -211,14 +214,15 @@ def whiten(
     """
     residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
-    r = residuals / np.broadcast_to(sigma_px, len(obs))[:, None]
-    weight = np.sqrt(loss.weights(np.linalg.norm(r, axis=1))) / sigma_px
+    errors = np.sqrt(np.einsum("ni,ni->n", residuals, residuals)) / sigma_px
+    weight = np.sqrt(loss.weights(errors)) / sigma_px
     return WhitenedObservations(
         residuals * weight[:, None],
         by_pose * weight[:, None, None],
         by_point * weight[:, None, None],
         by_calibration * weight[:, None, None],
         depths,
+        errors,
     )
 
 

@@ -72,8 +72,9 @@ def minimize(
     """
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
-    layout, before = cost.layout(), cost.value()
-    posterior, delta = _step(cost, linear or cost.linearize(summed=True), layout, predicted)
+    linear = linear or cost.linearize(summed=True)
+    layout, before = cost.layout(), cost.value(linear)
+    posterior, delta = _step(cost, linear, layout, predicted)
     minimum = Minimum(posterior, (before, cost.value()))
     while _another(policy, minimum, delta, again):
         undo = cost.snapshot()
@@ -157,7 +158,7 @@ class _DampedCost:
 
     def value(self) -> float:
         """The cost under the robust loss."""
-        return self._cost.value()
+        return self._cost.value(self._given)
 
     def linearize(self) -> None:
         """Linearise all residuals."""
