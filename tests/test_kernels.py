@@ -23,7 +23,7 @@ from slam_graph.kernels.projection import (
     to_cameras,
     to_cameras_numpy,
 )
-from slam_graph.kernels.triangulation import triangulate_rays, triangulate_rays_numpy
+from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
 from slam_graph.sensors import Camera
 
 EQUAL = 1e-12

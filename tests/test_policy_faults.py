@@ -28,7 +28,6 @@ from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES, POSE_SE
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize
-from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
 from slam_graph.sensors.measurements import FeatureFrame, Packet
 
@@ -66,8 +65,8 @@ class Faults:
         leave_out, errors = CostConstruction._leave_out, Cost.squared_errors
         gate, reject = Cost.gate, CostConstruction.reject_residuals
 
-        def some_gated(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> Gate:
-            found = gate(cost, linear, predicted)
+        def some_gated(cost: Cost, *arguments: Any) -> Gate:
+            found = gate(cost, *arguments)
             kept = [self._some(len(part)) for part in (found.landmarks, found.tracks)]
             return replace(
                 found, landmarks=found.landmarks & kept[0], tracks=found.tracks & kept[1]

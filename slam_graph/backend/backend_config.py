@@ -73,7 +73,7 @@ class TriangulationConfig(Settings):
     """Smallest accepted angle between two rays to a feature."""
 
     moved: ClassVar[Mapping[str, str]] = {
-        "iterations": "is a constant now: STEPS in kernels/triangulation.py",
+        "iterations": "is a constant now: STEPS in kernels/ray_triangulation.py",
     }
 
 

@@ -281,9 +281,11 @@ class CostConstruction:
         one of so many tests, whatever it is. Its observations are tested after the steps.
         """
         linear = cost.linearize()
-        gate = cost.gate(linear, predicted)
+        entered = None
         if self._features.relinearized and cost.tracks is not None:
             entered = is_in(cost.tracks.obs.ids, window.kept_points[0])
+        gate = cost.gate(linear, predicted, None if entered is None else ~entered)
+        if entered is not None and cost.tracks is not None:
             passed = gate.tracks | entered
             dof = np.append(
                 2 * cost.tracks.obs.counts[passed] - POINT_DIM,

@@ -25,7 +25,7 @@ from slam_graph.backend.cost.feature_factors import (
     sum_features,
     whiten,
 )
-from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.gating import (
     Gate,
     Innovations,
@@ -36,7 +36,7 @@ from slam_graph.backend.cost.gating import (
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
-from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, stacked_points
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys, stacked_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,12 +291,18 @@ class Cost:
 
     # --- gating --------------------------------------------------------------------------------
 
-    def gate(self, linear: Linearization, predicted: SquareRootInformation) -> Gate:
+    def gate(
+        self,
+        linear: Linearization,
+        predicted: SquareRootInformation,
+        tested: BoolArray | None = None,
+    ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
         Args:
             linear: of this cost, not summed up.
             predicted: what is known of the variables before these measurements.
+            tested: (J,) which of the new features are tested; all of them if it is not given.
         """
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
@@ -316,13 +322,16 @@ class Cost:
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if linear.tracks is not None and self.tracks is not None:
             assert not isinstance(linear.tracks, SummedFeatures), "these are not told apart"
-            obs = self.tracks.obs
+            obs, observations = self.tracks.obs, linear.tracks
+            if tested is not None:
+                obs, observations = obs.subset(tested), observations.subset(tested[obs.feature])
             of_poses = root[:, layout.indices(self.rig.keys_of(obs))]
-            distance = distances_of_tracks(obs, linear.tracks, of_poses.T @ of_poses)
+            distance = distances_of_tracks(obs, observations, of_poses.T @ of_poses)
             dof = 2 * obs.counts - POINT_DIM
             largest = threshold(dof, confidence)
-            tracks = distance < largest
-            innovations += Innovations.of(distance, dof, largest, tracks)
+            passed = distance < largest
+            innovations += Innovations.of(distance, dof, largest, passed)
+            tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
         return Gate(landmarks, tracks, innovations)
 
     def _gated_keys(self, linear: Linearization) -> list[int]:
@@ -356,12 +365,6 @@ def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:
     return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
 
 
-def landmark_keys(ids: IntArray) -> list[int]:
-    """Keys of features (J,): GTSAM's symbols have their index in the lowest bits."""
-    keys: list[int] = (ids + L(0)).tolist()
-    return keys
-
-
 def _state_rows(
     linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
@@ -375,11 +378,9 @@ def _state_rows(
 def _null_space_rows(
     linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
 ) -> FloatArray:
-    """What new features say of all else, compressed to at most 6 F + C + 1 rows."""
-    compact = linear.rows
-    Ab = np.zeros((len(compact), layout.size + 1))
-    Ab[:, columns] = compact[:, :-1]
-    Ab[:, -1] = compact[:, -1]
+    """What new features say of all else, at most 6 F + C + 1 rows."""
+    Ab = np.zeros((len(linear.rows), layout.size + 1))
+    Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
     return Ab
 
 

@@ -85,7 +85,7 @@ class Gate:
 
     Attributes:
         landmarks: (N,) observations of features of the state that pass.
-        tracks: (J,) new features that pass.
+        tracks: (J,) new features that pass, of those that were tested.
         innovations: their distances.
     """
 

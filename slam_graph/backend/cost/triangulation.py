@@ -20,7 +20,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.kernels.triangulation import triangulate_rays
+from slam_graph.kernels.ray_triangulation import triangulate_rays
 from slam_graph.sensors import FeatureFrame, Rig
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, D, L, V, X
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.geometry import NavState
 
@@ -252,6 +252,12 @@ def stacked_poses(values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArr
 def stacked_points(values: gtsam.Values, features: Iterable[int]) -> FloatArray:
     """Positions (J, 3) of some features."""
     return np.array([values.atPoint3(L(j)) for j in features]).reshape(-1, 3)
+
+
+def landmark_keys(ids: IntArray) -> list[int]:
+    """Keys of features (J,): GTSAM's symbols have their index in the lowest bits."""
+    keys: list[int] = (ids + L(0)).tolist()
+    return keys
 
 
 def dims_of(keys: Iterable[int]) -> Mapping[int, int]:
