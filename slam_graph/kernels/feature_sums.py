@@ -21,9 +21,13 @@ _REGULARISATION = 1e-15
 def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
     """Make the columns of (m, 3) rows orthonormal; R (3, 3) is what they were multiplied with."""
     squares, L, before = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    R[:] = np.eye(3)
+    for a in range(3):
+        for b in range(3):
+            R[a, b] = 1.0 if a == b else 0.0
     for _ in range(2):
-        squares[:] = 0.0
+        for a in range(3):
+            for b in range(3):
+                squares[a, b], before[a, b] = 0.0, R[a, b]
         for i in range(m):
             for a in range(3):
                 for b in range(3):
@@ -40,7 +44,6 @@ def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
                 for k in range(a):
                     Q[i, a] -= L[a, k] * Q[i, k]
                 Q[i, a] /= L[a, a]
-        before[:] = R
         for a in range(3):
             for b in range(3):
                 R[a, b] = 0.0
@@ -81,7 +84,9 @@ def sum_of_features(
     """
     width, C = len(information), by_calibration.shape[2]
     first = width - 1 - C
-    information[:], T[:] = 0.0, 0.0
+    for a in range(width):
+        for b in range(width):
+            information[a, b] = 0.0
     longest = 0
     for j in range(len(T)):
         longest = max(longest, starts[j + 1] - starts[j])
@@ -91,14 +96,18 @@ def sum_of_features(
         columns[6 + k] = first + k
     for j in range(len(T)):
         begin, m = starts[j], 2 * (starts[j + 1] - starts[j])
-        for row in range(m):
-            Q[row] = by_point[begin + row // 2, row % 2]
+        for k in range(3):
+            for row in range(m):
+                Q[row, k] = by_point[begin + row // 2, row % 2, k]
+            for a in range(width):
+                T[j, k, a] = 0.0
         _orthonormalize(Q, m, R_f[j])
         for row in range(m):
             n, i = begin + row // 2, row % 2
             for k in range(6):
                 columns[k], h[k] = 6 * frame[n] + k, by_pose[n, i, k]
-            h[6 : 6 + C] = by_calibration[n, i]
+            for k in range(C):
+                h[6 + k] = by_calibration[n, i, k]
             h[6 + C] = r[n, i]
             for a in range(7 + C):
                 for k in range(3):

@@ -35,7 +35,8 @@ def observation_distances(
     rows = len(root)
     y = np.empty((2, rows))
     for n in range(len(r)):
-        y[:] = 0.0
+        for i in range(rows):
+            y[0, i] = y[1, i] = 0.0
         for k in range(columns.shape[1]):
             column = root[:, columns[n, k]]
             a, b = H[n, 0, k], H[n, 1, k]
@@ -47,7 +48,7 @@ def observation_distances(
             s00 += y[0, i] * y[0, i]
             s01 += y[0, i] * y[1, i]
             s11 += y[1, i] * y[1, i]
-        u, v = r[n]
+        u, v = r[n, 0], r[n, 1]
         distances[n] = (s11 * u * u - 2.0 * s01 * u * v + s00 * v * v) / (s00 * s11 - s01 * s01)
 
 
@@ -125,13 +126,15 @@ def track_distances(
         for row in range(m):
             n, i = begin + row // 2, row % 2
             rest[row, 0] = r[n, i]
-            rest[row, 1:] = by_point[n, i]
-            HP[:] = 0.0
+            for k in range(3):
+                rest[row, 1 + k] = by_point[n, i, k]
+            for column in range(size):
+                HP[column] = 0.0
             for k in range(6 + C):
                 h = by_pose[n, i, k] if k < 6 else by_calibration[n, i, k - 6]
-                state = covariance[6 * frame[n] + k if k < 6 else first + k - 6]
+                state = 6 * frame[n] + k if k < 6 else first + k - 6
                 for column in range(size):
-                    HP[column] += h * state[column]
+                    HP[column] += h * covariance[state, column]
             for other in range(row, m):
                 o, i_o = begin + other // 2, other % 2
                 value = 1.0 if other == row else 0.0

@@ -49,7 +49,7 @@ def _nearest_to_rays(
     for i in range(3):
         lhs[i, i] = _REGULARISATION
     for n in range(first, last):
-        u, v = normalized[n]
+        u, v = normalized[n, 0], normalized[n, 1]
         length = math.sqrt(u * u + v * v + 1.0)
         for i in range(3):
             b[i] = (R[n, i, 0] * u + R[n, i, 1] * v + R[n, i, 2]) / length
@@ -77,7 +77,10 @@ def _normal_equations(
     rhs: FloatArray,
 ) -> float:
     """Squared error, JᵀJ (3, 3) and Jᵀr (3,) of one feature at x (3,)."""
-    lhs[:], rhs[:] = 0.0, 0.0
+    for i in range(3):
+        rhs[i] = 0.0
+        for k in range(3):
+            lhs[i, k] = 0.0
     error = 0.0
     J, r, p = np.empty((2, 3)), np.empty(2), np.empty(3)
     for n in range(first, last):
@@ -145,8 +148,9 @@ def _refine(
     for _ in range(STEPS):
         converged = True
         for j in range(count):
-            damped[:] = lhs[j]
             for i in range(3):
+                for k in range(3):
+                    damped[i, k] = lhs[j, i, k]
                 damped[i, i] += lhs[j, i, i] * damping[j] + _REGULARISATION
             _solve(damped, rhs[j], step)
             for i in range(3):
@@ -159,7 +163,11 @@ def _refine(
                 R, t, normalized, weights, first, last, trial, trial_lhs, trial_rhs
             )
             if trial_error < error[j]:
-                x[j], lhs[j], rhs[j], error[j] = trial, trial_lhs, trial_rhs, trial_error
+                error[j] = trial_error
+                for i in range(3):
+                    x[j, i], rhs[j, i] = trial[i], trial_rhs[i]
+                    for k in range(3):
+                        lhs[j, i, k] = trial_lhs[i, k]
                 damping[j] *= 0.1
             else:
                 damping[j] *= 10.0
@@ -211,7 +219,8 @@ def triangulate_rays(
         _nearest_to_rays(world_R_camera, world_p_camera, normalized, home, starts[j + 1], points[j])
         _start(world_R_camera[home], world_p_camera[home], normalized[home], points[j], x[j])
     _refine(R, t, normalized, weights, starts, x, lhs)
-    known, unit, toward = np.empty(3), np.array([0.0, 0.0, 1.0]), np.empty((2, 3))
+    known, unit, toward = np.empty(3), np.zeros(3), np.empty((2, 3))
+    unit[2] = 1.0
     for j in range(len(points)):
         home = starts[j]
         for i in range(3):
