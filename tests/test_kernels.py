@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
 from slam_graph.kernels.feature_sums import sum_of_features, sum_of_features_numpy
 from slam_graph.kernels.gate import (
     observation_distances,
@@ -140,3 +141,21 @@ def test_sum_of_features(calibration: int) -> None:
         found.append([np.empty(shape) for shape in shapes])
         kernel(*given, *found[-1])
     assert all(same(a, b) for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("gone", [[], [0, 1], [4, 5, 9], [3, 11, 12], [11, 12]])
+def test_eliminate_columns(gone: list[int]) -> None:
+    """Up to the signs of rows: those that stay, and those that determine the eliminated columns."""
+    n, columns, w = 10, 14, len(gone)
+    triangle = np.triu(np.random.default_rng(3).normal(size=(columns, columns)))
+    order = [*gone, *(k for k in range(columns) if k not in gone)]
+    rows, carried = triangle[:n, order], np.zeros((w, columns))
+    behind = sum(k >= n for k in gone)
+    tail = np.linalg.qr(triangle[n:, order[w - behind :]])[1][:behind]
+    carried[w - behind :, w - behind :] = tail
+    own, stays = rows.copy(), [i for i in range(n) if i not in gone]
+    expected = carried.copy()
+    eliminate_columns_numpy(rows, np.array(gone, np.int64), expected)
+    eliminate_columns(own, np.array(gone, np.int64), carried)
+    assert same(np.abs(own[stays]), np.abs(rows[stays]))
+    assert same(np.abs(carried), np.abs(expected))

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from slam_graph.arrays import FloatArray
+from slam_graph.kernels.elimination import eliminate_columns
 
 _BLOCK_SIZE = 32
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
-_ROWS_AT_ONCE = 48
-"""Block height for eliminating leading variables."""
 
 
 class Layout:
@@ -216,8 +215,8 @@ class SquareRootInformation:
         """The conditional of all variables but `keep` given these, and the marginal over `keep`.
 
         Variables whose order changes go through one QR. The rows of the variables before them are
-        processed in blocks from the bottom up, together with the rows of the eliminated variables.
-        That costs O(n²) in the number n of rows, where a QR of all of them would cost O(n³).
+        rotated with the rows of the eliminated variables, from the bottom up. That costs O(n²) in
+        the number n of rows, where a QR of all of them would cost O(n³).
         """
         staying = set(keep)
         gone = Layout({k: d for k, d in self.layout.dims.items() if k not in staying})
@@ -230,12 +229,13 @@ class SquareRootInformation:
         tail = np.r_[lead_gone:w, w + top : len(order)]
         triangle = triangularize(self.Rd[lead:, order[tail]])
         Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
-        carried = np.zeros((w - lead_gone, len(order)))
-        carried[:, tail] = triangle[: w - lead_gone]
-        if w == 0:
-            Rd[:lead] = self.Rd[:lead, order]
-        else:
-            carried = _eliminate_behind(Rd, self.Rd[:lead, order], order[:w], carried)
+        carried = np.zeros((w, len(order)))
+        carried[lead_gone:, tail] = triangle[: w - lead_gone]
+        rows = np.ascontiguousarray(self.Rd[:lead, order])
+        eliminate_columns(rows, order[:w], carried)
+        stays = np.ones(lead, np.bool_)
+        stays[order[:lead_gone]] = False
+        Rd[:top] = rows[stays, w:]
         return Conditional(gone, kept, carried), SquareRootInformation(kept, Rd)
 
     def _unmoved(self, keep: Sequence[int]) -> int:
@@ -248,39 +248,6 @@ class SquareRootInformation:
                 place += 1
             columns += dim
         return columns
-
-
-def _eliminate_behind(
-    Rd: FloatArray, rows: FloatArray, gone: NDArray[np.intp], carried: FloatArray
-) -> FloatArray:
-    """Eliminate variables from rows of a triangle, block by block from the bottom up.
-
-    A rotation with each block takes the eliminated columns out of it, another restores its
-    triangle.
-
-    Args:
-        Rd: gets the rows without the eliminated variables as its first ones.
-        rows: (n, w + …) the leading rows of the triangle, with the w eliminated columns first.
-        gone: (w,) where these columns stood in the triangle, ascending.
-        carried: (w', w + …) rows that determine those of them that stood behind the leading rows.
-
-    Returns:
-        (w, w + …) rows that determine all of them.
-    """
-    w, width = len(gone), rows.shape[1]
-    for stop in range(len(rows), 0, -_ROWS_AT_ONCE):
-        start = max(stop - _ROWS_AT_ONCE, 0)
-        before, upto = np.searchsorted(gone, [start, stop])
-        first, last = start - before, stop - upto  # rows of the result
-        stacked = np.vstack([carried, rows[start:stop]])
-        Q, R = np.linalg.qr(stacked[:, before:w], mode="complete")
-        others = Q.T @ stacked[:, w + first :]
-        carried = np.zeros((w - before, width))
-        carried[:, before:w], carried[:, w + first :] = R[: w - before], others[: w - before]
-        Q, _ = np.linalg.qr(others[w - before :, : last - first], mode="complete")
-        Rd[first:last, first:] = Q.T @ others[w - before :]
-        Rd[first:last, first:last] = np.triu(Rd[first:last, first:last])
-    return carried
 
 
 def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
