@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 from slam_graph import evaluation
 from slam_graph.errors import DataError
 from slam_graph.geometry import StateHistory, Trajectory
-from slam_graph.results.run_logs import RunLogs
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
     from slam_graph.backend import FinalBa
     from slam_graph.loop_closure import LoopClosures
+    from slam_graph.results.run_logs import RunLogs
 
 SCHEMA_VERSION = 2
 """Counts up whenever a key changes its name or meaning."""
