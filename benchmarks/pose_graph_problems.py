@@ -28,7 +28,8 @@ def grid_walk(poses: int, loops: int, seed: int = 0) -> PoseGraph:
     """
     rng = np.random.default_rng(seed)
     half = round(np.sqrt(poses) / 3.0)
-    place, heading = np.zeros(2), 0
+    place = np.zeros(2)
+    heading = np.int64(0)
     translations, headings = np.zeros((poses, 2)), np.zeros(poses, int)
     steps = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     for k in range(1, poses):

@@ -136,7 +136,7 @@ class Picture(Figure):
         before = self.dpi
         self.dpi = dpi
         try:
-            canvas = FigureCanvasAgg(self)
+            canvas: Any = FigureCanvasAgg(self)
             canvas.draw()
             return Image.fromarray(np.asarray(canvas.buffer_rgba()))
         finally:
