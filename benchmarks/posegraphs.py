@@ -49,7 +49,7 @@ OPTIMUM_BAR = 1e-6
 TIME_BAR = 1.0
 REPETITIONS = 5
 GRID, DRIVE = (10_000, 10_000), (4541, 150)
-"""Poses and loop closures of made-up graphs; the second has as many poses as KITTI's sequence 00."""
+"""Poses and loop closures of made-up graphs; the second is as long as KITTI's sequence 00."""
 
 WITH_FALSE_LOOPS = ("sphere2500", "M3500", "intel")
 SHARES = (0.1, 0.3, 0.5)
