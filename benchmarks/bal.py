@@ -23,8 +23,11 @@ from slam_graph.diagnostics import Diagnostics
 CAMERAS, POINTS = 100, 20_000
 REPETITIONS = 3
 
+LADYBUG = (49, 7776, 4.1)
+"""Cameras, points, and views of a point, as the first problem of BAL's Ladybug has them."""
+
 COST_BAR = 1e-4
-TIME_BAR = 1.2
+TIME_BAR = 0.3
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 """GTSAM's cameras look along their positive z axis, and their y axis points down."""
@@ -44,9 +47,11 @@ SMALL_BAR = 1e-6
 """Cost below which it is solved, px²."""
 
 
-def beside_gtsam(data: Path) -> Outcome:
-    """A made-up problem, solved by both from the same start."""
-    problem = usable(ring(CAMERAS, POINTS).problem, Diagnostics()).problem
+def beside_gtsam(
+    data: Path, cameras: int = CAMERAS, points: int = POINTS, views: float = 6.0
+) -> Outcome:
+    """A made-up problem, solved by both from the same start; see `ring` for the arguments."""
+    problem = usable(ring(cameras, points, views=views).problem, Diagnostics()).problem
     seconds: dict[str, float] = {}
     costs: dict[str, float] = {}
     solvers: dict[str, Callable[[], float]] = {
@@ -143,6 +148,11 @@ def small(data: Path) -> Outcome:
 BENCHMARKS = {
     "bal": Benchmark(
         f"Bundle adjustment, {CAMERAS} cameras and {POINTS} points, beside GTSAM", (), beside_gtsam
+    ),
+    "bal_49": Benchmark(
+        "Bundle adjustment as large as BAL's Ladybug of 49 cameras, made up, beside GTSAM",
+        (),
+        lambda data: beside_gtsam(data, *LADYBUG),
     ),
     "bal_small": Benchmark(
         "Bundle adjustment of a small problem of GTSAM's", (), small, quick=True

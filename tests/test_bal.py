@@ -99,7 +99,7 @@ def test_no_pixel_moves_along_the_gauge() -> None:
 def test_elimination_solves_the_whole_equations(intrinsics: Intrinsics) -> None:
     cost, damping = small_cost(intrinsics), 1e-3
     problem, E = cost.part.problem, cost.variables.toarray()
-    equations = normal_equations(cost, problem.estimates, structure(cost))
+    equations = normal_equations(cost, problem.estimates)
     step = damped_step(cost, structure(cost), equations, damping)
     linear = cost.linearized(problem.estimates)
     N, n = len(problem.camera), E.shape[1]

@@ -13,7 +13,7 @@ PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
     {"errors", "diagnostics", "version", "arrays", "lazy"},
-    {"plugins", "display"},
+    {"kernels", "plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},
     {"datasets", "frontend"},
@@ -59,6 +59,8 @@ def imports(path: Path) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             yield node.lineno, "." * node.level + (node.module or "")
+            if node.module == "slam_graph":
+                yield from ((node.lineno, f"slam_graph.{alias.name}") for alias in node.names)
 
 
 def importers(*roots: str, home: str = "") -> list[str]:

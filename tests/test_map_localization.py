@@ -11,8 +11,8 @@ from map_flights import World
 
 from slam_graph.errors import DataError
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
+from slam_graph.maps.map_config import LocalizationConfig
 from slam_graph.maps.map_localization import MapLocalizer, MapPoseFilter, with_roll_and_pitch
-from slam_graph.maps.map_model import LocalizationConfig
 from slam_graph.maps.map_places import MapPlaces
 
 CONFIG = LocalizationConfig()

@@ -10,8 +10,9 @@ import pytest
 from map_flights import CONFIG, World
 
 from slam_graph.errors import EstimationError
+from slam_graph.maps.map_config import LocalizationConfig
 from slam_graph.maps.map_merge import MIN_LINKS, merge_maps
-from slam_graph.maps.map_model import LocalizationConfig, SlamMap
+from slam_graph.maps.map_model import SlamMap
 from slam_graph.pose_graph.graph import Poses
 
 LOOPS, LOCALIZATION = CONFIG, LocalizationConfig()

@@ -11,10 +11,11 @@ from pose_graphs import distance, laps, turns, with_false_loops
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.pose_graph.graph import Poses
-from slam_graph.pose_graph.graph_cost import chi2_table
+from slam_graph.pose_graph.graph import PoseGraph, Poses
+from slam_graph.pose_graph.graph_cost import chi2_of_edges, chi2_table
 from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.pose_graph.graph_initialization import along_tree, chordal_cost, initialize
+from slam_graph.pose_graph.gtsam_graph import edge_chi2, edge_factors, values_of
 from slam_graph.pose_graph.optimize import optimize_pose_graph
 from slam_graph.pose_graph.pose_graph_policy import (
     PoseGraphCostPolicy,
@@ -50,6 +51,25 @@ def test_known_optima_are_reached_from_own_estimates(data_dir: Path, name: str) 
 
 
 @pytest.mark.data
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_chi2_of_edges_is_that_of_the_factors(dimension: int) -> None:
+    """For angles from zero to nearly half a turn."""
+    rng, count = np.random.default_rng(0), 300
+    angles = np.concatenate(
+        [np.zeros(1), np.geomspace(1e-6, 1.0, 149), np.linspace(1.0, 3.14, 150)]
+    )
+    axes = rng.standard_normal((count, 3 if dimension == 3 else 1))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    measured = Poses(turns(axes * angles[:, None]), rng.standard_normal((count, dimension)))
+    root = rng.standard_normal((count, 3 * dimension - 3, 3 * dimension - 3))
+    ends = np.tile([0, 1], (count, 1))
+    information = root @ root.transpose(0, 2, 1)
+    graph = PoseGraph(np.arange(2), None, ends, measured, information)
+    poses = Poses(np.tile(np.eye(dimension), (2, 1, 1)), rng.standard_normal((2, dimension)))
+    expected = edge_chi2(edge_factors(graph, range(count)), values_of(poses))
+    np.testing.assert_allclose(chi2_of_edges(graph, poses), expected, rtol=1e-9)
+
+
 def test_chi2_in_the_convention_of_g2o(data_dir: Path) -> None:
     path = data_dir / "posegraphs" / "sphere2500.g2o"
     angle = optimize_pose_graph(read_pose_graph(path))

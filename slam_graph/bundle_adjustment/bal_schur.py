@@ -22,15 +22,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.bundle_adjustment.bal_cost import BalCost
-from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalPart
+from slam_graph.bundle_adjustment.bal_problem import (
+    CAMERA_DIM,
+    BalEstimates,
+    BalPart,
+    BalProblem,
+)
 from slam_graph.errors import EstimationError
 
 GAUGE_DIM = 7
@@ -46,7 +51,7 @@ _MAX_PAIRS = 100_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CommonPoints:
-    """Pairs of observations of the same point: one in a camera, one in it or a later camera.
+    """Pairs of observations of the same point: one in a camera, one in a later camera.
 
     Attributes:
         first: (K,) observations in the camera.
@@ -66,11 +71,9 @@ class Structure:
     """The sparsity of the equations, which is the same at every step.
 
     Attributes:
-        sum_by_point: (P, N) sums over the observations of each point.
-        pairs: the common points of each camera with itself and the later ones.
+        pairs: the common points of each camera with the later ones.
     """
 
-    sum_by_point: csr_array
     pairs: list[_CommonPoints]
 
 
@@ -120,16 +123,13 @@ def structure(cost: BalCost) -> Structure:
     """
     problem = cost.part.problem
     views = np.bincount(problem.point)
-    pairs = int(np.sum(views * (views + 1) // 2))
+    pairs = int(np.sum(views * (views - 1) // 2))
     if problem.cameras > _MAX_CAMERAS or pairs > _MAX_PAIRS:
         raise EstimationError(
             f"{problem.name}: too large: {problem.cameras} cameras and {pairs} pairs of "
             f"observations of the same point; the most are {_MAX_CAMERAS} and {_MAX_PAIRS}"
         )
-    N = len(problem.point)
-    where = (problem.point, np.arange(N))
-    summed = csr_array((np.ones(N), where), shape=(problem.points, N))
-    return Structure(summed, list(_common_points(cost.part, views)))
+    return Structure(list(_common_points(cost.part, views)))
 
 
 def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[_CommonPoints]:
@@ -139,20 +139,23 @@ def _common_points(part: BalPart, views: NDArray[np.int64]) -> Iterator[_CommonP
     place = np.empty_like(by_point)
     place[by_point] = np.arange(len(by_point))
     ends = np.cumsum(views)[problem.point]
+    cameras = problem.camera.astype(np.int16)  # sorted much faster than longer integers
     for camera in range(problem.cameras):
         rows = np.arange(starts[camera], starts[camera + 1], dtype=np.int32)
-        counts = ends[rows] - place[rows]
+        counts = ends[rows] - place[rows] - 1
         within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         first = np.repeat(rows, counts)
-        second = by_point[place[first] + within]
-        order = np.argsort(problem.camera[second], kind="stable")
-        first, second = first[order], second[order]
-        others, begin = np.unique(problem.camera[second], return_index=True)
-        bounds = np.append(begin, len(second)).astype(np.int32)
-        yield _CommonPoints(first, second, others.astype(np.int32), bounds)
+        second = by_point[place[first] + 1 + within]
+        order = np.argsort(cameras[second], kind="stable")
+        common = np.bincount(cameras[second])
+        others = np.flatnonzero(common)
+        bounds = np.append(0, np.cumsum(common[others]))
+        yield _CommonPoints(
+            first[order], second[order], others.astype(np.int32), bounds.astype(np.int32)
+        )
 
 
-def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -> NormalEquations:
+def normal_equations(cost: BalCost, estimates: BalEstimates) -> NormalEquations:
     """Linearise a cost."""
     linear, part = cost.linearized(estimates), cost.part
     by_camera, by_point = linear.by_camera, linear.by_point
@@ -161,19 +164,26 @@ def normal_equations(cost: BalCost, estimates: BalEstimates, fixed: Structure) -
     for camera, (a, b) in enumerate(zip(part.camera_starts, part.camera_starts[1:], strict=False)):
         block = rows[a:b].reshape(-1, CAMERA_DIM + 1)
         squares[camera] = block.T @ block
+    V, g_p = _squares_of_points(part.problem, by_point, linear.r)
     gauge = gauge_directions(estimates, part.groups)
-    rows = np.concatenate([by_point, linear.r[:, :, None]], axis=2)
-    products = np.einsum("nai,naj->nij", by_point, rows).reshape(len(rows), -1)
-    of_points = (fixed.sum_by_point @ products).reshape(-1, 3, 4)
     return NormalEquations(
-        by_camera,
-        by_point,
-        squares[:, :-1, :-1],
-        squares[:, :-1, -1],
-        of_points[:, :, :3],
-        of_points[:, :, 3],
-        gauge,
+        by_camera, by_point, squares[:, :-1, :-1], squares[:, :-1, -1], V, g_p, gauge
     )
+
+
+def _squares_of_points(
+    problem: BalProblem, by_point: FloatArray, r: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Information (P, 3, 3) and gradient (P, 3) of the points, entry by entry."""
+    columns = np.ascontiguousarray(np.concatenate([by_point, r[:, :, None]], axis=2).T)
+    sums = np.empty((problem.points, 3, 4))
+    for i in range(3):
+        for j in range(i, 4):
+            products = columns[i, 0] * columns[j, 0] + columns[i, 1] * columns[j, 1]
+            sums[:, i, j] = np.bincount(problem.point, products, problem.points)
+            if j < 3:
+                sums[:, j, i] = sums[:, i, j]
+    return sums[:, :, :3], sums[:, :, 3]
 
 
 def damped_step(
@@ -186,53 +196,85 @@ def damped_step(
     """
     problem, E = cost.part.problem, cost.variables
     D_p = _positive(np.diagonal(equations.V, axis1=1, axis2=2))
-    V = equations.V + damping * D_p[:, :, None] * np.eye(3)
-    inverse_root = np.linalg.inv(np.linalg.cholesky(V))
+    inverse_root = _inverse_root(equations.V + damping * D_p[:, :, None] * np.eye(3))
     K = inverse_root[problem.point] @ equations.by_point.transpose(0, 2, 1)
     B = K @ equations.by_camera
     b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
 
-    S = _reduced_system(cost, fixed, equations, B)
+    S, g = _reduced_system(cost, fixed, equations, B, b_p[problem.point])
     if E.shape[1] < len(S):
-        S = E.T @ S @ E
-    g = (
-        E.T
-        @ (
-            equations.g_c - _per_camera(cost, np.einsum("nki,nk->ni", B, b_p[problem.point]))
-        ).ravel()
-    )
+        S = E.T @ (np.triu(S) + np.triu(S, 1).T) @ E
     D_c = _positive(E.T @ np.diagonal(equations.U, axis1=1, axis2=2).ravel())
-    δ, along_gauge = _solved(S, g, D_c, E.T @ equations.gauge, damping)
+    δ, along_gauge = _solved(S, E.T @ g, D_c, E.T @ equations.gauge, damping)
 
     by_camera = (E @ δ).reshape(-1, CAMERA_DIM)
-    pushed = fixed.sum_by_point @ np.einsum("nki,ni->nk", B, by_camera[problem.camera])
-    by_point = -np.einsum("pji,pj->pi", inverse_root, b_p + pushed)
+    pushed = b_p + _pushed(cost.part, B, by_camera)
+    by_point = -np.einsum("pji,pj->pi", inverse_root, pushed)
     slope = np.sum(equations.g_c * by_camera) + np.sum(equations.g_p * by_point)
     held = damping * (np.sum(D_c * δ**2) + np.sum(D_p * by_point**2)) + along_gauge
     return BalStep(by_camera, by_point, 0.5 * float(held - slope))
 
 
+def _inverse_root(V: FloatArray) -> FloatArray:
+    """L⁻¹ (P, 3, 3) of V = L Lᵀ, entry by entry.
+
+    Raises:
+        LinAlgError: if one is not positive definite.
+    """
+    pivots = np.empty((3, len(V)))
+    pivots[0] = V[:, 0, 0]
+    l10, l20 = V[:, 1, 0] / np.sqrt(pivots[0]), V[:, 2, 0] / np.sqrt(pivots[0])
+    pivots[1] = V[:, 1, 1] - l10**2
+    l21 = (V[:, 2, 1] - l20 * l10) / np.sqrt(pivots[1])
+    pivots[2] = V[:, 2, 2] - l20**2 - l21**2
+    if not (pivots > 0.0).all():
+        raise np.linalg.LinAlgError("the information of a point is not positive definite")
+    a, b, c = 1.0 / np.sqrt(pivots)
+    inverse = np.zeros(V.shape)
+    inverse[:, 0, 0], inverse[:, 1, 1], inverse[:, 2, 2] = a, b, c
+    inverse[:, 1, 0] = -a * b * l10
+    inverse[:, 2, 1] = -b * c * l21
+    inverse[:, 2, 0] = c * (a * b * l10 * l21 - a * l20)
+    return inverse
+
+
 def _reduced_system(
-    cost: BalCost, fixed: Structure, equations: NormalEquations, B: FloatArray
-) -> FloatArray:
-    """(9 C, 9 C) the reduced camera system S, both triangles."""
-    C = cost.part.problem.cameras
-    S = np.zeros((C, CAMERA_DIM, C, CAMERA_DIM))
+    cost: BalCost, fixed: Structure, equations: NormalEquations, B: FloatArray, b: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The upper triangle of the reduced camera system S (9 C, 9 C), and its gradient (9 C,).
+
+    Args:
+        cost: the cost.
+        fixed: its sparsity.
+        equations: its linearisation.
+        B: (N, 3, 9) of each observation.
+        b: (N, 3) L⁻¹ g_p of the point of each observation.
+    """
+    part, C = cost.part, cost.part.problem.cameras
+    blocks, g = np.zeros((C, C, CAMERA_DIM, CAMERA_DIM)), equations.g_c.copy()
     for i, pairs in enumerate(fixed.pairs):
+        own = slice(part.camera_starts[i], part.camera_starts[i + 1])
+        of_camera = B[own].reshape(-1, CAMERA_DIM)
+        blocks[i, i] = of_camera.T @ of_camera - equations.U[i]
+        g[i] -= of_camera.T @ b[own].ravel()
         left = B[pairs.first].reshape(-1, CAMERA_DIM)
         right = B[pairs.second].reshape(-1, CAMERA_DIM)
-        for j, a, b in zip(
-            pairs.others.tolist(),
-            (3 * pairs.starts[:-1]).tolist(),
-            (3 * pairs.starts[1:]).tolist(),
-            strict=True,
-        ):
-            block = left[a:b].T @ right[a:b]
-            S[i, :, j] -= block
-            if i != j:
-                S[j, :, i] -= block.T
-        S[i, :, i] += equations.U[i]
-    return S.reshape(CAMERA_DIM * C, CAMERA_DIM * C)
+        bounds, row = (3 * pairs.starts).tolist(), blocks[i]
+        for j, first, last in zip(pairs.others.tolist(), bounds, bounds[1:], strict=False):
+            np.dot(left[first:last].T, right[first:last], out=row[j])
+    S = np.empty((C, CAMERA_DIM, C, CAMERA_DIM))
+    np.negative(blocks.transpose(0, 2, 1, 3), out=S)
+    return S.reshape(CAMERA_DIM * C, CAMERA_DIM * C), g.ravel()
+
+
+def _pushed(part: BalPart, B: FloatArray, by_camera: FloatArray) -> FloatArray:
+    """(P, 3) sums of B δ over the observations of each point, with the steps δ (C, 9)."""
+    moved = np.empty(B.shape[:2])
+    for camera, (first, last) in enumerate(pairwise(part.camera_starts.tolist())):
+        of_camera = B[first:last].reshape(-1, CAMERA_DIM)
+        moved[first:last] = (of_camera @ by_camera[camera]).reshape(-1, 3)
+    point, points = part.problem.point, part.problem.points
+    return np.stack([np.bincount(point, column, points) for column in moved.T], axis=1)
 
 
 def _solved(
@@ -241,7 +283,7 @@ def _solved(
     """Increment of the camera variables, and the cost of its part along the gauge.
 
     Variables are scaled to unit information. The gauge directions, made orthonormal, get an
-    information of 1, where they had none. `S` is overwritten.
+    information of 1, where they had none. Of `S`, which is overwritten, the upper triangle is used.
     """
     scale = 1.0 / np.sqrt(D)
     N, _ = np.linalg.qr(gauge / scale[:, None])
@@ -252,11 +294,6 @@ def _solved(
     factor = cho_factor(S.T, lower=True, overwrite_a=True, check_finite=False)
     scaled = -cho_solve(factor, scale * g, check_finite=False)
     return scale * scaled, float(np.sum((N.T @ scaled) ** 2))
-
-
-def _per_camera(cost: BalCost, values: FloatArray) -> FloatArray:
-    """(C, k) sums over the observations of each camera."""
-    return np.add.reduceat(values, cost.part.camera_starts[:-1], axis=0)
 
 
 def _positive(diagonal: FloatArray) -> FloatArray:

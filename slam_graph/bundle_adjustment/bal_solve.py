@@ -129,7 +129,7 @@ class _DampedBundle:
         return self._value
 
     def linearize(self) -> None:
-        self._equations = normal_equations(self._cost, self.estimates, self._structure)
+        self._equations = normal_equations(self._cost, self.estimates)
 
     def solve(self, damping: float) -> float:
         assert self._equations is not None

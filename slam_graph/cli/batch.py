@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from slam_graph.cli.console import collected_log, echo_json, echo_rich_table, notice, number
+from slam_graph.cli.console import collected_log, echo_json, echo_rich_table, number
+from slam_graph.cli.loading import loading
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -114,7 +115,7 @@ def batch(
 
     Given the same OUTPUT again, only what is left is done. A recording that fails stops no other.
     """
-    with notice("loading"):
+    with loading():
         from slam_graph.experiment import batch as run_batch
 
     options: dict[str, Any] = {

@@ -242,18 +242,3 @@ class _Bars:
         """Stop the clocks of the bars so far."""
         for task in self._tasks.values():
             self._progress.stop_task(task)
-
-
-@contextmanager
-def notice(text: str) -> Iterator[None]:
-    """Say in a terminal what is going on, until there is more to say: imports take a while."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    sys.stderr.write(f"{text} …\r")
-    sys.stderr.flush()
-    try:
-        yield
-    finally:
-        sys.stderr.write("\x1b[2K")
-        sys.stderr.flush()

@@ -11,6 +11,7 @@ from zipfile import is_zipfile
 
 import typer
 
+from slam_graph.cli.loading import loading
 from slam_graph.cli.optimize_bal import optimize_bal
 from slam_graph.cli.optimize_pose_graph import Wanted, optimize_pose_graph_file
 from slam_graph.cli.options import (
@@ -88,9 +89,10 @@ def optimize(
 
     The newest results are also found under OUTPUT/<name>/latest; nothing is overwritten.
     """
-    from slam_graph.bundle_adjustment import BalPolicy
-    from slam_graph.pose_graph import PoseGraphPolicy
-    from slam_graph.results import refuse_to_replace
+    with loading():
+        from slam_graph.bundle_adjustment import BalPolicy
+        from slam_graph.pose_graph import PoseGraphPolicy
+        from slam_graph.results import refuse_to_replace
 
     watching = Watching(rerun, address=rerun_address)
     if save is not None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from slam_graph.cli.console import collected_log, echo_json, echo_table
+from slam_graph.cli.loading import loading
 from slam_graph.cli.options import timed, write_result
 from slam_graph.cli.watching import Watching, keep_serving
 
@@ -28,9 +29,10 @@ def optimize_bal(
     watching: Watching,
 ) -> None:
     """Estimate all cameras and points, write the results and print what was reached."""
-    from slam_graph.bundle_adjustment import adjust_bundle, read_bal
-    from slam_graph.diagnostics import Diagnostics
-    from slam_graph.results import BalResult
+    with loading():
+        from slam_graph.bundle_adjustment import adjust_bundle, read_bal
+        from slam_graph.diagnostics import Diagnostics
+        from slam_graph.results import BalResult
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}

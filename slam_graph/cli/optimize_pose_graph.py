@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from slam_graph.cli.console import collected_log, echo_json, echo_table
+from slam_graph.cli.loading import loading
 from slam_graph.cli.options import timed, write_result
 from slam_graph.cli.watching import Watching, keep_serving
 
@@ -45,8 +46,9 @@ def optimize_pose_graph_file(
     watching: Watching,
 ) -> None:
     """Estimate all poses, write the results and print what was reached."""
-    from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph import read_pose_graph
+    with loading():
+        from slam_graph.diagnostics import Diagnostics
+        from slam_graph.pose_graph import read_pose_graph
 
     diagnostics = Diagnostics()
     seconds: dict[str, float] = {}
@@ -73,8 +75,9 @@ def _solve(
     wanted: Wanted,
 ) -> PoseGraphResult:
     """Optimise, and find out what else is asked for."""
-    from slam_graph.pose_graph import certify, optimize_pose_graph
-    from slam_graph.results import PoseGraphResult
+    with loading():
+        from slam_graph.pose_graph import certify, optimize_pose_graph
+        from slam_graph.results import PoseGraphResult
 
     with timed(seconds, "optimize"):
         solution = optimize_pose_graph(graph, policy, diagnostics)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import typer
 from pydantic import BaseModel
 
-from slam_graph.cli.console import notice
+from slam_graph.cli.loading import loading
 
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
@@ -186,7 +186,7 @@ def open_recording(
     cameras: int | None = None,
 ) -> RecordedSequence:
     """Open the recording that the options name, with its first `cameras` cameras or all."""
-    with notice(f"opening {data}"):
+    with loading(f"opening {data}"):
         from slam_graph.datasets import open_dataset
 
         return open_dataset(
@@ -214,7 +214,7 @@ def run_settings(
         options: top-level settings; None changes nothing.
     """
     tables = {name: {"enabled": on} for name, on in parts.items() if on is not None}
-    with notice("loading"):
+    with loading():
         from slam_graph.config import load_config
 
         return load_config(config, overrides or (), **options, **tables)

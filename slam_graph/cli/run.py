@@ -17,9 +17,9 @@ from slam_graph.cli.console import (
     collected_log,
     echo_json,
     echo_table,
-    notice,
     number,
 )
+from slam_graph.cli.loading import loading
 from slam_graph.cli.options import (
     INTERRUPTED,
     Algorithm,
@@ -297,7 +297,7 @@ def execute(
     graph_times: SequenceOf[int | float] = (),
 ) -> tuple[RunResult, Path, list[Path]]:
     """Run, and write the result, whole or cut short."""
-    with notice("loading"):
+    with loading():
         from slam_graph.pipeline import run as run_pipeline
         from slam_graph.results import ResultFolder
 

@@ -19,7 +19,7 @@ which is robust to false loop closures.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy  # its parts are imported when they are first used
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
@@ -229,4 +229,4 @@ def _sigma(
         return float(np.exp(low))
     if excess(high) >= 0.0:
         return float(np.exp(high))
-    return float(np.exp(brentq(excess, low, high)))
+    return float(np.exp(scipy.optimize.brentq(excess, low, high)))

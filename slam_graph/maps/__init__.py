@@ -4,7 +4,7 @@
 
 `map_building.py` (`build_map`) makes a `SlamMap` (`map_model.py`) of the keyframes of a run,
 `map_file.py` reads and writes it, `map_localization.py` (`MapLocalizer`) localizes a run in it, and
-`map_merge.py` (`merge_maps`) merges two. Settings are in `map_model.py`.
+`map_merge.py` (`merge_maps`) merges two. Settings are in `map_config.py`.
 """
 
 from typing import TYPE_CHECKING
@@ -25,15 +25,20 @@ __all__ = [
 
 if TYPE_CHECKING:
     from slam_graph.maps.map_building import build_map
+    from slam_graph.maps.map_config import LocalizationConfig, MapConfig
     from slam_graph.maps.map_file import read_map, write_map
     from slam_graph.maps.map_localization import MapLocalizer
     from slam_graph.maps.map_merge import merge_maps
-    from slam_graph.maps.map_model import LocalizationConfig, MapConfig, MapRecording, SlamMap
+    from slam_graph.maps.map_model import MapRecording, SlamMap
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "map_building": ("build_map",),
+            "map_config": (
+                "LocalizationConfig",
+                "MapConfig",
+            ),
             "map_file": (
                 "read_map",
                 "write_map",
@@ -41,8 +46,6 @@ else:
             "map_localization": ("MapLocalizer",),
             "map_merge": ("merge_maps",),
             "map_model": (
-                "LocalizationConfig",
-                "MapConfig",
                 "MapRecording",
                 "SlamMap",
             ),

@@ -26,7 +26,8 @@ from scipy.special import gammaincinv
 
 from slam_graph.arrays import FloatArray
 from slam_graph.loop_closure import Keyframe, LoopClosureConfig
-from slam_graph.maps.map_model import LocalizationConfig, SlamMap
+from slam_graph.maps.map_config import LocalizationConfig
+from slam_graph.maps.map_model import SlamMap
 from slam_graph.maps.map_places import MapPlaces, PlaceMatch
 from slam_graph.sensors import Rig
 

@@ -27,12 +27,13 @@ from slam_graph.maps.map_building import (
     merged_groups,
     with_points,
 )
+from slam_graph.maps.map_config import LocalizationConfig
 from slam_graph.maps.map_localization import (
     CONSISTENT_CHI2,
     MapPoseFilter,
     with_roll_and_pitch,
 )
-from slam_graph.maps.map_model import NO_FEATURE, LocalizationConfig, SlamMap
+from slam_graph.maps.map_model import NO_FEATURE, SlamMap
 from slam_graph.maps.map_places import MapPlaces, PlaceMatch
 from slam_graph.pose_graph import Poses
 from slam_graph.version import __version__

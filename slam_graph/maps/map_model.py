@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map: keyframes, the features that they observe, the vocabulary; and the settings of maps.
+"""A map: keyframes, the features that they observe, the vocabulary.
 
 The z axis of a gravity-aligned map is up. In a map of several recordings the keyframes are ordered
 by recording, and in time within each.
@@ -8,10 +8,10 @@ by recording, and in time within each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -25,46 +25,6 @@ from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure import Keyframe, Vocabulary
 from slam_graph.pose_graph import Poses
 from slam_graph.sensors import Rig
-from slam_graph.settings import Settings, expert
-
-
-class MapConfig(Settings):
-    """The map of a run, for later runs."""
-
-    enabled: bool = False
-    """Whether the map is saved (--save-map), for `localize` and `map merge`. Keyframes, vocabulary
-    and verification have the settings of loop_closure."""
-
-
-class LocalizationConfig(Settings):
-    """Localization of a run in a map; recognition and verification are those of loop_closure."""
-
-    moved: ClassVar[Mapping[str, str]] = {
-        "agreeing": "is a constant now: MIN_CONSISTENT in maps/map_localization.py",
-        "patience": "is a constant now: MAX_REJECTED in maps/map_localization.py",
-        "memory": "is a constant now: MAX_PENDING in maps/map_localization.py",
-        "confidence": "is a constant now: CONFIDENCE in maps/map_localization.py",
-        "tilt_sigma": "is a constant now: TILT_SIGMA in maps/map_localization.py",
-    }
-
-    period_s: float = expert(0.2, ge=0)
-    """Time between two frames that are matched with the map; until the run is localized, every
-    frame is."""
-    candidates: int = expert(3, ge=1)
-    """Number of similar keyframes that a frame is matched with."""
-    neighbours: int = expert(10, ge=0)
-    """Number of covisible keyframes whose features are added to those of a candidate."""
-    odometry_rotation_sigma: float = expert(1e-3, gt=0)
-    """Drift of the yaw of the run, a random walk, rad/√s."""
-    odometry_position_sigma: float = expert(0.01, gt=0)
-    """Drift of the position of the run, a random walk, m/√s."""
-    map_rotation_sigma: float = expert(5e-3, gt=0)
-    """Standard deviation of the orientation of keyframes in the map, rad."""
-    map_position_sigma: float = expert(0.02, gt=0)
-    """Standard deviation of the position of keyframes in the map, m."""
-    max_position_sigma: float = expert(0.2, gt=0)
-    """The run is localized while the standard deviation of its position is less on all axes, m."""
-
 
 NO_FEATURE = -1
 """Feature index of an observation without a triangulated point."""

@@ -8,21 +8,13 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as SequenceOf
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import Sequence, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
-from slam_graph.maps import SlamMap
 from slam_graph.pipeline.estimation import Estimation
-from slam_graph.pipeline.mapping import (
-    Keyframes,
-    Localization,
-    LoopClosing,
-    MapBuilding,
-    require_places,
-)
 from slam_graph.pipeline.observers import (
     GraphKeeping,
     NullProgress,
@@ -39,6 +31,9 @@ from slam_graph.pipeline.stage import Stage
 from slam_graph.pipeline.supervision import interrupts_between_frames, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
 from slam_graph.results import RunInput, RunResult
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 
 def run(
@@ -80,13 +75,16 @@ def run(
     settings = _settings(config, overrides, options)
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
-    require_places(sequence, result.input, known_map)
+    places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
-    watchers = (progress or NullProgress(), recorder or NullRecorder())
-    stages = _stages(sequence, result, watchers, known_map)
     estimator, diagnostics = estimation.estimator, sequence.diagnostics
-    stages += [
+    progress = progress or NullProgress()
+    smoothed = result.config.final_ba.enabled
+    stages: list[Stage] = [  # in the order in which they finish
+        Observers(progress, recorder or NullRecorder()),
+        *([Smoothing(result, progress, diagnostics)] if smoothed else []),
+        *places,
         GraphKeeping(result, estimator, graph_times, diagnostics),
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),
     ]
@@ -112,23 +110,26 @@ def run(
     return result
 
 
-def _stages(
-    sequence: Sequence,
-    result: RunResult,
-    watchers: tuple[Progress, Recorder],
-    known_map: SlamMap | None,
-) -> list[Stage]:
-    """The stages after estimation, in the order in which they finish; `off` does nothing."""
-    config, diagnostics, off = result.config, sequence.diagnostics, Stage()
-    keyframes = Keyframes(result)
+def _place_stages(sequence: Sequence, result: RunResult, known_map: SlamMap | None) -> list[Stage]:
+    """Localization, loop closure and the map, as far as they are wanted.
+
+    Raises:
+        DataError: if places cannot be recognised in the recording.
+    """
+    config, diagnostics = result.config, sequence.diagnostics
     loops, mapping = config.loop_closure.enabled, config.map.enabled
+    if not (loops or mapping or known_map is not None):
+        return []
+    from slam_graph.pipeline import mapping as of_places  # most runs need none of it
+
+    of_places.require_places(sequence, result.input, known_map)
+    keyframes = of_places.Keyframes(result)
+    off = Stage()
     return [
-        Observers(*watchers),
-        Smoothing(result, watchers[0], diagnostics) if config.final_ba.enabled else off,
-        off if known_map is None else Localization(result, known_map, diagnostics),
+        off if known_map is None else of_places.Localization(result, known_map, diagnostics),
         keyframes if loops or mapping else off,
-        LoopClosing(result, keyframes, diagnostics) if loops else off,
-        MapBuilding(result, keyframes, diagnostics) if mapping else off,
+        of_places.LoopClosing(result, keyframes, diagnostics) if loops else off,
+        of_places.MapBuilding(result, keyframes, diagnostics) if mapping else off,
     ]
 
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from slam_graph.backend import FrameLog, adjust_recording
+from slam_graph import backend
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.pipeline.observers import Progress
@@ -40,7 +40,7 @@ class Smoothing(Stage):
         self._progress = progress
         self._diagnostics = diagnostics
         self._recording = ExitStack()
-        self._log: FrameLog | None = None
+        self._log: backend.FrameLog | None = None
 
     def begin(self, resources: ExitStack) -> None:
         """Make the temporary folder."""
@@ -48,7 +48,7 @@ class Smoothing(Stage):
         try:
             folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
             resources.enter_context(self._recording)  # released before the folder is removed
-            recording = FrameLog.recording(rig, config, Path(folder))
+            recording = backend.FrameLog.recording(rig, config, Path(folder))
             self._log = self._recording.enter_context(recording)
         except OSError as error:
             self._give_up(error)
@@ -71,10 +71,10 @@ class Smoothing(Stage):
             self._recording.close()
             self._solve(self._log)
 
-    def _solve(self, log: FrameLog) -> None:
+    def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
         calibrated = result.logs.calibration.latest
-        result.final_ba = adjust_recording(
+        result.final_ba = backend.adjust_recording(
             log,
             result.trajectory,
             result.causal_rig if calibrated is None else calibrated.rig,

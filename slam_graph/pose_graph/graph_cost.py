@@ -30,6 +30,9 @@ from slam_graph.pose_graph.gtsam_graph import (
 )
 from slam_graph.pose_graph.pose_graph_policy import PoseGraphCostPolicy
 
+_SMALL_ANGLE = 1e-4
+"""Below this angle the series of ½θ cot ½θ has a smaller error than the quotient."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraphCost:
@@ -108,8 +111,47 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
 
 
 def chi2_of_edges(graph: PoseGraph, poses: Poses) -> FloatArray:
-    """(M,) squared whitened residual of each edge, without a robust loss."""
-    return edge_chi2(edge_factors(graph, range(len(graph.edges))), values_of(poses))
+    """(M,) squared whitened residual of each edge, without a robust loss, as GTSAM's factors."""
+    residuals = _logarithms(_errors(graph, poses))
+    squared: FloatArray = np.einsum(
+        "ni,nij,nj->n", residuals, graph.angle_information, residuals, optimize=True
+    )
+    return squared
+
+
+def _errors(graph: PoseGraph, poses: Poses) -> Poses:
+    """M poses i_T_j⁻¹ T_i⁻¹ T_j, the identity where an edge agrees with its poses."""
+    i, j = graph.edges.T
+    return graph.measured.inverse().compose(poses.select(i).inverse().compose(poses.select(j)))
+
+
+def _logarithms(errors: Poses) -> FloatArray:
+    """(M, 3 or 6) logarithms, translation before rotation.
+
+    With θ the angle of R and a = ½θ cot ½θ, that of (R, t) has the translation a t - ½ ω × t
+    in 2D, where ω × t = θ (-t_y, t_x); in 3D (1 - a)/θ² ω (ω·t) is added.
+    """
+    t = errors.translations
+    if errors.dimension == 2:
+        θ = errors.angles()
+        turned = np.stack([-t[:, 1], t[:, 0]], axis=1) * θ[:, None]
+        moved = _half_cotangent(θ)[:, None] * t - 0.5 * turned
+        return np.column_stack([moved, θ])
+    ω = Rotation.from_matrix(errors.rotations).as_rotvec()
+    θ = np.linalg.norm(ω, axis=1)
+    a = _half_cotangent(θ)
+    small = θ < _SMALL_ANGLE
+    factor = np.where(small, 1.0 / 12.0, (1.0 - a) / np.where(small, 1.0, θ) ** 2)
+    along = (factor * np.sum(ω * t, axis=1))[:, None] * ω
+    return np.hstack([a[:, None] * t - 0.5 * np.cross(ω, t) + along, ω])
+
+
+def _half_cotangent(θ: FloatArray) -> FloatArray:
+    """½θ cot ½θ."""
+    small = np.abs(θ) < _SMALL_ANGLE
+    half = 0.5 * np.where(small, 1.0, θ)
+    cotangent: FloatArray = np.where(small, 1.0 - θ**2 / 12.0, half / np.tan(half))
+    return cotangent
 
 
 def chi2_table(
@@ -140,8 +182,7 @@ def chi2_table(
 
 def _g2o_chi2(graph: PoseGraph, poses: Poses) -> float:
     """χ² with g2o's residuals: translation, and the angle or the vector part of a quaternion."""
-    i, j = graph.edges.T
-    error = graph.measured.inverse().compose(poses.select(i).inverse().compose(poses.select(j)))
+    error = _errors(graph, poses)
     if graph.dimension == 2:
         turn = error.angles()[:, None]
     else:

@@ -14,10 +14,11 @@ rotations count twice.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, vstack
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import SuperLU, splu
@@ -26,6 +27,8 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.pose_graph.graph import PoseGraph, Poses
+
+_Number = TypeVar("_Number", np.float64, np.complex128)
 
 
 def translation_rows(graph: PoseGraph, τ: FloatArray) -> csr_matrix:
@@ -153,12 +156,35 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
 
 def _chordal_rotations(graph: PoseGraph) -> FloatArray:
     """(N, d, d) minimum of Σ κ ‖R_j - R_i R_ij‖² over all matrices, projected on SO(d)."""
+    if graph.dimension == 2:
+        return _chordal_rotations_2d(graph)
     d, n = graph.dimension, len(graph.keys)
     rows = rotation_rows(graph, graph.precisions[0])[:, n:]
     held = (d * graph.anchors[:, None] + np.arange(d)).ravel()
     first = graph.anchor_poses().rotations.transpose(0, 2, 1).reshape(-1, d)
     transposed = _solved(rows, held, first).reshape(n, d, d)
     return nearest_rotations(transposed.transpose(0, 2, 1))
+
+
+def _chordal_rotations_2d(graph: PoseGraph) -> FloatArray:
+    """(N, 2, 2) the same in 2D, with a complex number for each rotation.
+
+    The minimum over all matrices is found among multiples of rotations, because the measurements
+    and the anchors are rotations. So half the unknowns do.
+    """
+    n, m, root = len(graph.keys), len(graph.edges), np.sqrt(graph.precisions[0])
+    turns, first = (
+        R[:, 0, 0] + 1j * R[:, 1, 0]
+        for R in (graph.measured.rotations, graph.anchor_poses().rotations)
+    )
+    values = np.stack([-root * turns, root.astype(complex)], axis=1)
+    rows = np.repeat(np.arange(m), 2)
+    matrix = csr_matrix((values.ravel(), (rows, graph.edges.ravel())), shape=(m, n))
+    z = _solved(matrix, graph.anchors, first[:, None])[:, 0]
+    z = z / np.abs(z)
+    if not np.isfinite(z).all():
+        raise np.linalg.LinAlgError("a relaxed rotation is zero")
+    return np.stack([z.real, -z.imag, z.imag, z.real], axis=1).reshape(-1, 2, 2)
 
 
 def _lago_rotations(graph: PoseGraph) -> FloatArray:
@@ -203,18 +229,22 @@ def _translations_given(graph: PoseGraph, rotations: FloatArray) -> FloatArray:
 
 
 def _solved(
-    rows: csr_matrix, held: IntArray, values: FloatArray, right: FloatArray | None = None
-) -> FloatArray:
+    rows: csr_matrix,
+    held: IntArray,
+    values: NDArray[_Number],
+    right: NDArray[_Number] | None = None,
+) -> NDArray[_Number]:
     """Least-squares solution x (n, c) of rows · x = right with some entries of x fixed."""
     count = rows.shape[1]
     free = np.setdiff1d(np.arange(count), held)
-    x = np.zeros((count, values.shape[1]))
+    x = np.zeros((count, values.shape[1]), values.dtype)
     x[held] = values
     if len(free) == 0:
         return x
     residual = (0.0 if right is None else right) - rows @ x
     columns = rows.tocsc()[:, free]
-    x[free] = factorized(columns.T @ columns).solve(columns.T @ residual)
+    adjoint = columns.conj().T
+    x[free] = factorized(adjoint @ columns).solve(adjoint @ residual)
     if not np.isfinite(x).all():
         raise np.linalg.LinAlgError("the linear problem has no unique solution")
     return x

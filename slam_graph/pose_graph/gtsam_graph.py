@@ -10,7 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 
 _LOSSES: dict[str, Callable[[float], Any]] = {
@@ -39,13 +39,25 @@ def edge_factors(
     estimator = None if loss == "none" else robust_estimator(loss, width)
     gaussian, robust = gtsam.noiseModel.Gaussian.Information, gtsam.noiseModel.Robust.Create
     poses, ends = gtsam_poses(graph.measured), graph.edges.tolist()
+    like_last = _repeated(information).tolist()
     factors: list[gtsam.NonlinearFactor] = []
+    noise: Any = None
+    last = -1
     for row in rows:
-        noise: Any = gaussian(information[row], False)
-        if estimator is not None:
-            noise = robust(estimator, noise)
+        if noise is None or row != last + 1 or not like_last[row]:
+            noise = gaussian(information[row], False)
+            if estimator is not None:
+                noise = robust(estimator, noise)
+        last = row
         factors.append(between(*ends[row], poses[row], noise))
     return factors
+
+
+def _repeated(information: FloatArray) -> BoolArray:
+    """(M,) whether a matrix equals the one before it, so that their edges can share a noise."""
+    repeated = np.zeros(len(information), bool)
+    repeated[1:] = (information[1:] == information[:-1]).all(axis=(1, 2))
+    return repeated
 
 
 def robust_estimator(loss: str, width: float) -> Any:

@@ -46,6 +46,10 @@ from slam_graph.pose_graph.pose_graph_solution import Minimum, PoseGraphSolution
 _NEGLIGIBLE_COST = 1e-14
 """A cost of less than this for each edge is rounding: all edges agree."""
 
+_SHRINKING = 0.01
+"""Decreases of the cost that shrink to so much of the last are those of Gauss-Newton near its
+minimum: they foretell the decrease of the next step."""
+
 _ROUNDING = 1e-9
 """A relative increase of the cost up to this is rounding."""
 
@@ -82,20 +86,24 @@ def _gauss_newton(
         values_of(start),
         _parameters(gtsam.GaussNewtonParams(), policy.tolerance, policy.max_steps),
     )
-    negligible = _NEGLIGIBLE_COST * len(cost.edges)
+    negligible, before = _NEGLIGIBLE_COST * len(cost.edges), 0.0
     for step in range(1, policy.max_steps + 1):
         values, error = gtsam.Values(optimizer.values()), optimizer.error()  # a view otherwise
         lower = _iterated(optimizer)
-        if lower <= negligible or -_ROUNDING * error <= error - lower <= policy.tolerance * error:
+        decrease, small = error - lower, policy.tolerance * error
+        # decreases shrink at least by the same factor from step to step near the minimum
+        nearly = 0.0 < decrease <= _SHRINKING * before and decrease**2 <= small * before
+        if lower <= negligible or nearly or -_ROUNDING * error <= decrease <= small:
             return Minimum(poses_of(optimizer.values(), start.dimension), lower, step, True)
+        before = decrease
         if not lower < error:
             diagnostics.warn(
                 "pose_graph_step_damped",
                 f"{cost.graph.name}: Gauss-Newton step {step} does not lower the cost; "
                 "Levenberg-Marquardt continues",
             )
-            before = poses_of(values, start.dimension)
-            damped = _optimized(_LM, cost, before, policy, max(policy.max_steps - step, 1))
+            last = poses_of(values, start.dimension)
+            damped = _optimized(_LM, cost, last, policy, max(policy.max_steps - step, 1))
             return replace(damped, steps=step + damped.steps)
     last = poses_of(optimizer.values(), start.dimension)
     return Minimum(last, optimizer.error(), policy.max_steps, False)

@@ -7,12 +7,15 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import Estimator
 from slam_graph.sensors import FeatureFrame
+
+if TYPE_CHECKING:
+    from slam_graph.backend import Estimator
 
 _MAX_COSTS = 8
 """Of more Gauss-Newton steps in one frame, the last ones are left out."""

@@ -6,16 +6,18 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 
+from slam_graph import evaluation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation import accuracy_report, ape, synchronize
 from slam_graph.geometry import Similarity, Trajectory
-from slam_graph.maps import SlamMap
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 _POSE_WIDTH = 7
 _LEAST_SHARED = 3
@@ -127,10 +129,10 @@ class LocalizationLog:
         by_map: dict[str, Any]
         try:
             similarity = map_alignment(truth, self.known)
-            by_map = accuracy_report(truth, similarity.apply(located))["none"]
+            by_map = evaluation.accuracy_report(truth, similarity.apply(located))["none"]
         except DataError as error:
             by_map = {"unavailable": str(error)}
-        return {"map": by_map, **accuracy_report(truth, located)}
+        return {"map": by_map, **evaluation.accuracy_report(truth, located)}
 
 
 def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
@@ -144,7 +146,7 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
     pairs = []
     for keyframes in known.trajectories():
         try:
-            pairs.append(synchronize(truth, keyframes))
+            pairs.append(evaluation.synchronize(truth, keyframes))
         except DataError:
             continue
     if sum(len(true) for true, _ in pairs) < _LEAST_SHARED:
@@ -167,4 +169,6 @@ def errors_in_map(
         DataError: if the two share no time.
     """
     moved = similarity.apply(located)
-    return ape(truth, moved, "trans_part").values, ape(truth, moved, "angle_deg").values
+    return evaluation.ape(truth, moved, "trans_part").values, evaluation.ape(
+        truth, moved, "angle_deg"
+    ).values

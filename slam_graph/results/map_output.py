@@ -7,13 +7,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slam_graph import maps
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.maps import SlamMap, read_map, write_map
 from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 _POINT_COLOUR = (200, 200, 200)
 _CAMERA_COLOUR = (220, 30, 30)
@@ -131,7 +135,7 @@ def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
     path = Path(path)
     refuse_to_replace(path, force)
     with _writable(path, "map "), appearing(path) as partial:
-        write_map(partial, content)
+        maps.write_map(partial, content)
 
 
 def load_map(path: Path | str) -> SlamMap:
@@ -144,7 +148,7 @@ def load_map(path: Path | str) -> SlamMap:
     Raises:
         DataError: if there is none, or it cannot be used.
     """
-    return read_map(find_map(path))
+    return maps.read_map(find_map(path))
 
 
 def find_map(path: Path | str) -> Path:

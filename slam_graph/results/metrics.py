@@ -15,15 +15,17 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from slam_graph.backend import FinalBa
+from slam_graph import evaluation
 from slam_graph.errors import DataError
-from slam_graph.evaluation import accuracy_report, consistency_report
 from slam_graph.geometry import StateHistory, Trajectory
-from slam_graph.loop_closure import LoopClosures
-from slam_graph.results.run_logs import RunLogs
 from slam_graph.version import __version__
+
+if TYPE_CHECKING:
+    from slam_graph.backend import FinalBa
+    from slam_graph.loop_closure import LoopClosures
+    from slam_graph.results.run_logs import RunLogs
 
 SCHEMA_VERSION = 2
 """Counts up whenever a key changes its name or meaning."""
@@ -78,7 +80,7 @@ def accuracy_table(truth: Trajectory | None, trajectory: Trajectory) -> Table | 
     """Errors against ground truth, or None where there is nothing to compare."""
     if truth is None or len(trajectory) == 0:
         return None
-    return accuracy_report(truth, trajectory)
+    return evaluation.accuracy_report(truth, trajectory)
 
 
 def consistency_table(
@@ -98,7 +100,7 @@ def consistency_table(
     if truth is None or len(history) == 0:
         return None
     try:
-        return consistency_report(truth, history, given, smoothed)
+        return evaluation.consistency_report(truth, history, given, smoothed)
     except DataError as error:
         return {"unavailable": str(error)}
 
@@ -140,7 +142,7 @@ def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table 
     """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one."""
     if final_ba is None:
         return None
-    accuracy = None if truth is None else accuracy_report(truth, final_ba.trajectory)
+    accuracy = None if truth is None else evaluation.accuracy_report(truth, final_ba.trajectory)
     nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
     return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees}
 
@@ -161,7 +163,7 @@ def loop_closure_table(
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
         "accepted": int(loops.accepted.sum()),
-        "accuracy": None if truth is None else accuracy_report(truth, corrected),
+        "accuracy": None if truth is None else evaluation.accuracy_report(truth, corrected),
     }
 
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from slam_graph import datasets
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets import read_groundtruth
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 
@@ -253,4 +253,4 @@ def read_tum(path: Path) -> Trajectory:
     """
     if path.is_file() and path.stat().st_size == 0:
         return Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
-    return read_groundtruth(path)
+    return datasets.read_groundtruth(path)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam_graph import evaluation
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.evaluation import nees_of_run, synchronize
 from slam_graph.geometry import Similarity, StateHistory, Trajectory, interpolate
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class RunView:
             return self
         best = self.estimates.get(SMOOTHED, self.estimates[CAUSAL]).trajectory
         try:
-            true, own = synchronize(self.truth, best)
+            true, own = evaluation.synchronize(self.truth, best)
             return self.moved(Similarity.of_positions(true.positions, own.positions, "yaw"))
         except DataError:  # no common time, or what never moves determines no yaw
             return self
@@ -125,7 +125,7 @@ def with_path_in_map(view: RunView, path: Trajectory | None) -> RunView:
     if path is None or not len(path):
         return view
     with suppress(DataError):  # no common time, or what never moves determines no yaw
-        there, own = synchronize(reference, path)
+        there, own = evaluation.synchronize(reference, path)
         onto = Similarity.of_positions(there.positions, own.positions, "yaw")
         return replace(view, paths={**view.paths, IN_MAP: onto.apply(path)})
     return view
@@ -148,7 +148,7 @@ def with_covariances_after_alignment(
     similarity = None
     for name, history in histories.items():
         with suppress(DataError):
-            judged, alignment = nees_of_run(view.truth, history, False, final_ba)
+            judged, alignment = evaluation.nees_of_run(view.truth, history, False, final_ba)
             if alignment == "yaw":
                 trajectory = history.trajectory()
                 covariances = np.full((len(trajectory), 6, 6), np.nan)
@@ -227,7 +227,7 @@ def _series_panels(view: RunView) -> list[Panel]:
     for name, path in (paths | dict(view.paths)).items():
         if view.truth is not None and len(path):
             with suppress(DataError):
-                true, own = synchronize(view.truth, path)
+                true, own = evaluation.synchronize(view.truth, path)
                 lines[name] = (_seconds(view, own), _differences(own, true))
     if view.truth is None and SMOOTHED in sigmas:
         causal, smoothed = (view.estimates[name].trajectory for name in (CAUSAL, SMOOTHED))

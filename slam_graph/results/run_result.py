@@ -9,19 +9,16 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from slam_graph import evaluation
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import FinalBa, WindowGraph
 from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.evaluation import innovation_report, nees_of_run
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.loop_closure import LoopClosures
-from slam_graph.maps import SlamMap
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
@@ -38,6 +35,11 @@ from slam_graph.results.run_picture import (
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
+
+if TYPE_CHECKING:
+    from slam_graph.backend import FinalBa, WindowGraph
+    from slam_graph.loop_closure import LoopClosures
+    from slam_graph.maps import SlamMap
 
 Status = Literal[
     "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
@@ -222,7 +224,7 @@ class RunResult(RunSummary):
         if self.groundtruth is None or not len(self.history):
             return None
         try:
-            found, _ = nees_of_run(
+            found, _ = evaluation.nees_of_run(
                 self.groundtruth, self.history, self.start_was_given, self.final_ba
             )
         except DataError:
@@ -283,7 +285,7 @@ class RunResult(RunSummary):
                 "nees": tables.consistency_table(
                     truth, self.history, self.start_was_given, self.final_ba
                 ),
-                "nis": innovation_report(logs.innovations.columns()),
+                "nis": evaluation.innovation_report(logs.innovations.columns()),
                 "calibration": logs.calibration.table(),
                 "timing": tables.timing_table(logs, asked.start_ns, self.ending.wall_s),
                 "features_per_frame": {

@@ -17,7 +17,6 @@ from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
-from slam_graph.maps import SlamMap
 from slam_graph.results.run_picture import LOOPS_CLOSED, RunView, run_figure
 from slam_graph.results.scene import SceneParts, export_scene
 from slam_graph.results.scene_files import (
@@ -29,6 +28,7 @@ from slam_graph.results.scene_files import (
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
     from slam_graph.visualization import Picture
 
 

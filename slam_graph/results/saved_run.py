@@ -8,7 +8,7 @@ import json
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import read_kalibr
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.maps import SlamMap
 from slam_graph.results import result_files as names
 from slam_graph.results.frame_table import KEYFRAME, NEES
 from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
@@ -31,6 +30,9 @@ from slam_graph.results.run_picture import (
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.sensors import Rig
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 _METRICS = ("dataset", "algorithm", "status", "message", "extent", "accuracy")
 _EXTENT = ("start_ns", "frames", "estimated_frames", "coverage")

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import gtsam
@@ -21,8 +22,10 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 _TURN_RAD = 0.1
 """A frame is also a keyframe when the body has turned so far since the last."""

@@ -10,12 +10,18 @@ not a setting but a constant beside its use.
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
+from inspect import cleandoc, getsource
+from itertools import pairwise
+from sys import modules
 from typing import Any, ClassVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from slam_graph.display import Displayed
 
@@ -31,9 +37,29 @@ class Settings(Displayed, BaseModel):
             the key and says what to do instead, such as "is now frontend.max_features".
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     moved: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    def meanings(cls) -> dict[str, str]:
+        """What each setting means: the docstring below its field.
+
+        They are read from the source when they are asked for. Pydantic can do so, too, but whenever
+        a table is defined, which takes longer than all else that defines it.
+        """
+        tables = (table for table in reversed(cls.__mro__) if issubclass(table, Settings))
+        return {name: text for table in tables for name, text in _docstrings(table).items()}
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        found = handler(schema)
+        properties, meanings = handler.resolve_ref_schema(found)["properties"], cls.meanings()
+        for name in properties.keys() & meanings.keys():
+            properties[name].setdefault("description", meanings[name])
+        return found
 
     def __repr__(self) -> str:
         changed = ", ".join(f"{name}={value}" for name, value in self._changed().items())
@@ -79,13 +105,39 @@ class Settings(Displayed, BaseModel):
         return "\n".join(_yaml_lines(self, self.model_dump(mode="json"), "")) + "\n"
 
 
+def _docstrings(table: type[Settings]) -> dict[str, str]:
+    """The docstrings below the fields of a table, without those of its bases."""
+    body = _classes(table.__module__).get(table.__name__, [])
+    return {
+        field.target.id: cleandoc(text.value.value)
+        for field, text in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
+    }
+
+
+@cache
+def _classes(module: str) -> dict[str, list[ast.stmt]]:
+    """The statements of each class of a module; none if its source is not there."""
+    try:
+        tree = ast.parse(getsource(modules[module]))
+    except (OSError, TypeError):
+        return {}
+    return {node.name: node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
 def _yaml_lines(config: BaseModel, plain: dict[str, Any], indent: str) -> Iterator[str]:
     """The lines of those settings of a table that are in its dump `plain`."""
+    meanings = type(config).meanings() if isinstance(config, Settings) else {}
     for name, info in type(config).model_fields.items():
         if name not in plain:
             continue
-        if info.description:
-            yield f"{indent}# {' '.join(info.description.split())}"
+        meaning = info.description or meanings.get(name)
+        if meaning:
+            yield f"{indent}# {' '.join(meaning.split())}"
         value = getattr(config, name)
         if isinstance(value, BaseModel):
             yield f"{indent}{name}:"

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -127,12 +128,23 @@ class Picture(Figure):
     def png(self, dpi: int = _FILE_DPI) -> bytes:
         """The picture as a PNG file."""
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=dpi)
+        self._drawn(dpi).save(buffer, "PNG", dpi=(dpi, dpi))
         return buffer.getvalue()
+
+    def _drawn(self, dpi: int) -> Image.Image:
+        """The pixels, as `savefig` has them; that would draw everything twice."""
+        before = self.dpi
+        self.dpi = dpi
+        try:
+            canvas: Any = FigureCanvasAgg(self)
+            canvas.draw()
+            return Image.fromarray(np.asarray(canvas.buffer_rgba()))
+        finally:
+            self.dpi = before
 
     def light_png(self, dpi: int = _NOTEBOOK_DPI) -> bytes:
         """The picture as a PNG file with a palette, which keeps a notebook light."""
-        whole = Image.open(io.BytesIO(self.png(dpi))).convert("RGB")
+        whole = self._drawn(dpi).convert("RGB")
         reduced = whole.quantize(_COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
         buffer = io.BytesIO()
         reduced.save(buffer, "PNG", optimize=True)

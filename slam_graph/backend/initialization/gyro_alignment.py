@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
+import scipy  # its parts are imported when they are first used
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray, skew
@@ -260,7 +260,7 @@ def turns_contradict(
     """
     camera = Rotation.from_matrix(turns.R).as_rotvec()
     stamps_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    integral = cumulative_trapezoid(imu.gyro, stamps_s, axis=0, initial=0.0)
+    integral = scipy.integrate.cumulative_trapezoid(imu.gyro, stamps_s, axis=0, initial=0.0)
     one, two = (
         (stamps - imu.stamps_ns[0]) * 1e-9 + offset_s
         for stamps in (turns.first_ns, turns.second_ns)

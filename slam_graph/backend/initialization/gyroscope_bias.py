@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
@@ -84,7 +84,7 @@ def estimate_gyro_bias(
     if pairs is None:
         return None
     for _ in range(_ROUNDS):  # the rotation is linearised in the bias: once more at the solution
-        result = least_squares(
+        result = scipy.optimize.least_squares(
             _residuals,
             np.zeros(3),
             _jacobian,

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_factors import eliminate_points
@@ -166,7 +166,7 @@ def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignm
 
     low = -values[0] + 1e-12 * max(values[-1], 1e-12)
     high = np.linalg.norm(projected) / gravity + values[-1]
-    multiplier = brentq(excess, low, high) if excess(low) > 0 else low
+    multiplier = scipy.optimize.brentq(excess, low, high) if excess(low) > 0 else low
     g = vectors @ (projected / (values + multiplier))
     length = np.linalg.norm(g)
     if length == 0.0:

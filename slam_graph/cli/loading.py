@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Imports inside commands: announced in a terminal, and as cheap as they can be."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec, module_from_spec
+from types import ModuleType
+from typing import Any
+
+_UNUSED = ("f2py", "testing")
+"""Parts of NumPy that SciPy imports because it copies all names of NumPy; nobody uses them, and
+they take half as long as all of `scipy.linalg`."""
+
+
+@contextmanager
+def loading(text: str = "loading") -> Iterator[None]:
+    """Around imports: says in a terminal what is going on, until there is more to say.
+
+    No garbage is collected meanwhile. Imports leave none, and each collection would look at all
+    that was imported so far, which makes up a quarter of their time. Later ones do not look at it
+    either.
+    """
+    announced = sys.stderr.isatty()
+    if announced:
+        sys.stderr.write(f"{text} …\r")
+        sys.stderr.flush()
+    gc.disable()
+    try:
+        _postpone_unused()
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+        if announced:
+            sys.stderr.write("\x1b[2K")
+            sys.stderr.flush()
+
+
+class _Postponed(ModuleType):
+    """A module that is executed when the first of its names is used.
+
+    Unlike that of `importlib.util.LazyLoader` it is not executed by `inspect`, which looks at the
+    file of every module.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or self.__spec__ is None or self.__spec__.loader is None:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name)
+        self.__class__ = ModuleType  # type: ignore[assignment]  # a plain module from now on
+        self.__spec__.loader.exec_module(self)
+        return getattr(self, name)
+
+
+def _postpone_unused() -> None:
+    """Import the unused parts of NumPy when the first of their names is used."""
+    import numpy as np
+
+    for part in _UNUSED:
+        name = f"numpy.{part}"
+        spec = None if name in sys.modules else find_spec(name)
+        if spec is not None:
+            module = sys.modules[name] = module_from_spec(spec)
+            module.__class__ = _Postponed
+            setattr(np, part, module)
