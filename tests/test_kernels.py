@@ -2,9 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every compiled kernel does what its NumPy form does."""
 
+import cv2
 import numpy as np
+import pytest
 
+from slam_graph.kernels.epipolar import (
+    constraint_moments,
+    constraint_moments_numpy,
+    sampson_distances,
+    sampson_distances_numpy,
+)
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
+from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
+from slam_graph.kernels.spacing import (
+    apart,
+    apart_numpy,
+    claim,
+    claim_numpy,
+    clear_disks,
+    clear_disks_numpy,
+)
+from slam_graph.sensors.camera_model import CameraModel
+from slam_graph.sensors.lens_models import RadialTangential
 
 EQUAL = 1e-12
 """Largest difference, relative to the largest value."""
@@ -24,3 +43,72 @@ def test_triangularize_features() -> None:
     triangularize_features(A, B)
     assert same(A, expected[0])
     assert same(B, expected[1])
+
+
+def disk(radius: int) -> np.ndarray:
+    image = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
+    cv2.circle(image, (radius, radius), radius, 1, cv2.FILLED)
+    return image.sum(axis=1, dtype=np.int64) // 2
+
+
+@pytest.mark.parametrize("radius", [0, 1, 4, 12, 30])
+def test_clear_disks(radius: int) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-20.0, 140.0, (40, 2)).astype(np.float32)
+    masks = [np.full((100, 120), 255, np.uint8) for _ in range(3)]
+    clear_disks(masks[0], points, disk(radius))
+    clear_disks_numpy(masks[1], points, disk(radius))
+    for u, v in np.rint(points).astype(int).tolist():
+        cv2.circle(masks[2], (u, v), radius, 0, cv2.FILLED)
+    assert np.array_equal(masks[0], masks[1])
+    assert np.array_equal(masks[0], masks[2])
+
+
+@pytest.mark.parametrize("count", [0, 5, 1000])
+def test_claim(count: int) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0.0, 119.0, (300, 2)).astype(np.float32)
+    mask = np.where(rng.random((100, 120)) < 0.7, np.uint8(255), np.uint8(0))
+    masks = mask.copy(), mask.copy()
+    chosen = claim(masks[0], points, count, 8.5, disk(8))
+    assert np.array_equal(chosen, claim_numpy(masks[1], points, count, 8.5, disk(8)))
+    assert np.array_equal(*masks)
+    assert len(chosen) == (min(count, len(chosen)) if count else 0)
+
+
+def test_apart() -> None:
+    points = np.random.default_rng(3).uniform(0.0, 60.0, (200, 2)).astype(np.float32)
+    alone = apart(points, 3.0)
+    assert np.array_equal(alone, apart_numpy(points, 3.0))
+    assert 0 < np.count_nonzero(alone) < len(points)
+
+
+def test_epipolar_constraint() -> None:
+    rng = np.random.default_rng(4)
+    F, a, b = rng.normal(size=(3, 3)), rng.normal(size=(90, 2)), rng.normal(size=(90, 2))
+    assert same(sampson_distances(F, a, b), sampson_distances_numpy(F, a, b))
+    assert same(constraint_moments(a, b), constraint_moments_numpy(a, b))
+    assert np.all(sampson_distances(np.zeros((3, 3)), a, b) == 0.0)
+
+
+def test_most_similar() -> None:
+    rng = np.random.default_rng(5)
+    one, other = rng.integers(0, 256, (2, 60, 90)).astype(np.uint8)
+    other[20:40] = one[20:40]
+    one[:9] = 7  # no texture
+    points = rng.uniform(-5.0, 365.0, (50, 2))
+    candidates = points[:, None] + rng.uniform(-30.0, 30.0, (50, 25, 2))
+    candidates[:, 7], candidates[:5] = points, -1e6
+    scores = np.zeros((2, 50))
+    best = most_similar(one, other, points, candidates, 4, 3, scores[0])
+    assert np.array_equal(best, most_similar_numpy(one, other, points, candidates, 4, 3, scores[1]))
+    assert same(*scores)
+
+
+def test_undistort_radtan() -> None:
+    coefficients = (-0.283, 0.0739, 1.9e-4, 1.8e-5)
+    m = np.random.default_rng(6).uniform(-0.8, 0.8, (200, 2))
+    model = RadialTangential()
+    q = model.distort(m, coefficients)[0]
+    assert same(model.undistort(q, coefficients), m)
+    assert same(CameraModel._newton(model, q, coefficients, q, 20), m)

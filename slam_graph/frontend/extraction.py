@@ -234,7 +234,8 @@ def _disk(radius: int) -> IntArray:
     """Pixels (2 radius + 1,) on either side of the centre in each row of a disk."""
     disk = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
     cv2.circle(disk, (radius, radius), radius, 1, cv2.FILLED)
-    return np.sum(disk, axis=1, dtype=np.int64) // 2
+    widths: IntArray = np.sum(disk, axis=1, dtype=np.int64)
+    return widths // 2
 
 
 def _inside(pixels: Pixels, cell: _Cell) -> BoolArray:
