@@ -105,12 +105,13 @@ class CameraTracker:
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
             candidates = self._associator.propose(before, after, verify)
-            points = candidates.points
-            normalized = self._camera.undistort(points.astype(np.float64))
-            good = np.ones(len(points), np.bool_)
-            flow = np.full((len(points), 2), np.nan)
+            points, count = candidates.points, len(candidates.points)
+            places = [points] if candidates.origins is None else [points, candidates.origins]
+            undistorted = self._camera.undistort(np.concatenate(places).astype(np.float64))
+            normalized, origins = undistorted[:count], undistorted[count:]
+            good = np.ones(count, np.bool_)
+            flow = np.full((count, 2), np.nan)
             if candidates.origins is not None:
-                origins = self._camera.undistort(candidates.origins.astype(np.float64))
                 motions = self._motions(before.select(there), after.select(here))
                 unrolled = self._predictor.unrolled
                 origins = unrolled(candidates.origins, origins, before.stamp_ns)

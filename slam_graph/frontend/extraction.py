@@ -184,11 +184,13 @@ class FeatureExtractor:
         if missing <= 0:
             return []
         counts = self._count(occupied)
-        emptiest_first = np.argsort(counts, kind="stable")
         # No cell rests while many features are missing, e.g. after the lens was covered
         awake = (self._rest == 0) | (2 * missing > self._config.max_features)
         wanting = (counts < self._share) & awake
-        return [(int(i), self._share - int(counts[i])) for i in emptiest_first if wanting[i]]
+        cells = np.flatnonzero(wanting)
+        emptiest_first = cells[np.argsort(counts[cells], kind="stable")]
+        shares = self._share - counts[emptiest_first]
+        return list(zip(emptiest_first.tolist(), shares.tolist(), strict=True))
 
     def _count(self, points: Pixels) -> IntArray:
         """How many points (N, 2) lie in each cell."""

@@ -24,7 +24,7 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
-from slam_graph.frontend.outliers import epipolar_error, essential_matrix, triangulated_depths
+from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
 from slam_graph.kernels.patch_search import most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
@@ -222,6 +222,7 @@ class StereoMatcher:
         self._reference = reference
         self._wide = camera.model.sees_sideways or reference.model.sees_sideways
         self._other_T_reference = other_T_reference
+        self._essential = essential_matrix(other_T_reference)
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
         self._lucas_kanade = lucas_kanade
         self._extractor = extractor
@@ -285,11 +286,11 @@ class StereoMatcher:
         pose = self._other_T_reference
         depth_m = triangulated_depths(pose, m_reference, m_other)[:, 0]
         if self._wide:
-            E = essential_matrix(pose)
-            distance_px = distances_px(self._reference, E, m_reference, m_other, self._camera)
+            camera, other = self._reference, self._camera
+            distance_px = distances_px(camera, self._essential, m_reference, m_other, other)
             depth_m = depth_m * np.sqrt(1.0 + np.sum(m_reference**2, axis=1))  # along the ray
         else:
-            distance_px = epipolar_error(pose, m_reference, m_other) * focal_px
+            distance_px = epipolar_distance(self._essential, m_reference, m_other) * focal_px
         # In terms of disparity, because far points may come out a little beyond infinity
         disparity_px = focal_px * self._baseline_m / depth_m
         nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m
