@@ -196,8 +196,8 @@ class FeatureExtractor:
         """How many points (N, 2) lie in each cell."""
         xs, ys = self._edges
         columns, rows = self._config.grid
-        column = np.clip(np.searchsorted(xs, points[:, 0], side="right") - 1, 0, columns - 1)
-        row = np.clip(np.searchsorted(ys, points[:, 1], side="right") - 1, 0, rows - 1)
+        column = np.searchsorted(xs[1:-1], points[:, 0], side="right")
+        row = np.searchsorted(ys[1:-1], points[:, 1], side="right")
         return np.bincount(row * columns + column, minlength=columns * rows)
 
     def _free(self, occupied: Pixels) -> Image:
