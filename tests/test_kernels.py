@@ -4,11 +4,21 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.frontend.lucas_kanade import LucasKanade
+from slam_graph.frontend.pyramids import Pyramids
 from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
+from slam_graph.kernels.epipolar import (
+    constraint_moments,
+    constraint_moments_numpy,
+    sampson_distances,
+    sampson_distances_numpy,
+)
 from slam_graph.kernels.feature_sums import sum_of_features, sum_of_features_numpy
 from slam_graph.kernels.gate import (
     observation_distances,
@@ -17,6 +27,7 @@ from slam_graph.kernels.gate import (
     track_distances_numpy,
 )
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
+from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
     chain_rule_numpy,
@@ -25,7 +36,17 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
+from slam_graph.kernels.spacing import (
+    apart,
+    apart_numpy,
+    claim,
+    claim_numpy,
+    clear_disks,
+    clear_disks_numpy,
+)
 from slam_graph.sensors import Camera
+from slam_graph.sensors.camera_model import CameraModel
+from slam_graph.sensors.lens_models import RadialTangential
 
 EQUAL = 1e-12
 """Largest difference, relative to the largest value."""
@@ -159,3 +180,93 @@ def test_eliminate_columns(gone: list[int]) -> None:
     eliminate_columns(own, np.array(gone, np.int64), carried)
     assert same(np.abs(own[stays]), np.abs(rows[stays]))
     assert same(np.abs(carried), np.abs(expected))
+
+
+def disk(radius: int) -> np.ndarray:
+    image = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
+    cv2.circle(image, (radius, radius), radius, 1, cv2.FILLED)
+    return image.sum(axis=1, dtype=np.int64) // 2
+
+
+@pytest.mark.parametrize("radius", [0, 1, 4, 12, 30])
+def test_clear_disks(radius: int) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-20.0, 140.0, (40, 2)).astype(np.float32)
+    masks = [np.full((100, 120), 255, np.uint8) for _ in range(3)]
+    clear_disks(masks[0], points, disk(radius))
+    clear_disks_numpy(masks[1], points, disk(radius))
+    for u, v in np.rint(points).astype(int).tolist():
+        cv2.circle(masks[2], (u, v), radius, 0, cv2.FILLED)
+    assert np.array_equal(masks[0], masks[1])
+    assert np.array_equal(masks[0], masks[2])
+
+
+@pytest.mark.parametrize("count", [0, 5, 1000])
+def test_claim(count: int) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0.0, 119.0, (300, 2)).astype(np.float32)
+    mask = np.where(rng.random((100, 120)) < 0.7, np.uint8(255), np.uint8(0))
+    masks = mask.copy(), mask.copy()
+    chosen = claim(masks[0], points, count, 8.5, disk(8))
+    assert np.array_equal(chosen, claim_numpy(masks[1], points, count, 8.5, disk(8)))
+    assert np.array_equal(*masks)
+    assert len(chosen) == (min(count, len(chosen)) if count else 0)
+
+
+def test_apart() -> None:
+    points = np.random.default_rng(3).uniform(0.0, 60.0, (200, 2)).astype(np.float32)
+    alone = apart(points, 3.0)
+    assert np.array_equal(alone, apart_numpy(points, 3.0))
+    assert 0 < np.count_nonzero(alone) < len(points)
+
+
+def test_epipolar_constraint() -> None:
+    rng = np.random.default_rng(4)
+    F, a, b = rng.normal(size=(3, 3)), rng.normal(size=(90, 2)), rng.normal(size=(90, 2))
+    assert same(sampson_distances(F, a, b), sampson_distances_numpy(F, a, b))
+    assert same(constraint_moments(a, b), constraint_moments_numpy(a, b))
+    assert np.all(sampson_distances(np.zeros((3, 3)), a, b) == 0.0)
+
+
+def test_most_similar() -> None:
+    rng = np.random.default_rng(5)
+    one, other = rng.integers(0, 256, (2, 60, 90)).astype(np.uint8)
+    other[20:40] = one[20:40]
+    one[:9] = 7  # no texture
+    points = rng.uniform(-5.0, 365.0, (50, 2))
+    candidates = points[:, None] + rng.uniform(-30.0, 30.0, (50, 25, 2))
+    candidates[:, 7], candidates[:5] = points, -1e6
+    scores = np.zeros((2, 50))
+    best = most_similar(one, other, points, candidates, 4, 3, scores[0])
+    assert np.array_equal(best, most_similar_numpy(one, other, points, candidates, 4, 3, scores[1]))
+    assert same(*scores)
+
+
+def test_undistort_radtan() -> None:
+    coefficients = (-0.283, 0.0739, 1.9e-4, 1.8e-5)
+    m = np.random.default_rng(6).uniform(-0.8, 0.8, (200, 2))
+    model = RadialTangential()
+    q = model.distort(m, coefficients)[0]
+    assert same(model.undistort(q, coefficients), m)
+    assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+@pytest.mark.parametrize("levels", [0, 1, 3, 8])
+def test_track_level_is_opencv_s(levels: int) -> None:
+    rng = np.random.default_rng(7)
+    noise = rng.integers(0, 256, (160, 210)).astype(np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    image[100:, 150:] = 90  # no texture
+    shift = np.array([[1.0, 0.02, 2.6], [-0.02, 1.0, -1.7]])
+    other = cv2.warpAffine(image, shift, (210, 160), borderMode=cv2.BORDER_REFLECT)
+    points = rng.uniform(-3.0, 213.0, (300, 2)).astype(np.float32)  # some outside
+    guess = points + rng.normal(0.0, 1.5, points.shape).astype(np.float32)
+    lucas_kanade = LucasKanade(FrontendConfig(), Pyramids(2))
+    ours, found = lucas_kanade._lucas_kanade(image, other, points, guess, levels)
+    theirs, expected = lucas_kanade._by_opencv(image, other, points, guess, levels)
+    assert np.array_equal(found, expected)
+    assert 50 < np.count_nonzero(found) < 290
+    # To the bit on x86; OpenCV adds in another order on other machines, and may stop a step later
+    error_px = np.linalg.norm(ours - theirs, axis=1)[found]
+    assert np.mean(error_px > 1e-3) < 0.02
+    assert error_px.max() < 0.1

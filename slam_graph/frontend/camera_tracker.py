@@ -12,9 +12,10 @@ from slam_graph.frontend.epipolar_test import EpipolarTest, distances_px, fitted
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
-from slam_graph.frontend.keypoints import Image, Pixels, Tracks
+from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
+from slam_graph.kernels.spacing import apart
 from slam_graph.sensors import RigCamera
 
 _MERGE_DISTANCE_PX = 3.0
@@ -88,7 +89,7 @@ class CameraTracker:
             after = after.select(inlier & in_map)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
-        alone = _apart(after.pixels, _MERGE_DISTANCE_PX)
+        alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
         return self._with_residual_flow(before, after.select(alone))
 
@@ -104,12 +105,13 @@ class CameraTracker:
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
             candidates = self._associator.propose(before, after, verify)
-            points = candidates.points
-            normalized = self._camera.undistort(points.astype(np.float64))
-            good = np.ones(len(points), np.bool_)
-            flow = np.full((len(points), 2), np.nan)
+            points, count = candidates.points, len(candidates.points)
+            places = [points] if candidates.origins is None else [points, candidates.origins]
+            undistorted = self._camera.undistort(np.concatenate(places).astype(np.float64))
+            normalized, origins = undistorted[:count], undistorted[count:]
+            good = np.ones(count, np.bool_)
+            flow = np.full((count, 2), np.nan)
             if candidates.origins is not None:
-                origins = self._camera.undistort(candidates.origins.astype(np.float64))
                 motions = self._motions(before.select(there), after.select(here))
                 unrolled = self._predictor.unrolled
                 origins = unrolled(candidates.origins, origins, before.stamp_ns)
@@ -219,11 +221,3 @@ class CameraTracker:
             self._unrolled(before)[there], self._unrolled(after)[here], seconds
         )
         return after
-
-
-def _apart(pixels: Pixels, distance_px: float) -> BoolArray:
-    """Which points (N, 2) are not within a distance of an earlier one."""
-    u, v = pixels.T
-    close = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2 < distance_px**2
-    result: BoolArray = ~np.any(np.tril(close, -1), axis=1)
-    return result

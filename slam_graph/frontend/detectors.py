@@ -111,12 +111,10 @@ class _GradientCorners:
         )
         if corners is None:
             return Keypoints.concatenate([])
-        found = Keypoints.of(
-            np.asarray(corners, np.float32),
-            np.ravel(scores).astype(np.float32),
-            float(_CORNER_WINDOW_PX),
-        )
-        return found.select(found.scores >= self._smallest)
+        strengths = np.ravel(scores).astype(np.float32)
+        strong = strengths >= self._smallest
+        corners = np.asarray(corners, np.float32).reshape(-1, 2)
+        return Keypoints.of(corners[strong], strengths[strong], float(_CORNER_WINDOW_PX))
 
 
 @DETECTORS.register("shi_tomasi")

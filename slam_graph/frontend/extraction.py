@@ -15,6 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
+from slam_graph.kernels.spacing import claim, clear_disks
 from slam_graph.sensors import Camera
 
 BORDER_PX = 5
@@ -97,6 +98,7 @@ class FeatureExtractor:
         allowed = np.zeros((height, width), np.uint8)
         allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
+        self._half_widths = _disk(round(self._distance_px))
         self._rest = np.zeros(len(self._cells), np.int64)
         self._share = -(-config.max_features // len(self._cells))
 
@@ -127,12 +129,9 @@ class FeatureExtractor:
             else:
                 whole = self._whole(image, free) if whole is None else whole
                 best = whole.select(_inside(whole.pixels, cell))
-            best = best.select(self._still_free(free, best.pixels))
-            chosen = spread(best.pixels, surplus * quota, self._distance_px)
-            pixels = best.pixels[chosen]
+            pixels = best.pixels[self._claim(free, best.pixels, surplus * quota)]
             if len(pixels) < quota:
                 self._rest[i] = _REST_FRAMES
-            self._occupy(free, pixels)
             found.append(pixels)
             quotas.append(quota)
             missing -= min(quota, len(pixels))
@@ -170,11 +169,8 @@ class FeatureExtractor:
         missing = self._config.max_features - len(occupied)
         for i, share in self._wanted(occupied):
             inside = np.flatnonzero(_inside(keypoints.pixels, self._cells[i]))
-            inside = inside[self._still_free(free, keypoints.pixels[inside])]
             inside = inside[np.argsort(-keypoints.scores[inside], kind="stable")]
-            pixels = keypoints.pixels[inside]
-            best = inside[spread(pixels, min(missing, share), self._distance_px)]
-            self._occupy(free, keypoints.pixels[best])
+            best = inside[self._claim(free, keypoints.pixels[inside], min(missing, share))]
             chosen += best.tolist()
             missing -= len(best)
             if missing <= 0:
@@ -188,38 +184,32 @@ class FeatureExtractor:
         if missing <= 0:
             return []
         counts = self._count(occupied)
-        emptiest_first = np.argsort(counts, kind="stable")
         # No cell rests while many features are missing, e.g. after the lens was covered
         awake = (self._rest == 0) | (2 * missing > self._config.max_features)
         wanting = (counts < self._share) & awake
-        return [(int(i), self._share - int(counts[i])) for i in emptiest_first if wanting[i]]
+        cells = np.flatnonzero(wanting)
+        emptiest_first = cells[np.argsort(counts[cells], kind="stable")]
+        shares = self._share - counts[emptiest_first]
+        return list(zip(emptiest_first.tolist(), shares.tolist(), strict=True))
 
     def _count(self, points: Pixels) -> IntArray:
         """How many points (N, 2) lie in each cell."""
         xs, ys = self._edges
         columns, rows = self._config.grid
-        column = np.clip(np.searchsorted(xs, points[:, 0], side="right") - 1, 0, columns - 1)
-        row = np.clip(np.searchsorted(ys, points[:, 1], side="right") - 1, 0, rows - 1)
+        column = np.searchsorted(xs[1:-1], points[:, 0], side="right")
+        row = np.searchsorted(ys[1:-1], points[:, 1], side="right")
         return np.bincount(row * columns + column, minlength=columns * rows)
 
     def _free(self, occupied: Pixels) -> Image:
         """The mask of pixels where a new point may lie."""
         free = self._allowed.copy()
-        self._occupy(free, occupied)
+        clear_disks(free, np.ascontiguousarray(occupied), self._half_widths)
         return free
 
-    def _occupy(self, free: Image, points: Pixels) -> None:
-        """Clear a disk around each point (N, 2) of a mask."""
-        radius = round(self._distance_px)
-        for u, v in np.rint(points).astype(int).tolist():
-            cv2.circle(free, (u, v), radius, 0, cv2.FILLED)
-
-    def _still_free(self, free: Image, points: Pixels) -> BoolArray:
-        """Which points (N, 2), all inside the image, are not too near to those chosen so far."""
-        u, v = np.rint(points).astype(int).T
-        height, width = free.shape
-        result: BoolArray = free[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] > 0
-        return result
+    def _claim(self, free: Image, pixels: Pixels, count: int) -> IntArray:
+        """The first points (N, 2) that are free and apart, as indices; their place is taken."""
+        pixels = np.ascontiguousarray(pixels)
+        return claim(free, pixels, count, self._distance_px, self._half_widths)
 
     def _whole(self, image: Image, allowed: Image) -> Keypoints:
         """All keypoints of a detector that needs the whole image, best first."""
@@ -240,6 +230,14 @@ class FeatureExtractor:
         patch = np.ascontiguousarray(image[top:bottom, left:right])
         found = self._detector.detect(patch, allowed, count, self._distance_px)
         return found.at(found.pixels + np.array([left, top], np.float32))
+
+
+def _disk(radius: int) -> IntArray:
+    """Pixels (2 radius + 1,) on either side of the centre in each row of a disk."""
+    disk = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
+    cv2.circle(disk, (radius, radius), radius, 1, cv2.FILLED)
+    widths: IntArray = np.sum(disk, axis=1, dtype=np.int64)
+    return widths // 2
 
 
 def _inside(pixels: Pixels, cell: _Cell) -> BoolArray:

@@ -158,12 +158,13 @@ class Tracks:
 
     def select(self, keep: BoolArray | IntArray) -> Tracks:
         """Those where a mask `keep` (N,) is true, or those with given indices."""
-        return replace(
-            self,
-            ids=self.ids[keep],
-            pixels=self.pixels[keep],
-            normalized=self.normalized[keep],
-            residual_flow=self.residual_flow[keep],
+        return Tracks(
+            self.image,
+            self.stamp_ns,
+            self.ids[keep],
+            self.pixels[keep],
+            self.normalized[keep],
+            self.residual_flow[keep],
         )
 
     def joined(self, other: Tracks) -> Tracks:

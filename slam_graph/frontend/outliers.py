@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
+from slam_graph.kernels.epipolar import constraint_moments, sampson_distances
 
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
@@ -252,10 +253,7 @@ def eight_point(m_a: FloatArray, m_b: FloatArray) -> FloatArray:
     Normalised coordinates are of the order of one, so the linear system is conditioned well enough
     as it stands (Hartley 1997).
     """
-    a = np.column_stack([m_a, np.ones(len(m_a))])
-    b = np.column_stack([m_b, np.ones(len(m_b))])
-    rows = (b[:, :, None] * a[:, None, :]).reshape(-1, 9)
-    _, vectors = np.linalg.eigh(rows.T @ rows)
+    _, vectors = np.linalg.eigh(constraint_moments(_contiguous(m_a), _contiguous(m_b)))
     U, s, Vt = np.linalg.svd(vectors[:, 0].reshape(3, 3))
     F: FloatArray = (U * [s[0], s[1], 0.0]) @ Vt
     return F
@@ -276,13 +274,7 @@ def epipolar_distance(E: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatA
     To first order it is the length of the smallest correction of the four coordinates that makes
     the match fit (Hartley and Zisserman 2004, eq. 11.9).
     """
-    a = np.column_stack([m_a, np.ones(len(m_a))])
-    b = np.column_stack([m_b, np.ones(len(m_b))])
-    line_b, line_a = a @ E.T, b @ E
-    residual = np.abs(np.sum(b * line_b, axis=1))
-    gradient = np.sqrt(np.sum(line_a[:, :2] ** 2, axis=1) + np.sum(line_b[:, :2] ** 2, axis=1))
-    distance: FloatArray = residual / np.maximum(gradient, 1e-12)
-    return distance
+    return sampson_distances(_contiguous(E), _contiguous(m_a), _contiguous(m_b))
 
 
 def epipolar_error(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
@@ -295,8 +287,8 @@ def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) ->
 
     They are infinite where the rays are parallel, and negative where they meet behind a camera.
     """
-    a = np.column_stack([m_a, np.ones(len(m_a))]) @ b_T_a.rotation().matrix().T
-    b = np.column_stack([m_b, np.ones(len(m_b))])
+    a = _rays(m_a) @ b_T_a.rotation().matrix().T
+    b = _rays(m_b)
     t = b_T_a.translation()
     # z_a a + t = z_b b in the least squares sense
     aa, bb, ab = np.sum(a * a, 1), np.sum(b * b, 1), np.sum(a * b, 1)
@@ -306,3 +298,15 @@ def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) ->
         depths = np.column_stack([ab * bt - bb * at, aa * bt - ab * at]) / determinant[:, None]
     result: FloatArray = np.where(determinant[:, None] < 1e-12, np.inf, depths)
     return result
+
+
+def _rays(m: FloatArray) -> FloatArray:
+    """Rays (N, 3) through points (N, 2) of the plane z = 1."""
+    rays = np.ones((len(m), 3))
+    rays[:, :2] = m
+    return rays
+
+
+def _contiguous(values: FloatArray) -> FloatArray:
+    """As kernels take them."""
+    return np.ascontiguousarray(values, np.float64)

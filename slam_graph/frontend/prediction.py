@@ -105,7 +105,7 @@ _SHORTEST_SPAN_S = 0.02
 """The motion at an image of a rolling shutter is that of at least so much time."""
 
 _NEIGHBOURS = 3
-"""The median motion of this many neighbours predicts that of a new feature."""
+"""The median motion of this many neighbours, an odd number, predicts that of a new feature."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,11 +209,11 @@ class PointPredictor:
 
     def _rolled(self, m: FloatArray, stamp_ns: int) -> FloatArray:
         """Pixels (N, 2) of points whose coordinates are those at the time of the middle row."""
-        pixels: FloatArray = self._camera.distort(m)[0]
+        pixels = self._camera.pixels(m)
         if not self._turns_rows or len(m) == 0:
             return pixels
         for _ in range(_ROW_ITERATIONS):
-            pixels = self._camera.distort(self._turned(m, pixels[:, 1], stamp_ns, -1.0))[0]
+            pixels = self._camera.pixels(self._turned(m, pixels[:, 1], stamp_ns, -1.0))
         return pixels
 
     def _turned(self, m: FloatArray, rows: FloatArray, stamp_ns: int, sign: float) -> FloatArray:
@@ -285,4 +285,5 @@ def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
     if len(start) < _NEIGHBOURS:
         return np.zeros_like(at)
     _, nearest = cKDTree(start).query(at, k=_NEIGHBOURS)
-    return np.asarray(np.median((end - start)[nearest], axis=1), np.float32)
+    ascending = np.sort((end - start)[nearest], axis=1)
+    return np.asarray(ascending[:, _NEIGHBOURS // 2], np.float32)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.frontend.epipolar_test import distances_px
@@ -25,7 +24,8 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
-from slam_graph.frontend.outliers import epipolar_error, essential_matrix, triangulated_depths
+from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
+from slam_graph.kernels.patch_search import most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
 _OVERLAP_GRID = 8
@@ -101,7 +101,7 @@ def _sees(mounted: RigCamera, points: FloatArray) -> BoolArray:
     ahead = points[:, 2] > 0
     m = points[:, :2] / np.where(ahead, points[:, 2], np.inf)[:, None]
     ahead &= camera.within_reach(m, MAX_TANGENT)
-    pixels = camera.distort(np.where(ahead[:, None], m, 0.0))[0]
+    pixels = camera.pixels(np.where(ahead[:, None], m, 0.0))
     sees: BoolArray = (
         ahead & np.all(pixels >= 0, axis=1) & np.all(pixels < (camera.width, camera.height), axis=1)
     )
@@ -128,8 +128,6 @@ class _EpipolarSearch:
         disparity_px = camera.fx * float(np.linalg.norm(self._t)) / min_depth_m
         count = int(disparity_px / (_SEARCH_STEP_PX * 2**_HALVINGS)) + 2
         self._inverse_depths = np.linspace(0.0, 1.0 / min_depth_m, count)
-        steps = np.arange(-_PATCH_RADIUS, _PATCH_RADIUS + 1)
-        self._patch = np.stack(np.meshgrid(steps, steps, indexing="ij")).reshape(2, -1)
 
     def project(self, normalized: FloatArray, inverse_depth_per_m: FloatArray) -> FloatArray:
         """Pixels in the other camera of points of the reference camera at given depths.
@@ -148,7 +146,7 @@ class _EpipolarSearch:
         points = rays @ self._R.T + self._t * inverse_depth_per_m[..., None]
         m = points[..., :2] / np.maximum(points[..., 2:], 1e-3)
         m = m.reshape(-1, 2)
-        pixels = self._camera.distort(m)[0]
+        pixels = self._camera.pixels(m)
         if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
             pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
         return pixels.reshape(points[..., :2].shape)
@@ -173,31 +171,10 @@ class _EpipolarSearch:
             np.broadcast_to(normalized[:, None], (n, candidates, 2)),
             np.broadcast_to(self._inverse_depths, (n, candidates)),
         )
-        patches = self._patches(reference, pixels.astype(np.float64))
-        candidate_patches = self._patches(other, targets.reshape(-1, 2)).reshape(n, candidates, -1)
-        scores = np.einsum("np,ncp->nc", patches, candidate_patches)
-        height, width = other.shape
-        scale = 2**_HALVINGS
-        outside = np.any((targets < 0) | (targets > (width * scale, height * scale)), axis=2)
-        scores[outside] = -1.0
-        best = np.argmax(scores, axis=1)
-        rows = np.arange(n)
-        return targets[rows, best], scores[rows, best].astype(np.float64)
-
-    def _patches(self, image: Image, pixels: FloatArray) -> NDArray[np.float32]:
-        """Patches (N, P) around full-size pixels (N, 2), of zero mean and unit norm."""
-        height, width = image.shape
-        # Pixel centres are at integers, so a reduced pixel u covers 4u - 1.5 … 4u + 1.5 of the full
-        scale = 2**_HALVINGS
-        centre = np.rint((pixels + 0.5) / scale - 0.5)
-        u = np.clip(centre[:, 0], _PATCH_RADIUS, width - 1 - _PATCH_RADIUS).astype(np.int64)
-        v = np.clip(centre[:, 1], _PATCH_RADIUS, height - 1 - _PATCH_RADIUS).astype(np.int64)
-        offsets = self._patch[0] * width + self._patch[1]
-        patches = image.ravel()[(v * width + u)[:, None] + offsets].astype(np.float32)
-        patches -= patches.mean(axis=1, keepdims=True)
-        norm = np.sqrt(np.einsum("ij,ij->i", patches, patches))
-        result: NDArray[np.float32] = patches / np.maximum(norm, 1e-6)[:, None]
-        return result
+        scores = np.empty(n)
+        points = pixels.astype(np.float64)
+        best = most_similar(reference, other, points, targets, 2**_HALVINGS, _PATCH_RADIUS, scores)
+        return targets[np.arange(n), best], scores
 
 
 def _reduce(image: Image) -> Image:
@@ -245,6 +222,7 @@ class StereoMatcher:
         self._reference = reference
         self._wide = camera.model.sees_sideways or reference.model.sees_sideways
         self._other_T_reference = other_T_reference
+        self._essential = essential_matrix(other_T_reference)
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
         self._lucas_kanade = lucas_kanade
         self._extractor = extractor
@@ -308,11 +286,11 @@ class StereoMatcher:
         pose = self._other_T_reference
         depth_m = triangulated_depths(pose, m_reference, m_other)[:, 0]
         if self._wide:
-            E = essential_matrix(pose)
-            distance_px = distances_px(self._reference, E, m_reference, m_other, self._camera)
+            camera, other = self._reference, self._camera
+            distance_px = distances_px(camera, self._essential, m_reference, m_other, other)
             depth_m = depth_m * np.sqrt(1.0 + np.sum(m_reference**2, axis=1))  # along the ray
         else:
-            distance_px = epipolar_error(pose, m_reference, m_other) * focal_px
+            distance_px = epipolar_distance(self._essential, m_reference, m_other) * focal_px
         # In terms of disparity, because far points may come out a little beyond infinity
         disparity_px = focal_px * self._baseline_m / depth_m
         nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m

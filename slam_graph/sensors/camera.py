@@ -100,13 +100,18 @@ class Camera:
         focal = np.array([self.fx, self.fy])
         return q * focal + (self.cx, self.cy), jacobian * focal[:, None]
 
+    def pixels(self, normalized: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of normalised points (N, 2), in less time than with the derivative."""
+        q = self.model.points(normalized, self.coefficients)
+        return np.asarray(q * np.array([self.fx, self.fy]) + (self.cx, self.cy))
+
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (N, 2) of points (N, 3) in the camera frame; the points must have z > 0."""
-        return self.distort(points[:, :2] / points[:, 2:3])[0]
+        return self.pixels(points[:, :2] / points[:, 2:3])
 
     def by_intrinsics(self, normalized: FloatArray) -> FloatArray:
         """Derivatives (N, 2, 4) of the pixels of normalised points by (fx, fy, cx, cy)."""
-        q = (self.distort(normalized)[0] - (self.cx, self.cy)) / (self.fx, self.fy)
+        q = self.model.points(normalized, self.coefficients)
         derivative = np.zeros((len(normalized), 2, 4))
         derivative[:, 0, 0], derivative[:, 1, 1] = q[:, 0], q[:, 1]
         derivative[:, 0, 2] = derivative[:, 1, 3] = 1.0
@@ -162,7 +167,7 @@ class Camera:
             plane = self.undistort(pixels)
             usable = np.linalg.norm(plane, axis=1) < min(max_tangent, self.max_tangent)
             plane = np.where(usable[:, None], plane, 0.0)
-            error_px = np.linalg.norm(self.distort(plane)[0] - pixels, axis=1)
+            error_px = np.linalg.norm(self.pixels(plane) - pixels, axis=1)
         return plane, usable & (error_px < _VISIBLE_TOLERANCE_PX)
 
     def visible_mask(self, max_tangent: float = MAX_TANGENT) -> BoolArray:

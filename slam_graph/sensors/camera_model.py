@@ -38,7 +38,7 @@ _FOLD_SAMPLES = 458
 """Radii at which a model is tested for being one-to-one; a step is 0.025."""
 
 _NEWTON_STEPS = 20
-_NEWTON_TOLERANCE = 1e-10
+NEWTON_TOLERANCE = 1e-10
 
 Coefficients = tuple[float, ...]
 
@@ -74,6 +74,10 @@ class CameraModel(ABC):
     @abstractmethod
     def distort(self, m: FloatArray, coefficients: Coefficients) -> tuple[FloatArray, FloatArray]:
         """Points q (N, 2) of normalised points m (N, 2), and the derivatives dq/dm (N, 2, 2)."""
+
+    def points(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """Points q (N, 2) alone; a model that computes them in less time overrides it."""
+        return self.distort(m, coefficients)[0]
 
     @abstractmethod
     def by_coefficients(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
@@ -140,7 +144,7 @@ class CameraModel(ABC):
         for _ in range(steps):
             value, jacobian = self.distort(m, coefficients)
             m = m + _solve_2x2(jacobian, q - value)
-            if np.max(np.abs(q - value), initial=0.0) < _NEWTON_TOLERANCE:
+            if np.max(np.abs(q - value), initial=0.0) < NEWTON_TOLERANCE:
                 break
         return m
 

@@ -17,7 +17,12 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.sensors.camera_model import CameraModel, Coefficients, register_camera_model
+from slam_graph.sensors.camera_model import (
+    NEWTON_TOLERANCE,
+    CameraModel,
+    Coefficients,
+    register_camera_model,
+)
 
 _OPENCV_ITERATIONS = 20
 _OPENCV_EPSILON = 1e-9
@@ -98,15 +103,25 @@ class RadialTangential(_SolvedByOpenCv):
         r2 = xx + yy
         radial = 1.0 + r2 * (k1 + k2 * r2)
         slope = 2.0 * k1 + 4.0 * k2 * r2  # d radial / d x = slope * x
-        q = np.empty_like(m)
-        q[:, 0] = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
-        q[:, 1] = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
+        q = self.points(m, coefficients)
         jacobian = np.empty((len(m), 2, 2))
         jacobian[:, 0, 0] = radial + slope * xx + 2.0 * p1 * y + 6.0 * p2 * x
         jacobian[:, 0, 1] = slope * xy + 2.0 * p1 * x + 2.0 * p2 * y
         jacobian[:, 1, 0] = jacobian[:, 0, 1]
         jacobian[:, 1, 1] = radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x
         return q, jacobian
+
+    def points(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """Points q (N, 2) of normalised points m (N, 2)."""
+        k1, k2, p1, p2 = coefficients
+        x, y = m[:, 0], m[:, 1]
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + k2 * r2)
+        q = np.empty_like(m)
+        q[:, 0] = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
+        q[:, 1] = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
+        return q
 
     def by_coefficients(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
         """Derivatives (N, 2, 4) of q by k1, k2, p1, p2."""
@@ -124,6 +139,15 @@ class RadialTangential(_SolvedByOpenCv):
     def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
         eye = np.eye(3)
         return cv2.undistortPointsIter(q, eye, coefficients, eye, eye, _CRITERIA)
+
+    def _newton(
+        self, q: FloatArray, coefficients: Coefficients, m: FloatArray, steps: int
+    ) -> FloatArray:
+        """Newton's method for each point by itself, in a kernel."""
+        from slam_graph.kernels.undistortion import undistort_radtan  # which imports Numba
+
+        places, start = np.ascontiguousarray(q), np.ascontiguousarray(m)
+        return undistort_radtan(places, start, np.array(coefficients), steps, NEWTON_TOLERANCE)
 
 
 @register_camera_model

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The candidate whose patch is most similar to that of a point in another image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.kernels.compilation import compiled
+
+__all__ = ["most_similar", "most_similar_numpy"]
+
+_Image = NDArray[np.uint8]
+
+
+@compiled()
+def _centre(place: float, scale: int, length: int, radius: int) -> int:
+    """The reduced pixel at a place, so far from the edge that a patch fits in."""
+    # Pixel centres are at integers, so a reduced pixel u covers 4u - 1.5 … 4u + 1.5 of the full
+    nearest = np.rint((place + 0.5) / scale - 0.5)
+    return int(min(max(nearest, float(radius)), float(length - 1 - radius)))
+
+
+@compiled()
+def _correlation(
+    reference: _Image, other: _Image, u: int, v: int, a: int, b: int, radius: int
+) -> float:
+    """Normalised cross-correlation of patches around pixels (u, v) and (a, b)."""
+    sum_r = sum_o = sum_rr = sum_oo = sum_ro = 0
+    for i in range(-radius, radius + 1):
+        for j in range(-radius, radius + 1):
+            r, o = int(np.int64(reference[v + i, u + j])), int(np.int64(other[b + i, a + j]))
+            sum_r += r
+            sum_o += o
+            sum_rr += r * r
+            sum_oo += o * o
+            sum_ro += r * o
+    count = (2 * radius + 1) ** 2
+    variances = (count * sum_rr - sum_r * sum_r) * (count * sum_oo - sum_o * sum_o)
+    if variances == 0:
+        return 0.0
+    return (count * sum_ro - sum_r * sum_o) / math.sqrt(float(variances))
+
+
+@compiled("i8[::1](u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1])")
+def most_similar(
+    reference: _Image,
+    other: _Image,
+    points: FloatArray,
+    candidates: FloatArray,
+    scale: int,
+    radius: int,
+    scores: FloatArray,
+) -> IntArray:
+    """The best candidate of each point, the first one among equals.
+
+    Args:
+        reference: image of the points, reduced.
+        other: image of the candidates, likewise.
+        points: (N, 2) pixels of full size.
+        candidates: (N, C, 2) pixels of full size; those outside of the image score -1.
+        scale: how many times as large full size is.
+        radius: patches have (2 radius + 1)² pixels, moved inwards at the edge.
+        scores: (N,) is filled with the normalised cross-correlations of the best.
+
+    Returns:
+        (N,) their indices.
+    """
+    height, width = other.shape
+    best = np.zeros(len(points), np.int64)
+    for n in range(len(points)):
+        u = _centre(points[n, 0], scale, width, radius)
+        v = _centre(points[n, 1], scale, height, radius)
+        scores[n], score = -1.0, -1.0
+        last_a, last_b = -1, -1
+        for c in range(candidates.shape[1]):
+            x, y = candidates[n, c]
+            if not (0.0 <= x <= scale * width and 0.0 <= y <= scale * height):
+                continue
+            a, b = _centre(x, scale, width, radius), _centre(y, scale, height, radius)
+            if a != last_a or b != last_b:
+                score = _correlation(reference, other, u, v, a, b, radius)
+                last_a, last_b = a, b
+            if score > scores[n]:
+                scores[n], best[n] = score, c
+    return best
+
+
+def most_similar_numpy(
+    reference: _Image,
+    other: _Image,
+    points: FloatArray,
+    candidates: FloatArray,
+    scale: int,
+    radius: int,
+    scores: FloatArray,
+) -> IntArray:
+    """`most_similar` in NumPy."""
+    count = candidates.shape[1]
+    patches = _patches(reference, points, scale, radius)
+    others = _patches(other, candidates.reshape(-1, 2), scale, radius)
+    similar = np.einsum("np,ncp->nc", patches, others.reshape(len(points), count, -1))
+    height, width = other.shape
+    size = np.array([scale * width, scale * height])
+    similar[~np.all((candidates >= 0) & (candidates <= size), axis=2)] = -1.0
+    # Equal patches must not be told apart by a rounding
+    best: IntArray = np.argmax(np.round(similar, 12), axis=1)
+    scores[:] = similar[np.arange(len(points)), best]
+    return best
+
+
+def _patches(image: _Image, pixels: FloatArray, scale: int, radius: int) -> FloatArray:
+    """Patches (N, P) around full-size pixels (N, 2), of zero mean and unit norm."""
+    height, width = image.shape
+    centres = np.rint((pixels + 0.5) / scale - 0.5)
+    u, v = np.clip(centres, radius, np.array([width, height]) - 1 - radius).astype(np.int64).T
+    steps = np.arange(-radius, radius + 1)
+    offsets = (steps[:, None] * width + steps).ravel()
+    patches = image.ravel()[(v * width + u)[:, None] + offsets].astype(np.float64)
+    patches -= patches.mean(axis=1, keepdims=True)
+    norm = np.sqrt(np.einsum("ij,ij->i", patches, patches))
+    result: FloatArray = patches / np.maximum(norm, 1e-6)[:, None]
+    return result

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The inverse of the radial-tangential model, by Newton's method for each point."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.kernels.compilation import compiled
+
+__all__ = ["undistort_radtan"]
+
+
+@compiled("f8[:, ::1](f8[:, ::1], f8[:, ::1], f8[::1], i8, f8)")
+def undistort_radtan(
+    q: FloatArray, start: FloatArray, coefficients: FloatArray, steps: int, tolerance: float
+) -> FloatArray:
+    """Normalised points of distorted ones; the NumPy form is `CameraModel.undistort`.
+
+    Args:
+        q: (N, 2) points of the image plane.
+        start: (N, 2) guess of the result.
+        coefficients: (4,) k1, k2, p1, p2.
+        steps: most that are made.
+        tolerance: a step from where the error is smaller than this is the last one.
+
+    Returns:
+        (N, 2).
+    """
+    k1, k2, p1, p2 = coefficients
+    m = start.copy()
+    for n in range(len(q)):
+        x, y = m[n]
+        for _ in range(steps):
+            xx, yy, xy = x * x, y * y, x * y
+            r2 = xx + yy
+            radial = 1.0 + r2 * (k1 + k2 * r2)
+            slope = 2.0 * k1 + 4.0 * k2 * r2
+            error_x = q[n, 0] - (x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx))
+            error_y = q[n, 1] - (y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy)
+            a = radial + slope * xx + 2.0 * p1 * y + 6.0 * p2 * x
+            b = slope * xy + 2.0 * p1 * x + 2.0 * p2 * y
+            d = radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x
+            determinant = a * d - b * b
+            if determinant == 0.0:
+                x = y = np.nan
+                break
+            x += (d * error_x - b * error_y) / determinant
+            y += (a * error_y - b * error_x) / determinant
+            if max(abs(error_x), abs(error_y)) < tolerance:
+                break
+        m[n, 0], m[n, 1] = x, y
+    return m
