@@ -19,9 +19,8 @@ from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.prediction import ImuMotion, PointPredictor
-from slam_graph.frontend.pyramids import Pyramids
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
+from slam_graph.sensors import Camera, CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
 
 _FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""
@@ -86,17 +85,14 @@ class ImageFrontend:
         self._references = reference_cameras(rig)
         masks = _masks(rig, config)
         rng = np.random.default_rng(seed)
-        # Of each camera the image before and this one
-        lucas_kanade = LucasKanade(config, Pyramids(2 * len(rig.cameras)))
         self._trackers: list[CameraTracker] = []
         self._matchers: dict[int, StereoMatcher] = {}
         for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
             camera, reference = mounted.camera, self._references[i]
             extractor = FeatureExtractor(config, camera.width, camera.height, mask)
-            associator: Associator = CornerTracking(extractor, lucas_kanade, config)
+            associator: Associator = CornerTracking(extractor, config)
             if reference == i:
-                if config.method in DESCRIPTORS:
-                    associator = DescriptorMatching(camera, extractor, config, mask)
+                associator = _associator(camera, extractor, config, mask)
             else:
                 # it tracks its features itself only while the reference camera has no image
                 pose = rig.cameras[reference].body_T_camera
@@ -104,7 +100,7 @@ class ImageFrontend:
                     camera,
                     rig.cameras[reference].camera,
                     mounted.body_T_camera.between(pose),
-                    lucas_kanade,
+                    LucasKanade(config),
                     extractor,
                     config,
                 )
@@ -227,6 +223,15 @@ class ImageFrontend:
             self._stats.add("stereo", matcher.counts.matched)
             self._stats.add("rejected_stereo", matcher.counts.rejected)
             return matches
+
+
+def _associator(
+    camera: Camera, extractor: FeatureExtractor, config: FrontendConfig, mask: Image | None
+) -> Associator:
+    """Matching of the descriptor that the method names, or Lucas-Kanade."""
+    if config.method in DESCRIPTORS:
+        return DescriptorMatching(camera, extractor, config, mask)
+    return CornerTracking(extractor, config)
 
 
 def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:

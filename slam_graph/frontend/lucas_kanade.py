@@ -16,16 +16,12 @@ from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.frontend.pyramids import Pyramids
-from slam_graph.kernels.window_tracking import WINDOW_PX, track_level
 
 _ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
 
 _STEP_PX = 0.02
 """Iterations end when a step is smaller than this, which is well below the noise of a track."""
-
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
 
 _MIN_EIGENVALUE = 1e-3
 """Windows with less gradient than this are not tracked (OpenCV's `minEigThreshold`)."""
@@ -62,9 +58,9 @@ class Flow:
 class LucasKanade:
     """Pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check (Kalal et al. 2010)."""
 
-    def __init__(self, config: FrontendConfig, pyramids: Pyramids) -> None:
+    def __init__(self, config: FrontendConfig) -> None:
         self._window_px = config.window_px
-        self._pyramids = pyramids
+        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
 
     def flow(
         self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
@@ -91,34 +87,6 @@ class LucasKanade:
     def _lucas_kanade(
         self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
     ) -> tuple[Pixels, BoolArray]:
-        """Where points (N, 2) are in another image, and whether they have been found (N,)."""
-        if self._window_px != WINDOW_PX:
-            return self._by_opencv(source, target, points, start, levels)
-        one, other = self._pyramids.of(source), self._pyramids.of(target)
-        top = min(levels, one.highest)
-        points = np.ascontiguousarray(points, np.float32)
-        moved = start.astype(np.float32) / np.float32(1 << top)
-        found = np.ones(len(points), np.bool_)
-        for level in range(top, -1, -1):
-            track_level(
-                one.level(level),
-                other.level(level),
-                points,
-                moved,
-                found,
-                level,
-                _ITERATIONS,
-                _STEP_PX,
-                _MIN_EIGENVALUE,
-            )
-            if level > 0:
-                moved *= np.float32(2.0)
-        return moved, found
-
-    def _by_opencv(
-        self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
-    ) -> tuple[Pixels, BoolArray]:
-        """The same for windows of any size, in more time."""
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,
@@ -126,7 +94,7 @@ class LucasKanade:
             start.astype(np.float32),  # a copy: it is overwritten
             winSize=(self._window_px, self._window_px),
             maxLevel=levels,
-            criteria=_CRITERIA,
+            criteria=self._criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=_MIN_EIGENVALUE,
         )
@@ -136,11 +104,9 @@ class LucasKanade:
 class CornerTracking:
     """Tracks the corners of one camera by Lucas-Kanade: an `Associator`."""
 
-    def __init__(
-        self, extractor: FeatureExtractor, lucas_kanade: LucasKanade, config: FrontendConfig
-    ) -> None:
+    def __init__(self, extractor: FeatureExtractor, config: FrontendConfig) -> None:
         self._extractor = extractor
-        self._lucas_kanade = lucas_kanade
+        self._lucas_kanade = LucasKanade(config)
         self._levels = config.pyramid_levels
         self._largest_px = config.forward_backward_px
 
