@@ -177,7 +177,7 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
     """A short `demo`, no windows, and tasks in this process."""
     one_at_a_time = threading.Lock()
 
-    def do(text: str) -> str | None:
+    def do(text: str, wanted: object = None) -> str | None:
         try:
             with one_at_a_time:
                 tasks._ANY_TASK.validate_json(text).do()
