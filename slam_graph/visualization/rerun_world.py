@@ -19,6 +19,7 @@ from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
     RIG_M,
     SQUARE,
+    WIDE,
     Eye,
     Shown,
     odometry,
@@ -104,7 +105,8 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
         map_path=places_in_map(run, details.known_map),
         spans=series.spans,
     )
-    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, SQUARE, RIG_M)))
+    aspect = WIDE if cameras else SQUARE
+    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, aspect, RIG_M)))
 
 
 def _show_timing(
