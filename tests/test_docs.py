@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_questions import CODE, file_of, names
 
+from slam_graph.cli.help_texts import EXAMPLES
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
@@ -193,3 +194,17 @@ def test_the_recipe_for_phones_makes_one_table(tmp_path: Path, monkeypatch: Any)
     Path("phone.yaml").write_text(chain, encoding="utf-8")
     (camera,) = read_kalibr("phone.yaml").cameras
     assert not camera.rotation_known
+
+
+def test_the_reference_of_commands_has_no_markup_of_the_terminal() -> None:
+    """Examples are blocks of commands there."""
+    pytest.importorskip("mkdocs")
+    place = ROOT / "docs" / "hooks" / "generated_reference.py"
+    spec = importlib.util.spec_from_file_location("generated_reference", place)
+    assert spec is not None
+    assert spec.loader is not None
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    text = hook.commands()
+    assert text.count("**Examples**:\n\n```sh\nslam-graph ") == len(EXAMPLES)
+    assert not re.search(r"\[/?(bold|cyan|dim|red|green|yellow)\]", text)
