@@ -70,12 +70,16 @@ def test_sources_that_are_named_exist() -> None:
     assert not missing
 
 
-def test_every_page_is_in_the_index() -> None:
-    linked = {target for target, _ in LINK.findall((ROOT / "docs" / "index.md").read_text())}
+def links_of(page: str) -> set[str]:
+    return {target for target, _ in LINK.findall((ROOT / "docs" / page).read_text())}
+
+
+def test_every_page_is_in_the_index_and_every_notebook_among_the_tutorials() -> None:
     docs = ROOT / "docs"
     pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
+    assert not (pages | {"../README.md", "../CONTRIBUTING.md"}) - links_of("index.md")
     notebooks = {f"../notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")}
-    assert not (pages | notebooks | {"../README.md", "../CONTRIBUTING.md"}) - linked
+    assert not notebooks - links_of("tutorials.md")
 
 
 def test_every_page_is_in_the_navigation_of_the_site() -> None:
