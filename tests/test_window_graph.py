@@ -21,12 +21,12 @@ from slam_graph.backend.backend_config import (
     InitializationConfig,
     NoiseConfig,
 )
-from slam_graph.backend.cost.cost import Cost, Linearization
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.solve import gauss_newton
 from slam_graph.backend.solve.gauss_newton import linearized
-from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.cli.main import app
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.errors import EstimationError
@@ -149,13 +149,13 @@ def test_the_prior_is_made_of_it_where_the_last_step_began(
     began: list[Any] = []
     take_step = gauss_newton._step
 
-    def noted(cost: Cost, linear: Linearization, layout: Layout) -> Any:
+    def noted(cost: Cost, *rest: Any) -> Any:
         began.append(cost.snapshot())
-        return take_step(cost, linear, layout)
+        return take_step(cost, *rest)
 
-    def first_of(*arguments: Any) -> gauss_newton.Minimum:
+    def first_of(*arguments: Any, **named: Any) -> gauss_newton.Minimum:
         began.clear()
-        found.append(gauss_newton.minimize(*arguments))
+        found.append(gauss_newton.minimize(*arguments, **named))
         return found[-1]
 
     found: list[gauss_newton.Minimum] = []
