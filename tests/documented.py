@@ -20,6 +20,11 @@ PARTS = {
 }
 """Pages by the file of tests that does their steps; `methods` does all others."""
 
+GROUPS = ("data", "config", "frontend", "map")
+"""Commands of `slam-graph` that have commands of their own."""
+_ALONE = ("config dump", "config schema")
+"""Commands that do something without a word more."""
+
 _FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 _SHELL, _PYTHON = ("sh", "bash", "console"), ("py", "python")
 _INLINE = re.compile(r"`(slam-graph [a-z][^`…]*)`")
@@ -107,3 +112,21 @@ def inline_commands() -> list[str]:
     """The commands within sentences and tables of all pages, once each."""
     texts = [page_text(page) for page in pages() if page != HELP]
     return sorted({command for text in texts for command in _INLINE.findall(text)})
+
+
+def name_of(command: str) -> list[str]:
+    """The name of a command of `slam-graph`, in one or two words."""
+    words = command.split()[1:]
+    grouped = words[0] in GROUPS and len(words) > 1 and words[1].islower()
+    return words[: 2 if grouped else 1]
+
+
+def inline_steps() -> list[Step]:
+    """The commands within sentences and tables that can be typed: not those that are named only."""
+    found = []
+    for command in inline_commands():
+        name = name_of(command)
+        if command.split()[1:] != name or " ".join(name) in _ALONE:
+            places = [page for page in pages() if page != HELP and command in page_text(page)]
+            found.append(Step(places[0], " ".join(command.split())))
+    return found

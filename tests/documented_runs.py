@@ -19,7 +19,7 @@ import shlex
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,6 +71,32 @@ EXITS = {
     r"run walk.mp4 .*phone.yaml": 3,  # its unknown mounting is found in turns longer than this
 }
 """Commands whose made-up recording does not start (3): they read it, and say what they lack."""
+
+
+STANDS_FOR = {
+    "DATA": "path/to/MH_01_easy",
+    "FILE": "my_algorithm.yaml",
+    "OUTPUT": "converted",
+    "FOLDER": "recorded",
+    "OUT": "simulated",
+    "STAMP": "2.5",
+    "TRUTH": "walk.tum",
+    "ESTIMATE": "walk.tum",
+    "WHAT": "graph.g2o",
+    "my.yaml": "my_algorithm.yaml",
+    "flight": "monday",
+    "flight/": "flight.bag",
+    "6.5": "2.5",
+}
+"""What a command within a sentence or a table is executed with, by the word that it has there."""
+
+
+def in_place(step: Step) -> Step:
+    """A command within a sentence with files of the stock in place of its words in capitals."""
+    words = [STANDS_FOR.get(word, word) for word in step.text.split()]
+    if "backend.initialization.mode=static" in words:  # that of the stock moves at its start
+        words[words.index(STANDS_FOR["DATA"])] = "demo"
+    return Step(step.place, " ".join(words))
 
 
 def is_skipped(step: Step) -> bool:
@@ -177,7 +203,7 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
     """A short `demo`, no windows, and tasks in this process."""
     one_at_a_time = threading.Lock()
 
-    def do(text: str) -> str | None:
+    def do(text: str, wanted: object = None) -> str | None:
         try:
             with one_at_a_time:
                 tasks._ANY_TASK.validate_json(text).do()
@@ -207,14 +233,35 @@ def check_page(page: str, stock: Stock, folder: Path, monkeypatch: pytest.Monkey
         folder: empty.
         monkeypatch: undoes at the end what is replaced.
     """
-    todo = [step for step in steps(page) if not is_skipped(step)]
-    shown = [step.text for step in todo]
     files = [] if page == HELP else [content for _, _, content in blocks(page, "yaml")]
+    check_steps(steps(page), stock, folder, monkeypatch, files, stock.names(page))
+
+
+def check_steps(
+    all_steps: list[Step],
+    stock: Stock,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    files: Sequence[str] = (),
+    names: Mapping[str, object] | None = None,
+) -> None:
+    """Do steps; arguments as for `check_page`.
+
+    Args:
+        all_steps: in their order; those that are listed above are left out.
+        stock: what they take for granted.
+        folder: empty.
+        monkeypatch: undoes at the end what is replaced.
+        files: texts that name what is needed too.
+        names: that are defined in Python.
+    """
+    todo = [step for step in all_steps if not is_skipped(step)]
+    shown = [step.text for step in todo]
     stock.fill(folder, "\n".join([*shown, *files]))
     replace_what_is_slow(monkeypatch, stock("demo.csv") / wheel_tracks().name)
     forget_registered(monkeypatch, POSE_SELECTIONS, DETECTORS)
     monkeypatch.chdir(folder)
-    session = Session(folder, {"__name__": "page", **stock.names(page)})
+    session = Session(folder, {"__name__": "page", **(names or {})})
     with dask_cluster(any("--scheduler" in text for text in shown)) as session.scheduler:
         faults = [(step, session.fault(step)) for step in todo]
     report = [f"{step.place}: {step.text}\n    {fault}" for step, fault in faults if fault]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_questions import CODE, file_of, names
 
+from slam_graph.cli.help_texts import EXAMPLES
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
@@ -69,12 +70,16 @@ def test_sources_that_are_named_exist() -> None:
     assert not missing
 
 
-def test_every_page_is_in_the_index() -> None:
-    linked = {target for target, _ in LINK.findall((ROOT / "docs" / "index.md").read_text())}
+def links_of(page: str) -> set[str]:
+    return {target for target, _ in LINK.findall((ROOT / "docs" / page).read_text())}
+
+
+def test_every_page_is_in_the_index_and_every_notebook_among_the_tutorials() -> None:
     docs = ROOT / "docs"
     pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
+    assert not (pages | {"../README.md", "../CONTRIBUTING.md"}) - links_of("index.md")
     notebooks = {f"../notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")}
-    assert not (pages | notebooks | {"../README.md", "../CONTRIBUTING.md"}) - linked
+    assert not notebooks - links_of("tutorials.md")
 
 
 def test_every_page_is_in_the_navigation_of_the_site() -> None:
@@ -193,3 +198,17 @@ def test_the_recipe_for_phones_makes_one_table(tmp_path: Path, monkeypatch: Any)
     Path("phone.yaml").write_text(chain, encoding="utf-8")
     (camera,) = read_kalibr("phone.yaml").cameras
     assert not camera.rotation_known
+
+
+def test_the_reference_of_commands_has_no_markup_of_the_terminal() -> None:
+    """Examples are blocks of commands there."""
+    pytest.importorskip("mkdocs")
+    place = ROOT / "docs" / "hooks" / "generated_reference.py"
+    spec = importlib.util.spec_from_file_location("generated_reference", place)
+    assert spec is not None
+    assert spec.loader is not None
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    text = hook.commands()
+    assert text.count("**Examples**:\n\n```sh\nslam-graph ") == len(EXAMPLES)
+    assert not re.search(r"\[/?(bold|cyan|dim|red|green|yellow)\]", text)

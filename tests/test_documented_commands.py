@@ -9,15 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from documented import HELP, PARTS, ROOT, blocks, inline_commands, pages, pages_of, steps
+from documented import GROUPS, HELP, PARTS, ROOT, blocks, inline_commands, pages, pages_of, steps
 from documented_runs import EXITS, SKIPPED, is_skipped
 from limits import HANG_S
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
-
-GROUPS = ("data", "config", "frontend", "map")
-"""Commands of `slam-graph` that have commands of their own."""
 
 STEPS = {page: steps(page) for page in pages()}
 TYPED = [step for page in STEPS for step in STEPS[page]]
@@ -57,7 +54,7 @@ def test_targets_that_are_named_exist() -> None:
 
 
 def fault_of(line: str) -> str:
-    """What is wrong with a command within a sentence; empty if nothing."""
+    """What is wrong with the names of a command within a sentence; empty if nothing."""
     words = line.split()[1:]
     command = words[: 2 if words[0] in GROUPS else 1]
     shown = CliRunner().invoke(app, [*command, "--help"])
@@ -68,8 +65,8 @@ def fault_of(line: str) -> str:
     return f"no option {unknown}" if unknown else ""
 
 
-def test_commands_within_sentences_exist() -> None:
-    """They have names in place of data, so they are not executed."""
+def test_names_of_commands_and_options_exist() -> None:
+    """Also of those that are named only, which `documented_runs.py` cannot execute."""
     faults = {line: fault_of(line) for line in inline_commands()}
     assert len(faults) > 20
     assert not {line: fault for line, fault in faults.items() if fault}

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from limits import HANG_S
+from test_batch import command as batch
+from test_batch import flight, wait_for, worker_of
 
 from slam_graph.cli.console import echo_rich_table
 from slam_graph.config import load_config
@@ -276,6 +278,28 @@ def test_a_dask_cluster_does_the_same(
     (row,) = json.loads(done.stdout)["rows"]
     local = simulated[1]["rows"][0]
     assert row["ate_m"] == pytest.approx(local["ate_m"], rel=1e-9)
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
+def test_processes_that_workers_have_started_end_with_the_command(
+    scheduler: str, tmp_path: Path, by: signal.Signals
+) -> None:
+    """Also where the command is killed: Dask then forgets its tasks."""
+    pytest.importorskip("distributed")
+    for seed in range(2):
+        flight(tmp_path / "data" / f"flight_{seed}", seed, 60.0)
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        batch(tmp_path / "data", "--output", out, "--scheduler", scheduler, "--no-final-ba"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    )
+    started = [worker_of(out, f"flight_{seed}") for seed in range(2)]
+    process.send_signal(by)
+    assert process.wait(HANG_S) == (130 if by == signal.SIGINT else -by)
+    assert wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
+    assert not [path for path in out.iterdir() if path.is_dir()], "something half done"
 
 
 def test_no_scheduler_is_said_in_one_line() -> None:

@@ -137,7 +137,7 @@ def test_the_layout_has_space_cameras_plots_and_window(
 ) -> None:
     _, found = watched
     views = ("Run", "cam0", "Window", "Factor graph of the window", "Legend", "Log")
-    plots = ("velocity [m/s]", "gyro bias [rad/s]", "time [ms]", "NIS / degrees of freedom")
+    plots = ("velocity [m/s]", "gyro bias [rad/s]", "time [ms]", "NIS / dof")
     assert len(found.layouts) == 1, "a file has the layout of the end only"
     assert found.has_layout(*views, *plots, "position error [m]", "NEES")
 

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from map_flights import World
 from pose_graphs import laps
 from test_rerun import refused
 from typer.testing import CliRunner
 
+import slam_graph as sg
 from slam_graph.cli.main import app
 from slam_graph.errors import DataError
 from slam_graph.pose_graph import optimize_pose_graph
@@ -116,3 +118,30 @@ def test_without_a_driver_the_error_says_so(
     said = refused(graph_file, "--screenshot", tmp_path / "picture.png")
     assert "Vulkan driver" in said
     assert not (tmp_path / "picture.png").exists()
+
+
+def test_options_that_would_change_nothing_are_refused(tmp_path: Path) -> None:
+    """Those of recordings are for what has one, and those of the viewer for what has one."""
+    run = tmp_path / "run"
+    flight = sg.simulate(trajectory="figure8", duration_s=1.0)
+    flight.save(tmp_path / "flight")
+    sg.run(flight).save(run)
+    kalibr, picture = ("--calibration", run / "calibration.yaml"), ("--output", tmp_path / "a.rrd")
+    assert "--calibration is for the recording of" in refused(run, *kalibr, *picture)
+    truth = ("--recording", tmp_path / "flight", "--groundtruth", run / "groundtruth.tum")
+    assert "--groundtruth changes nothing" in refused(run, *truth, *picture)
+    assert "--format is for recordings" in refused(run, run, "--format", "euroc", *picture)
+    sg.save_map(World().map(), tmp_path / "map.slam")
+    assert "map.slam is none" in refused(tmp_path / "map.slam", *kalibr, *picture)
+    (run / "recording.rrd").touch()
+    assert "name it by --recording" in refused(run, "--topic", "imu=/imu0", *picture)
+    assert "--calibration changes nothing" in refused(run / "recording.rrd", *kalibr)
+    address = ("--rerun-address", "rerun+http://127.0.0.1:9876/proxy")
+    assert "--rerun-address is for --rerun connect" in refused(run, *address, *picture)
+    for words in (["run", "demo", *address], ["run", "demo", "--rerun-detail", "graph"]):
+        error = CliRunner().invoke(app, [*words, "--duration", "1"]).exception
+        assert isinstance(error, sg.SlamGraphError)
+    exported = ["export", run, "--tum", tmp_path / "a.tum", *kalibr]
+    error = CliRunner().invoke(app, [str(word) for word in exported]).exception
+    assert "--calibration is for the recording of the run" in str(error)
+    assert not (tmp_path / "a.tum").exists()

@@ -14,14 +14,17 @@ from flight import FISHEYE, RADTAN, Flight, packets, rig, room
 from typer.testing import CliRunner
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend import engine
 from slam_graph.backend.backend_config import (
     BackendConfig,
     CalibrationConfig,
     InitializationConfig,
     NoiseConfig,
 )
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.solve import gauss_newton
 from slam_graph.backend.solve.gauss_newton import linearized
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.cli.main import app
@@ -44,6 +47,7 @@ def steps(
     calibration: CalibrationConfig | None = None,
     outliers: float = 0.0,
     noise: NoiseConfig | None = None,
+    **policies: Any,
 ) -> Iterator[Estimator]:
     """An estimator after each frame of a noisy flight of 1.6 s, with a share of wrong pixels."""
     config = BackendConfig(
@@ -52,7 +56,9 @@ def steps(
         noise=noise or NoiseConfig(),
     )
     mounted, rng = rig(cameras, camera), np.random.default_rng(5)
-    estimator = Estimator(mounted, load_config(algorithm=name).algorithm, config)
+    algorithm = load_config(algorithm=name).algorithm
+    changed = type(algorithm).model_validate({**algorithm.model_dump(), **policies})
+    estimator = Estimator(mounted, changed, config)
     estimator.start(Flight().nav_state(0.0, SIGMAS))
     for packet in packets(Flight(), mounted, room(60, rng), 1.6, rng, 20.0):
         assert isinstance(packet.frame, FeatureFrame)
@@ -89,11 +95,11 @@ def eliminated(linear: gtsam.GaussianFactorGraph, keys: list[int]) -> tuple[Floa
 
 def check(estimator: Estimator) -> int:
     """Compare the two; how many features outside the state were in the cost."""
-    engine = estimator._engine
-    assert isinstance(engine, SquareRootEngine)
-    assert engine._cost is not None
-    count = len(engine._cost.tracks.points) if engine._cost.tracks is not None else 0
-    cost = engine._cost.part(engine._cost.factors, np.ones(count, np.bool_))
+    own = estimator._engine
+    assert isinstance(own, SquareRootEngine)
+    assert own._cost is not None
+    count = len(own._cost.tracks.points) if own._cost.tracks is not None else 0
+    cost = own._cost.part(own._cost.factors, np.ones(count, np.bool_))
     expected: SquareRootInformation = linearized(cost)
     window = estimator.factor_graph()
     known = set(window.values.keys())
@@ -128,6 +134,52 @@ def test_so_it_has_at_every_frame_with_outliers(name: str) -> None:
     assert sum(check(estimator) for estimator in flight) > 5, "no features outside the state"
 
 
+@pytest.mark.parametrize(
+    "gauss_newton_steps",
+    [{"max_steps": 1}, {"max_steps": 12, "tolerance": 1e-10}],
+    ids=["one", "many"],
+)
+def test_the_prior_is_made_of_it_where_the_last_step_began(
+    gauss_newton_steps: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The graph is linearised where that step ended: what differs in the two is that step alone.
+
+    With first estimates a further step may raise the cost, and then the last one is not small.
+    """
+    began: list[Any] = []
+    take_step = gauss_newton._step
+
+    def noted(cost: Cost, *rest: Any) -> Any:
+        began.append(cost.snapshot())
+        return take_step(cost, *rest)
+
+    def first_of(*arguments: Any, **named: Any) -> gauss_newton.Minimum:
+        began.clear()
+        found.append(gauss_newton.minimize(*arguments, **named))
+        return found[-1]
+
+    found: list[gauss_newton.Minimum] = []
+    monkeypatch.setattr(gauss_newton, "_step", noted)
+    monkeypatch.setattr(engine, "minimize", first_of)
+    flight = steps("msckf", cameras=1, outliers=0.1, gauss_newton=gauss_newton_steps)
+    next(flight)
+    unequal = 0
+    for estimator in flight:
+        own, minimum = estimator._engine, found[-1]
+        assert isinstance(own, SquareRootEngine)
+        assert own._cost is not None
+        expected = minimum.posterior.R.T @ minimum.posterior.R
+        scale = np.sqrt(np.diag(expected))
+        keys = list(minimum.posterior.layout.dims)
+        after = eliminated(estimator.factor_graph().linearize(), keys)[0]
+        own._cost.restore(began[len(minimum.costs) - 2])  # the trials that were undone are last
+        before = eliminated(estimator.factor_graph().linearize(), keys)[0]
+        unequal += bool(np.abs((after - expected) / np.outer(scale, scale)).max() > 1e-6)
+        normalized = (before - expected) / np.outer(scale, scale)
+        np.testing.assert_allclose(normalized, 0.0, atol=1e-9)
+    assert unequal > 0
+
+
 @pytest.mark.parametrize("cameras", [1, 2])
 @pytest.mark.parametrize("name", OWN)
 def test_so_it_has_with_the_calibration_as_variables(name: str, cameras: int) -> None:
@@ -143,10 +195,10 @@ def test_so_it_has_while_it_learns_the_noise_of_each_camera(name: str) -> None:
         if number == 0:  # what was learned in one camera counts in it only
             before = pixels.sigma_px = np.array([0.7, 1.4])
             continue
-        engine = estimator._engine
-        assert isinstance(engine, SquareRootEngine)
-        assert engine._cost is not None
-        np.testing.assert_array_equal(engine._cost.sigma_px, before)  # not what came later
+        own = estimator._engine
+        assert isinstance(own, SquareRootEngine)
+        assert own._cost is not None
+        np.testing.assert_array_equal(own._cost.sigma_px, before)  # not what came later
         check(estimator)
         before = pixels.sigma_px
 

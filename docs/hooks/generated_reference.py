@@ -25,6 +25,9 @@ MARKER = re.compile(r"^<!-- generated: ([a-z ]+) -->$", re.MULTILINE)
 TAG = re.compile(r"```.*?```|`[^`]*`|(?P<tag><)", re.DOTALL)
 """What looks like a tag of HTML outside of code."""
 
+EXAMPLES = re.compile(r"^\[bold\](.+)\[/bold\]\n\n((?:  \[cyan\].+\[/cyan\]\n)+)", re.MULTILINE)
+"""Examples as they are marked up for a terminal: title and lines."""
+
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put the generated parts where a page has their markers."""
@@ -39,7 +42,7 @@ def commands() -> str:
         [*typer, *arguments], cwd=PACKAGE.parent, capture_output=True, text=True, check=True
     )
     _, _, body = done.stdout.partition("\n")  # the page has a title of its own
-    body = _whole_summaries(body)
+    body = EXAMPLES.sub(_block, _whole_summaries(body))
     return TAG.sub(lambda found: found[0].replace("<", "&lt;") if found["tag"] else found[0], body)
 
 
@@ -54,6 +57,12 @@ def _whole_summaries(body: str) -> str:
             line = f"* `{entry[1]}`: {first[group + entry[1]].replace(chr(10), ' ')}"
         lines.append(line)
     return "\n".join(lines)
+
+
+def _block(found: re.Match[str]) -> str:
+    """Examples as a block of commands."""
+    lines = re.sub(r"^  \[cyan\](.+)\[/cyan\]$", r"\1", found[2], flags=re.MULTILINE)
+    return f"**{found[1]}**:\n\n```sh\n{lines}```\n"
 
 
 def main_names() -> str:

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from slam_graph.cli.options import Calibration, Format, Sources, open_recording
+from slam_graph.cli.options import (
+    Calibration,
+    Format,
+    Sources,
+    open_recording,
+    recording_options,
+    refuse_ignored,
+)
 
 if TYPE_CHECKING:
     from slam_graph.geometry import Trajectory
@@ -85,6 +92,9 @@ def export(
         )
     if scenes and recording is None:
         raise ConfigError("images are in the recording that was run: name it by --recording DATA")
+    if recording is None:
+        given = recording_options(format_, calibration, None, sources)
+        refuse_ignored(given, "is for the recording of the run: name it by --recording DATA")
     saved = load_result(result)
     for name, path in files.items():
         typer.echo(str(_chosen(saved, which).save(path, name)))  # type: ignore[arg-type]

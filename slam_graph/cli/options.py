@@ -177,6 +177,39 @@ def sources_from(texts: list[str] | None) -> dict[str, str]:
     return {sensor: where for sensor, _, where in pairs}
 
 
+def recording_options(
+    format_: str | None,
+    calibration: Path | None,
+    groundtruth: Path | None,
+    sources: list[str] | None,
+) -> dict[str, object]:
+    """Options for recordings, by their names, as far as they were given."""
+    options = {
+        "--format": format_,
+        "--calibration": calibration,
+        "--groundtruth": groundtruth,
+        "--topic": sources,
+    }
+    return {name: value for name, value in options.items() if value}
+
+
+def refuse_ignored(given: Mapping[str, object], why: str) -> None:
+    """Refuse options that would change nothing.
+
+    Args:
+        given: values by the names of the options.
+        why: for the message, after the name of the first one.
+
+    Raises:
+        ConfigError: if any was given.
+    """
+    from slam_graph.errors import ConfigError
+
+    for name, value in given.items():
+        if value:
+            raise ConfigError(f"{name} {why}")
+
+
 def open_recording(
     data: str,
     format_: str | None,

@@ -11,13 +11,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from slam_graph.cli.options import Calibration, Format, Groundtruth, RerunAddress, Sources
+from slam_graph.cli.options import (
+    Calibration,
+    Format,
+    Groundtruth,
+    RerunAddress,
+    Sources,
+    open_recording,
+    recording_options,
+    refuse_ignored,
+)
 from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
+    from slam_graph.datasets import Sequence
     from slam_graph.visualization import RerunRecording
 
 _Show = Callable[["RerunRecording"], None]
+_Options = tuple[str | None, Path | None, Path | None, list[str] | None]
+"""Format, calibration, ground truth and sources of a recording."""
+_FOR_RECORDINGS = "is for recordings, and {} is none"
 _RRD = ".rrd"
 
 
@@ -81,23 +94,24 @@ def view(
     pixels = _size(size)
     if screenshot is not None:
         _check_picture(screenshot)
+    if mode != "connect":
+        refuse_ignored({"--rerun-address": rerun_address}, "is for --rerun connect")
+    options = (format_, calibration, groundtruth, sources)
     wanted = {
         "--map": known_map,
         "--recording": recording_of_run,
-        "--no-images": None if images else images,
+        "--no-images": not images,
+        **recording_options(*options),
     }
-    existing = _recording_of(
-        what, [option for option, value in wanted.items() if value is not None]
-    )
+    existing = _recording_of(what, [option for option, value in wanted.items() if value])
     if existing is not None:
         _show_existing(existing, mode, output, screenshot, pixels, rerun_address)
         return
-    options = (format_, calibration, groundtruth, sources)
     name, show = _shown(what, images, known_map, recording_of_run, options)
     with tempfile.TemporaryDirectory(prefix="slam_graph_") as folder:
         files = output is not None or screenshot is not None
         path = output or Path(folder) / f"{name}{_RRD}"
-        watching = Watching("save" if files else mode, address=rerun_address)
+        watching = Watching("save") if files else Watching(mode, address=rerun_address)
         with watching.recording(path, name) as recording:
             show(recording)
             if not files:
@@ -186,7 +200,7 @@ def _shown(
     images: bool,
     known_map: Path | None,
     recording_of_run: str | None,
-    options: tuple[str | None, Path | None, Path | None, list[str] | None],
+    options: _Options,
 ) -> tuple[str, _Show]:
     """The name of what is meant, and what logs it.
 
@@ -195,9 +209,9 @@ def _shown(
         DataError: if it cannot be read.
     """
     from slam_graph.cli import view_files as files
-    from slam_graph.cli.options import open_recording
     from slam_graph.errors import ConfigError
 
+    given = recording_options(*options)
     of_run = known_map is not None or recording_of_run is not None
     misplaced = "--map and --recording are for the folder of one run"
     if len(what) > 1:
@@ -205,6 +219,7 @@ def _shown(
 
         if of_run:
             raise ConfigError(misplaced)
+        refuse_ignored(given, "is for recordings, and these are results of runs")
         return "comparison", runs_compared([Path(path) for path in what])
     path = Path(what[0])
     for folder in (path, path / "latest"):
@@ -212,15 +227,34 @@ def _shown(
             continue
         wanted = None
         if files.is_run(folder):
-            sequence = open_recording(recording_of_run, *options) if recording_of_run else None
+            sequence = _recording_of_run(folder, recording_of_run, options)
             wanted = files.RunOptions(known_map, sequence, images)
         elif of_run and files.of_folder(folder) is not None:
             raise ConfigError(f"{folder}: {misplaced}")
         if (found := files.of_folder(folder, wanted)) is not None:
+            if wanted is None:
+                refuse_ignored(given, _FOR_RECORDINGS.format(folder))
             return folder.resolve().parent.name or path.name, found
     if of_run:
         raise ConfigError(f"{path}: {misplaced}")
     if path.is_file() and options[0] is None and (found := files.of_file(path)) is not None:
+        refuse_ignored(given, _FOR_RECORDINGS.format(path))
         return path.stem, found
     sequence = open_recording(what[0], *options)
     return sequence.info().name, lambda recording: recording.show_recording(sequence, images)
+
+
+def _recording_of_run(folder: Path, data: str | None, options: _Options) -> Sequence | None:
+    """The recording of a run, if it was named.
+
+    Raises:
+        ConfigError: if options would change nothing.
+        DataError: if it cannot be opened.
+    """
+    given = recording_options(*options)
+    truth = {"--groundtruth": given.get("--groundtruth")}
+    refuse_ignored(truth, f"changes nothing: {folder} is shown with the ground truth of the run")
+    if data is None:
+        refuse_ignored(given, f"is for the recording of {folder}: name it by --recording DATA")
+        return None
+    return open_recording(data, *options)

@@ -22,8 +22,10 @@ _ERRORS = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
 _ERROR_TITLES = ("time_s", "position error [m]", "orientation error [deg]")
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
 """What NumPy raises for a file that is no archive of arrays, or lacks one."""
-_SAME_M = 1e-6
-"""Poses of a file that are nearer than this to those of odometry alone are these."""
+_SAME_PART = 1e-4
+"""Poses of a file that are nearer than this part of their extent to those of odometry alone are
+these: files round them.
+"""
 _GRAPH_SUFFIXES = {".g2o", ".graph", ".toro"}
 
 
@@ -98,8 +100,6 @@ def _begins_like_graph(path: Path) -> bool:
 
 def _graph(path: Path) -> _Show:
     """A pose graph as it is in its file beside odometry alone, or one of both if they agree."""
-    import numpy as np
-
     from slam_graph.pose_graph import PoseGraphSolution, read_pose_graph
 
     graph = read_pose_graph(path)
@@ -110,9 +110,17 @@ def _graph(path: Path) -> _Show:
     titles = {"before": "Odometry alone", "after": "As in the file"}
     if graph.estimates is None:
         del titles["after"]
-    elif np.abs(poses.translations - alone.translations).max(initial=0.0) < _SAME_M:
+    elif _is_same(poses.translations, alone.translations):
         titles = {"after": "As in the file: odometry alone"}
     return lambda recording: recording.show_pose_graph(solution, titles)
+
+
+def _is_same(first: FloatArray, second: FloatArray) -> bool:
+    """Whether positions (N, 3) differ by no more than a file rounds them."""
+    import numpy as np
+
+    extent = float(np.linalg.norm(np.ptp(second, axis=0))) if len(second) else 0.0
+    return bool(np.abs(first - second).max(initial=0.0) <= _SAME_PART * extent)
 
 
 def _optimized_graph(folder: Path) -> _Show:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from slam_graph.cli.options import RerunMode
+from slam_graph.cli.options import RerunMode, refuse_ignored
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -29,12 +29,21 @@ class Watching:
         images: of which frames images are sent.
         detail: `graph` adds the factor graph of every window.
         address: of the viewer to connect to; None means the usual one.
+
+    Raises:
+        ConfigError: if an option would change nothing.
     """
 
     mode: RerunMode = "off"
     images: Literal["none", "keyframes", "all"] = "all"
     detail: Literal["normal", "graph"] = "normal"
     address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode != "connect":
+            refuse_ignored({"--rerun-address": self.address}, "is for --rerun connect")
+        if self.mode == "off":
+            refuse_ignored({"--rerun-detail graph": self.detail == "graph"}, "needs --rerun")
 
     @contextmanager
     def viewer(self, path: Path, name: str, known_map: SlamMap | None = None) -> Iterator[Any]:

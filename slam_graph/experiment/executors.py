@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from typing import Protocol
@@ -24,6 +24,9 @@ _STOP_TIMEOUT_S = 10.0
 """Time for a task to end after SIGINT before it is killed."""
 
 _CONNECT_TIMEOUT_S = 10.0
+
+_LOOK_S = 0.3
+"""A worker of Dask looks as often whether its task is still wanted."""
 
 Outcome = tuple[Task, str | None]
 """A task that has ended, and why it failed or None."""
@@ -138,12 +141,24 @@ def executor_for(workers: int | None, scheduler: str | None) -> Executor:
 
 
 def _do_in_process(task: str) -> str | None:
-    """Do a task in a new process.
+    """Do a task of Dask in a new process, which ends when nobody waits for it any more.
+
+    A thread of a worker cannot be stopped from outside: Dask forgets a task that was cancelled, or
+    whose client is gone, and lets the thread go on. So the thread looks itself.
 
     Returns:
         Why it failed, or None.
     """
-    return _wait(_start(task))
+    from distributed import get_worker
+
+    worker = get_worker()
+    key = worker.get_current_task()
+
+    def wanted() -> bool:
+        known = worker.state.tasks.get(key)
+        return known is not None and known.state != "cancelled"
+
+    return _wait(_start(task), wanted)
 
 
 def _start(task: str) -> subprocess.Popen[str]:
@@ -176,9 +191,23 @@ def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
             process.kill()
 
 
-def _wait(process: subprocess.Popen[str]) -> str | None:
-    """Wait for the process of a task. Returns why it failed, or None."""
-    _, errors = process.communicate()
+def _wait(process: subprocess.Popen[str], wanted: Callable[[], bool] | None = None) -> str | None:
+    """Wait for the process of a task.
+
+    Args:
+        process: to wait for.
+        wanted: tells whether it is still wanted; it is ended if not. None if nobody is to ask.
+
+    Returns:
+        Why it failed, or None.
+    """
+    while True:
+        try:
+            _, errors = process.communicate(timeout=None if wanted is None else _LOOK_S)
+            break
+        except subprocess.TimeoutExpired:
+            if wanted is not None and not wanted():
+                _stop([process])
     if process.returncode == 0:
         return None
     if process.returncode < 0:

@@ -3,8 +3,9 @@
 """Keyframes with their images, and points: what programs for dense reconstruction start from.
 
 Keyframes are chosen by motion. Where the run saved a map, its keyframes are among them, the points
-are those of the map, and the first camera's observations in its keyframes are known. In the other
-images, those of further cameras among them, the points of the last keyframe are found again.
+are those of the map, moved to fit their observations (`scene_points.py`), and the first camera's
+observations in its keyframes are known. In the other images, those of further cameras among them,
+the points of the last keyframe are found again.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
+from slam_graph.results.scene_points import refined_points
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
 
 if TYPE_CHECKING:
@@ -166,7 +168,7 @@ class _Keyframes:
         if self._map is not None:
             if len(self._map.recordings) != 1:
                 raise DataError("the map is of several recordings; export the run of one of them")
-            self.rig, self.points = self._map.recordings[0].rig, self._map.points
+            self.rig, self.points = self._map.recordings[0].rig, refined_points(self._map)
         self._parts = parts
         self._last: gtsam.Pose3 | None = None
 

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.visualization.rerun_series import ERROR_PLOTS, STATE_PLOTS, WORK_PLOTS, Plot
+from slam_graph.visualization.rerun_series import (
+    ERROR_PLOTS,
+    IMU_PLOTS,
+    STATE_PLOTS,
+    WORK_PLOTS,
+    Plot,
+)
 from slam_graph.visualization.rerun_stream import FRAME, SENSOR_TIME
 
 _GRID = (75, 75, 75, 110)
@@ -252,6 +258,9 @@ GROWING = (
 )
 """What accumulates in the world of a run."""
 
+_STACKS = (STATE_PLOTS, ERROR_PLOTS, WORK_PLOTS)
+"""The tiles of plots of a run; those of one tile are its tabs."""
+
 
 def odometry(shown: Shown, eye: Eye | None = None) -> Any:
     """The layout of a run: space, cameras below it, and plots beside it.
@@ -278,15 +287,23 @@ def odometry(shown: Shown, eye: Eye | None = None) -> Any:
         spaces.insert(0, view)
     if shown.window:
         spaces.append(window())
-    active = len(spaces) - 1 if shown.window else 0
-    three = spaces[0] if len(spaces) == 1 else rrb.Tabs(*spaces, active_tab=active)
+    stacks = [views for plots in _STACKS if (views := _views(plots, shown))]
+    right = [rrb.Tabs(*views, active_tab=0) for views in stacks]
+    samples = _views(IMU_PLOTS, shown)
+    if right and samples:
+        # beside the space, where its two plots are wide and seen at once
+        aside = [rrb.Vertical(*samples, name="IMU")]
+    else:
+        aside, right = [], [*right, *samples]
+    three = rrb.Tabs(
+        *spaces, *aside, *_texts(shown), active_tab=len(spaces) - 1 if shown.window else 0
+    )
     cameras = [_camera(f"cam{number}", f"{body}/cam{number}") for number in range(shown.cameras)]
     left = rrb.Vertical(three, rrb.Horizontal(*cameras), row_shares=[67, 33]) if cameras else three
-    right = _plots(shown)
     if not right:
         return whole(left)
     return whole(
-        rrb.Horizontal(left, rrb.Vertical(*right), column_shares=[68, 32]),
+        rrb.Horizontal(left, rrb.Vertical(*right), column_shares=[66, 34]),
     )
 
 
@@ -307,26 +324,21 @@ def _camera(name: str, entity: str) -> Any:
     return rrb.Spatial2DView(name=name, origin=entity, overrides=overrides, background=_dark())
 
 
-def _plots(shown: Shown) -> list[Any]:
-    """Three stacks of plots: state, errors and consistency, work; with log and explanations."""
+def _views(plots: Iterable[Plot], shown: Shown) -> list[Any]:
+    """Views of those plots that have values."""
+    return [
+        plot_view(plot, shown.spans.get(plot.entity))
+        for plot in plots
+        if plot.entity in shown.plots
+    ]
+
+
+def _texts(shown: Shown) -> list[Any]:
+    """What colours mean, and the log of the run."""
     import rerun.blueprint as rrb
 
-    stacks = []
-    for plots in (STATE_PLOTS, ERROR_PLOTS, WORK_PLOTS):
-        views = [
-            plot_view(plot, shown.spans.get(plot.entity))
-            for plot in plots
-            if plot.entity in shown.plots
-        ]
-        if views:
-            stacks.append(views)
-    texts: list[Any] = [rrb.TextDocumentView(name="Legend", origin="/legend")]
-    if shown.log:
-        texts.append(rrb.TextLogView(name="Log", origin="/log"))
-    if not stacks:
-        return [rrb.Tabs(*texts)]
-    stacks[-1] += texts
-    return [rrb.Tabs(*views, active_tab=0) for views in stacks]
+    log = [rrb.TextLogView(name="Log", origin="/log")] if shown.log else []
+    return [*log, rrb.TextDocumentView(name="Legend", origin="/legend")]
 
 
 def window() -> Any:

@@ -34,7 +34,7 @@ from slam_graph.visualization.rerun_stream import RerunStream
 PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
 
-POINT_RADIUS, KEYFRAME_RADIUS, END_RADIUS = -1.3, -3.2, -4.0
+POINT_RADIUS, KEYFRAME_RADIUS, END_RADIUS = -1.3, -3.2, -6.0
 """Of points of maps, keyframes (they lie on paths), and ends of loop closures, in pixels."""
 
 _TRUTH_POINTS = 2000

@@ -139,8 +139,8 @@ def _summary(solution: PoseGraphSolution, chi2: dict[str, float]) -> str:
 | rejected | {rejected} |
 {rows}
 
-**Edges** are coloured by the logarithm of χ²{both}: dark blue fits, yellow does not. Red: rejected
-as an outlier. Edges that fit exactly (χ² below {_LEAST_CHI2:g}) have no residual.
+**Edges** by log χ²{both}: dark blue fits, yellow does not; red was rejected. Those that fit exactly
+(χ² below {_LEAST_CHI2:g}) have no residual.
 """
 
 

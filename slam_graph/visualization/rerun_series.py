@@ -39,7 +39,7 @@ class Plot:
 
     Attributes:
         entity: its values.
-        title: with the unit.
+        title: with the unit; short, as up to five share the head of a tile.
         names: of the values.
         colours: of the values.
         bounds: names of what is drawn thinner beside them, at `entity/bounds`.
@@ -64,12 +64,14 @@ STATE_PLOTS = (
     Plot("state/velocity", "velocity [m/s]"),
     _with_band("state/gyro_bias", "gyro bias [rad/s]"),
     _with_band("state/accel_bias", "accel bias [m/s²]"),
+)
+IMU_PLOTS = (
     Plot("imu/gyro", "angular rate [rad/s]"),
     Plot("imu/accel", "specific force [m/s²]"),
 )
 ERROR_PLOTS = (
     _with_band("error/position", "position error [m]", True),
-    _with_band("error/orientation", "orientation error [deg]", True),
+    _with_band("error/orientation", "orientation error [°]", True),
     Plot(
         "consistency/nees",
         "NEES",
@@ -81,7 +83,7 @@ ERROR_PLOTS = (
     ),
     Plot(
         "consistency/nis",
-        "NIS / degrees of freedom",
+        "NIS / dof",
         ("images",),
         (ORANGE,),
         ("expected", "95 %", "lower"),
@@ -100,13 +102,13 @@ WORK_PLOTS = (
     ),
     Plot(
         "backend/counts",
-        "features and poses",
+        "features",
         ("tracked", "other cameras", "estimated", "poses in state"),
         (SKY, GREEN, ORANGE, YELLOW),
     ),
     Plot(
         "backend/rejected",
-        "rejected features",
+        "rejected",
         ("RANSAC", "gate", "stereo"),
         (YELLOW, VERMILLION, SKY),
     ),
@@ -117,7 +119,7 @@ WORK_PLOTS = (
         (VERMILLION, *CYCLE[:3], *CYCLE[3:5], CYCLE[6], CYCLE[7])[:_MAX_STEPS],
     ),
 )
-PLOTS = {plot.entity: plot for plot in (*STATE_PLOTS, *ERROR_PLOTS, *WORK_PLOTS)}
+PLOTS = {plot.entity: plot for plot in (*STATE_PLOTS, *IMU_PLOTS, *ERROR_PLOTS, *WORK_PLOTS)}
 
 
 @dataclass(slots=True)

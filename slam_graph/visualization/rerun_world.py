@@ -19,6 +19,7 @@ from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
     RIG_M,
     SQUARE,
+    WIDE,
     Eye,
     Shown,
     odometry,
@@ -86,7 +87,7 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
         views.mount(details.rig)
         if details.recording is not None:
             plots |= _show_inputs(stream, series, views, details, outcome, stamps_ns)
-            cameras = len(details.rig.cameras)
+            cameras = _cameras_shown(details.recording, details.images)
     if details.known_map is not None:
         log_map(stream, KNOWN_MAP, details.known_map)
     lines = list(details.log)
@@ -104,7 +105,8 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
         map_path=places_in_map(run, details.known_map),
         spans=series.spans,
     )
-    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, SQUARE, RIG_M)))
+    aspect = WIDE if cameras else SQUARE
+    stream.arrange(odometry(shown, Eye.on(best.positions, details.points, aspect, RIG_M)))
 
 
 def _show_timing(
@@ -192,6 +194,11 @@ def _show_inputs(
     return _IMU_PLOTS
 
 
+def _cameras_shown(recording: Sequence, images: bool) -> int:
+    """Number of cameras of a recording of which anything is shown."""
+    return len(recording.rig.cameras) if images or recording.info().content != "images" else 0
+
+
 def _show_packet(
     stream: RerunStream,
     series: SeriesLog,
@@ -228,10 +235,11 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         _show_packet(stream, series, cameras, number, packet, images)
     series.flush()
     eye, frustum_m = None, _FRUSTUM_M[1]
+    outcome = OutcomeLog(stream, "world", series, stamps_ns)
+    outcome.show_legend()
     if truth is not None and stamps_ns:
         near = (truth.stamps_ns >= stamps_ns[0]) & (truth.stamps_ns <= stamps_ns[-1])
         truth = truth.select(near)
-        outcome = OutcomeLog(stream, "world", series, stamps_ns)
         outcome.path("path/groundtruth", truth, TRUTH)
         columns = rr.Transform3D.columns(translation=truth.positions, quaternion=truth.quaternions)
         stream.send_columns("world/body", outcome.frames(truth.stamps_ns), truth.stamps_ns, columns)
@@ -240,5 +248,5 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
             frustum_m = float(np.clip(_FRUSTUM_PART * extent_m, *_FRUSTUM_M))
         eye = Eye.on(truth.positions, around=RIG_M)
     cameras.mount(sequence.rig, frustum_m)
-    shown = Shown(cameras=len(sequence.rig.cameras), plots=_IMU_PLOTS, title="Recording")
+    shown = Shown(cameras=_cameras_shown(sequence, images), plots=_IMU_PLOTS, title="Recording")
     stream.arrange(odometry(shown, eye))
