@@ -1,16 +1,27 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures shared by all tests: where the recordings are."""
+"""Fixtures shared by all tests: where the recordings are; kernels that are compiled."""
 
 import os
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
 import gtsam
 import pytest
 
+import slam_graph.kernels
+
 if TYPE_CHECKING:
     from documented_stock import Stock
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels() -> None:
+    """All kernels in the cache, so that no command says that it compiles them."""
+    for module in iter_modules(slam_graph.kernels.__path__):
+        import_module(f"slam_graph.kernels.{module.name}")
 
 
 @pytest.fixture(scope="session")

@@ -41,9 +41,12 @@ def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
 
 
 def _tell(kernel: object) -> None:
-    """Say it once where a kernel was not in the cache: those that follow take seconds, too."""
+    """Say it once where a kernel was not in the cache: those that follow take seconds, too.
+
+    As a warning, which is shown where nothing has been set up to show logs yet.
+    """
     global _told
     stats = getattr(kernel, "stats", None)
     if not _told and stats is not None and stats.cache_misses:
         _told = True
-        logger.info("compiling kernels: once on this machine, some 20 s")
+        logger.warning("compiling kernels: once on this machine, some 15 s")
