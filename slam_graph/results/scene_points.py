@@ -10,11 +10,14 @@ nothing for recognising a place, and too much for a reconstruction.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.maps import SlamMap
+
+if TYPE_CHECKING:
+    from slam_graph.maps import SlamMap
 
 _STEPS = 8
 _DEPTH_PART = 0.05
