@@ -29,7 +29,8 @@ QUANTISED_TOLERANCE = 0.05
 
 TIMING_TOLERANCE = 0.30
 """For ratios of times of one run, which scatter with the caches of a machine. Load makes it worse
-(a front end of 2.7 flows once came out at 4.3), so no quick benchmark judges a time."""
+(a front end of 2.7 flows once came out at 4.3), so one quick benchmark alone judges a time, the
+least of a few runs (`speed_quick`)."""
 
 COMPUTING_TIMES = ("ms", "ms CPU", "ms = 1 LK", "s CPU", "s wall", "× real time")
 """Units of what a machine takes for something: another machine takes another time, so a figure in

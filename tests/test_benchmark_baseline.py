@@ -123,11 +123,14 @@ def test_what_a_machine_takes_is_never_judged(unit: str) -> None:
         Metric("a.b", 1.0, unit, "lower", 2.0)
 
 
-def test_no_quick_benchmark_judges_a_time() -> None:
+def test_quick_benchmarks_judge_ratios_of_times_generously() -> None:
+    """Load has made a ratio worse by 1.6 (`TIMING_TOLERANCE`); a repetition halves its chance."""
     records = baseline.read_baseline()
     quick = [records[name] for name, benchmark in BENCHMARKS.items() if benchmark.quick]
     metrics = [metric for record in quick for metric in record.metrics.values()]
-    assert not [metric.key for metric in metrics if metric.has_baseline and "LK" in metric.unit]
+    times = [metric for metric in metrics if metric.has_baseline and "LK" in metric.unit]
+    assert [metric.key for metric in times] == ["speed_quick.cost_mean"]
+    assert times[0].tolerance == 0.5
 
 
 def test_every_recording_of_a_benchmark_is_chosen_on_or_held_out() -> None:
