@@ -246,3 +246,12 @@ def test_undistort_radtan() -> None:
     q = model.distort(m, coefficients)[0]
     assert same(model.undistort(q, coefficients), m)
     assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+def test_a_division_by_zero_is_no_exception() -> None:
+    """A feature that no observation depends on: its linear system is refused later, as NaN."""
+    r, by_pose, none = np.ones((2, 2)), np.ones((2, 2, 6)), np.zeros((2, 2, 0))
+    frame, starts = np.array([0, 1]), np.array([0, 2])
+    R_f, T, information = np.zeros((1, 3, 3)), np.zeros((1, 3, 13)), np.zeros((13, 13))
+    sum_of_features(r, by_pose, np.zeros((2, 2, 3)), none, frame, starts, R_f, T, information)
+    assert np.isnan(information).any()

@@ -22,8 +22,9 @@ _told = False
 def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
     """Compile a function to machine code, without Python's lock while it runs.
 
-    In double precision with the roundings of IEEE 754 in the order that is written. Functions that
-    it calls must be in its own file: Numba's cache looks at nothing else to see what has changed.
+    In double precision with the roundings of IEEE 754 in the order that is written; a division by
+    zero is infinite or NaN, as in NumPy. Functions that it calls must be in its own file: Numba's
+    cache looks at nothing else to see what has changed.
 
     Args:
         signatures: types of arguments and result in Numba's notation, e.g. `f8[::1](f8[:, ::1])`;
@@ -31,7 +32,7 @@ def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
     """
 
     def decorate(function: _Kernel) -> _Kernel:
-        jit = numba.njit(list(signatures) or None, cache=True, nogil=True)
+        jit = numba.njit(list(signatures) or None, cache=True, nogil=True, error_model="numpy")
         kernel = cast("_Kernel", jit(function))
         if signatures:
             _tell(kernel)
