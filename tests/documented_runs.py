@@ -62,7 +62,6 @@ SKIPPED = {
     r"dask ": "runs until it is stopped; the cluster of the test takes its place",
     r"make demo": "tests/test_documented_commands.py compares what it prints",
     r"make (bench|gate)": "minutes to hours; tests/test_benchmarks.py",
-    r"python -m cProfile": "Python's profiler around a command that is executed elsewhere",
     r"make tables": "tests/test_benchmark_baseline.py",
 }
 """Commands that are not executed here, and why or where."""
