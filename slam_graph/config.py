@@ -110,9 +110,9 @@ class RunConfig(Settings):
     a result is chance."""
     min_coverage: float = expert(default=0.5, ge=0, le=1)
     """Smallest share of the time asked for that the estimate must cover for a run to succeed."""
-    overlap: bool = True
+    overlap: bool = False
     """Whether the front end tracks the next frame in a thread while the back end works on this one.
-    The results are the same; switch it off to time the parts of a run apart."""
+    The results are the same. Both need Python's lock: so far it gains nothing."""
     frontend: FrontendConfig = FrontendConfig()
     """From images to features."""
     backend: BackendConfig = BackendConfig()
