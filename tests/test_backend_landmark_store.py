@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 
+from slam_graph.backend.marginalization import landmark_store
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.marginalization.marginalize import LinearizationPoints, marginalize
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -87,3 +88,19 @@ def test_put_aside_and_recalled_is_held_on_to(seed: int, points: LinearizationPo
     seen = {gtsam.Symbol(k).index() for k in joint.prior.layout.dims if k != X(STEPS - 1)}
     assert len(archive.archive) > 0
     assert len(seen) > len(tracked)
+
+
+def test_a_store_that_closes_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A feature that comes back is a new variable then, and nothing is stored any more."""
+    rng, own = np.random.default_rng(5), Filter(archive=True, points="first")
+    own.step(0, {0, 1}, rng)
+    own.step(1, {2}, rng)
+    assert len(own.archive) == 2
+    monkeypatch.setattr(landmark_store, "_MAX_EXCHANGES", -1)
+    before = own.prior
+    own.step(2, {0, 2}, rng)
+    assert not own.archive.open
+    assert own.archive.size == 0
+    assert L(0) in own.state.offsets
+    assert L(0) not in before.layout
+    assert len(own.archive.due(np.array([0, 1, 2]))) == 0

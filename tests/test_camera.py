@@ -258,3 +258,9 @@ def test_refuses_a_wrong_calibration(change: dict[str, object], message: str) ->
     fields = {name: getattr(RADTAN, name) for name in RADTAN.__dataclass_fields__}
     with pytest.raises(DataError, match=message):
         Camera(**{**fields, **change})
+
+
+def test_whole_numbers_are_taken_for_parameters() -> None:
+    camera = Camera(458, 457, 367, 248, "radtan", (0, 0, 0, 0), 752, 480)
+    points = np.array([[0.1, -0.2], [0.0, 0.3]])
+    np.testing.assert_allclose(camera.undistort(camera.distort(points)[0]), points, atol=1e-12)

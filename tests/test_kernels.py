@@ -207,7 +207,9 @@ def test_claim(count: int) -> None:
     chosen = claim(masks[0], points, count, 8.5, disk(8))
     assert np.array_equal(chosen, claim_numpy(masks[1], points, count, 8.5, disk(8)))
     assert np.array_equal(*masks)
-    assert len(chosen) == (min(count, len(chosen)) if count else 0)
+    assert len(chosen) == 0 if count == 0 else 0 < len(chosen) <= count
+    apart_px = np.linalg.norm(points[chosen][:, None] - points[chosen], axis=2)
+    assert np.all(apart_px[~np.eye(len(chosen), dtype=bool)] >= 8.5)
 
 
 def test_apart() -> None:

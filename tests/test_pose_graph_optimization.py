@@ -50,7 +50,6 @@ def test_known_optima_are_reached_from_own_estimates(data_dir: Path, name: str) 
     assert solution.minimum.converged
 
 
-@pytest.mark.data
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_chi2_of_edges_is_that_of_the_factors(dimension: int) -> None:
     """For angles from zero to nearly half a turn."""
@@ -70,6 +69,7 @@ def test_chi2_of_edges_is_that_of_the_factors(dimension: int) -> None:
     np.testing.assert_allclose(chi2_of_edges(graph, poses), expected, rtol=1e-9)
 
 
+@pytest.mark.data
 def test_chi2_in_the_convention_of_g2o(data_dir: Path) -> None:
     path = data_dir / "posegraphs" / "sphere2500.g2o"
     angle = optimize_pose_graph(read_pose_graph(path))

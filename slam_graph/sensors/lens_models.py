@@ -147,7 +147,8 @@ class RadialTangential(_SolvedByOpenCv):
         from slam_graph.kernels.undistortion import undistort_radtan  # which imports Numba
 
         places, start = np.ascontiguousarray(q), np.ascontiguousarray(m)
-        return undistort_radtan(places, start, np.array(coefficients), steps, NEWTON_TOLERANCE)
+        own = np.array(coefficients, np.float64)
+        return undistort_radtan(places, start, own, steps, NEWTON_TOLERANCE)
 
 
 @register_camera_model

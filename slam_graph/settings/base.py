@@ -124,7 +124,7 @@ def _classes(module: str) -> dict[str, list[ast.stmt]]:
     """The statements of each class of a module; none if its source is not there."""
     try:
         tree = ast.parse(getsource(modules[module]))
-    except (OSError, TypeError):
+    except (KeyError, OSError, TypeError):
         return {}
     return {node.name: node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 

@@ -79,11 +79,16 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
     Args:
         obs: N observations of J features, each seen at least twice.
         linear: their linearisation.
+
+    Raises:
+        numpy.linalg.LinAlgError: if the observations of a feature do not determine its position.
     """
     J, width = len(obs.ids), POSE_DIM * len(obs.frames) + linear.by_calibration.shape[2] + 1
     R_f, T, information = np.empty((J, 3, 3)), np.empty((J, 3, width)), np.empty((width, width))
     parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
     sum_of_features(*parts, obs.frame, obs.starts, R_f, T, information)
+    if not np.all(np.isfinite(information)):
+        raise np.linalg.LinAlgError("a feature is not determined by its observations")
     return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
 
 

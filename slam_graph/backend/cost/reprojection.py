@@ -324,6 +324,5 @@ def _radtan_lenses(cameras: Sequence[Camera]) -> FloatArray | None:
     if not all(camera.distortion in ("radtan", "none") for camera in cameras):
         return None
     straight = (0.0, 0.0, 0.0, 0.0)
-    return np.array(
-        [[*camera.intrinsics, *(camera.coefficients or straight)] for camera in cameras]
-    )
+    rows = [[*camera.intrinsics, *(camera.coefficients or straight)] for camera in cameras]
+    return np.array(rows, np.float64)

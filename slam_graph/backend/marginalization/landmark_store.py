@@ -104,6 +104,7 @@ class LandmarkStore:
             self.open = False
             self._conditionals.clear()
             self._places.clear()
+            self._moved.clear()
         return np.array([j for j in seen.tolist() if j in self._places], dtype=np.int64)
 
     def recall(

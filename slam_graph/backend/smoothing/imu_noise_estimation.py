@@ -11,7 +11,8 @@ states. So for the residuals of one kind, all of whose variances are wrong by th
 whose denominator, the redundancy, is how many of the residuals the images can contradict. Its trace
 is estimated by random signs (Hutchinson 1990), which takes solutions of the linear problem in place
 of all covariances: with W_i the rows of Q^-½ A of the residual i and signs z_i, the mean of wᵀ P w
-of w = Σ W_iᵀ z_i is Σ tr W_i P W_iᵀ. The error of the redundancy is at most √(2 redundancy / 16).
+of w = Σ W_iᵀ z_i is Σ tr W_i P W_iᵀ. The redundancy has a standard deviation of at most
+√(2 redundancy / 16).
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import gtsam
 
 from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, solved
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
+from slam_graph.errors import EstimationError
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +48,8 @@ def cliques_at_minimum(
     """The linearised cost with its gauge fixed, which its covariances follow from.
 
     After each estimate of the noise one Gauss-Newton step goes to the minimum under it. It takes
-    the same elimination as the covariances.
+    the same elimination as the covariances. The states that are reported stay those of the given
+    minimum; what follows is linearised where these steps lead.
 
     Args:
         cost: that was minimised.
@@ -67,11 +69,14 @@ def cliques_at_minimum(
         assumed = factors.noise
         if not factors.learn_noise(inertial, values, partial(solved, cliques)):
             break
-        inertial = factors.inertial(values)
-        graph, tree = _eliminated(cost, inertial, factors, values)
-        moved = values.retract(tree.optimize())
-        if not graph.error(moved) <= graph.error(values):
-            logger.info("the noise of the IMU is not learned: a step under it raises the cost")
+        try:
+            inertial = factors.inertial(values)
+            graph, tree = _eliminated(cost, inertial, factors, values)
+            moved = values.retract(tree.optimize())
+            if not graph.error(moved) <= graph.error(values):
+                raise EstimationError("a step under it raises the cost")
+        except (EstimationError, RuntimeError) as error:
+            logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
         values, cliques = moved, cliques_of(tree, wanted)
