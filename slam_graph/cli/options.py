@@ -98,6 +98,16 @@ Cameras = Annotated[
         rich_help_panel=_RECORDING,
     ),
 ]
+Inject = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inject",
+        metavar="FAULT[:SETTING=VALUE,…]",
+        help="Put a fault into the recording, repeatable, e.g. imu_missing:at_s=6,duration_s=1.",
+        show_default=False,
+        rich_help_panel=_RECORDING,
+    ),
+]
 Start = Annotated[
     float | None,
     typer.Option(
@@ -217,12 +227,16 @@ def open_recording(
     groundtruth: Path | None,
     sources: list[str] | None,
     cameras: int | None = None,
+    faults: list[str] | None = None,
 ) -> RecordedSequence:
-    """Open the recording that the options name, with its first `cameras` cameras or all."""
-    with loading(f"opening {data}"):
-        from slam_graph.datasets import open_dataset
+    """Open the recording that the options name, with its first `cameras` cameras or all.
 
-        return open_dataset(
+    Faults are put into it as far as `--inject` asks for them.
+    """
+    with loading(f"opening {data}"):
+        from slam_graph.datasets import inject, open_dataset
+
+        recording = open_dataset(
             data,
             format=format_,
             cameras=cameras,
@@ -230,6 +244,7 @@ def open_recording(
             groundtruth=groundtruth,
             sources=sources_from(sources),
         )
+        return inject(recording, faults or ())
 
 
 def run_settings(

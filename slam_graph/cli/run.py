@@ -30,6 +30,7 @@ from slam_graph.cli.options import (
     Duration,
     Format,
     Groundtruth,
+    Inject,
     Json,
     Output,
     Overrides,
@@ -238,6 +239,7 @@ def run(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
+    inject: Inject = None,
     as_json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording and write the results.
@@ -256,7 +258,7 @@ def run(
     )
     with collected_log() as log:
         sequence = open_recording(
-            data, format_, calibration, groundtruth, sources, settings.cameras
+            data, format_, calibration, groundtruth, sources, settings.cameras, inject
         )
         result, folder, files = execute(
             sequence,
