@@ -132,7 +132,7 @@ def test_the_imu_is_cleaned_as_by_a_reader(tracks: RecordedSequence, name: str, 
 
 def test_being_kidnapped_takes_time_out_of_everything(tracks: RecordedSequence) -> None:
     """Frames, IMU and truth go on without a gap in time, from another place."""
-    faulty = inject(tracks, [f"kidnapped:at_s={AT_S},duration_s={FOR_S}"])
+    faulty = inject(tracks, [f"kidnapped:at_s=2,duration_s={FOR_S}"])
     info, shorter = tracks.info(), faulty.info()
     assert info.end_ns - shorter.end_ns == round(FOR_S * 1e9)
     stamps = np.array([frame.stamp_ns for frame in faulty.frames()])
