@@ -174,4 +174,4 @@ def test_a_run_on_a_faulty_recording(tmp_path: object) -> None:
     )
     assert found.exit_code == 0, found.output
     wrong = CliRunner().invoke(app, f"run demo --inject nothing --output {tmp_path}")
-    assert wrong.exit_code == 2
+    assert isinstance(wrong.exception, ConfigError)
