@@ -18,6 +18,7 @@ from slam_graph.datasets.streams.csv_rows import Rows, count_rows, read_rows, re
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import ImuData
+from slam_graph.sensors.imu_outliers import without_outliers
 
 _GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not
@@ -110,10 +111,8 @@ def clean_blocks(
         after_ns: samples before this time are left out; None for all.
     """
     cleaner = _ImuCleaner(diagnostics, after_ns)
-    for where, data in blocks:
-        cleaned = cleaner.clean(data, where)
-        if len(cleaned):
-            yield cleaned
+    cleaned = (cleaner.clean(data, where) for where, data in blocks)
+    return without_outliers(cleaned, diagnostics)
 
 
 class ImuSource(Protocol):
