@@ -104,7 +104,7 @@ class _Judge:
         beyond: BoolArray = (size > _RANGE).any(axis=1)
         yield "imu_out_of_range", beyond
         at_the_end = _in_runs(size[1:] == size[:-1], _AT_THE_END) & (size > _LARGE)
-        saturated: BoolArray = np.any(at_the_end, axis=1)
+        saturated: BoolArray = np.logical_or.reduce(at_the_end, axis=1)
         yield "imu_saturated", saturated
         yield "imu_stuck", self._stuck(values)
         yield "imu_spike", _spikes(values)
