@@ -101,11 +101,9 @@ class _Judge:
             values: (N, 6) angular rates in rad/s and specific forces in m/s².
         """
         size = np.abs(values)
-        beyond: BoolArray = (size > _RANGE).any(axis=1)
-        yield "imu_out_of_range", beyond
+        yield "imu_out_of_range", np.asarray(np.any(size > _RANGE, axis=1))
         at_the_end = _in_runs(size[1:] == size[:-1], _AT_THE_END) & (size > _LARGE)
-        saturated: BoolArray = np.logical_or.reduce(at_the_end, axis=1)
-        yield "imu_saturated", saturated
+        yield "imu_saturated", np.asarray(np.any(at_the_end, axis=1))
         yield "imu_stuck", self._stuck(values)
         yield "imu_spike", _spikes(values)
 
