@@ -9,11 +9,11 @@ import pytest
 
 from slam_graph.config import load_config
 from slam_graph.datasets import inject, open_dataset
+from slam_graph.datasets.streams.imu_outliers import without_outliers
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.evaluation import ape
 from slam_graph.pipeline import run
 from slam_graph.sensors import ImuData
-from slam_graph.sensors.imu_outliers import without_outliers
 from slam_graph.simulation import simulate
 
 AT = 1500

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, count_rows, read_rows, require_rows
+from slam_graph.datasets.streams.imu_outliers import without_outliers
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import ImuData
-from slam_graph.sensors.imu_outliers import without_outliers
 
 _GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not

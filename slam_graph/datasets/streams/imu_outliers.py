@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors import ImuData
 
 _RANGE = np.repeat([40.0, 350.0], 3)
 """Beyond what inertial sensors measure: 2000 °/s are 35 rad/s, 32 g are 314 m/s²."""
