@@ -6,13 +6,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 
 import gtsam
 
-from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, solved
+from slam_graph.backend.smoothing.recording_cost import (
+    EliminatedFeatures,
+    Estimates,
+    Factor,
+    LinearCost,
+    RecordingCost,
+)
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
+from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.errors import EstimationError
 
 logger = logging.getLogger(__name__)
@@ -21,77 +26,60 @@ _ROUNDS = 3
 """The noise is estimated this many times at most, each at the minimum under the last estimate."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedCost:
-    """A cost that was minimised.
-
-    Attributes:
-        graph: all of it.
-        inertial: priors, IMU and zero-velocity factors.
-        projections: the other factors.
-        ordering: of the elimination.
-    """
-
-    graph: gtsam.NonlinearFactorGraph
-    inertial: gtsam.NonlinearFactorGraph
-    projections: gtsam.NonlinearFactorGraph
-    ordering: gtsam.Ordering
-
-
-def cliques_at_minimum(
-    cost: SolvedCost,
+def states_at_minimum(
+    cost: RecordingCost,
     factors: RecordingFactors,
-    values: gtsam.Values,
+    estimates: Estimates,
     learn: bool,
     count_step: Callable[[], None],
-) -> list[Clique]:
-    """The linearised cost with its gauge fixed, which its covariances follow from.
+) -> EliminatedStates:
+    """The factor of the cost with its gauge fixed, which its covariances follow from.
 
-    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. It takes
-    the same elimination as the covariances. The states that are reported stay those of the given
-    minimum; what follows is linearised where these steps lead.
+    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. The states
+    that are reported stay those of the given minimum. What images say of them hardly changes on the
+    way, so that their Jacobians remain those of the minimum.
 
     Args:
         cost: that was minimised.
         factors: of the IMU; their noise becomes what was learned.
-        values: the minimum.
+        estimates: the minimum.
         learn: whether to estimate the noise of the IMU.
         count_step: is called after each step.
 
     Raises:
-        RuntimeError: if the cost does not determine all variables.
+        RuntimeError: if GTSAM cannot linearise a factor.
+        LinAlgError: if the cost does not determine all variables.
     """
-    inertial = cost.inertial
-    wanted = {k for k in values.keys() if chr(gtsam.symbolChr(k)) in "xvb"}  # noqa: SIM118
-    graph, tree = _eliminated(cost, inertial, factors, values)
-    cliques = cliques_of(tree, wanted)
+    features = EliminatedFeatures(cost.images.linearized(estimates), cost.keyframes)
+    inertial = _with_gauge(cost.inertial, factors, estimates)
+    chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
+    states = EliminatedStates(features.poses, chain)
     for _ in range(_ROUNDS if learn else 0):
         assumed = factors.noise
-        if not factors.learn_noise(inertial, values, partial(solved, cliques)):
+        if not factors.learn_noise(inertial, estimates.states, states.times_covariance):
             break
         try:
-            inertial = factors.inertial(values)
-            graph, tree = _eliminated(cost, inertial, factors, values)
-            moved = values.retract(tree.optimize())
-            if not graph.error(moved) <= graph.error(values):
+            inertial = _with_gauge(factors.inertial(estimates.states), factors, estimates)
+            under = cost.with_inertial(inertial)
+            chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
+            linear = LinearCost(chain, cost.images.linearized(estimates))
+            known = EliminatedStates(features.poses, chain)
+            moved = estimates.moved(Factor(features, known).step(linear))
+            if not under.value(moved) <= under.value(estimates):
                 raise EstimationError("a step under it raises the cost")
         except (EstimationError, RuntimeError) as error:
             logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
-        values, cliques = moved, cliques_of(tree, wanted)
+        estimates, states = moved, known
         count_step()
-    return cliques
+    return states
 
 
-def _eliminated(
-    cost: SolvedCost,
-    inertial: gtsam.NonlinearFactorGraph,
-    factors: RecordingFactors,
-    values: gtsam.Values,
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.GaussianBayesTree]:
-    """The cost with other inertial factors and a fixed gauge; its linearisation's Bayes tree."""
+def _with_gauge(
+    inertial: gtsam.NonlinearFactorGraph, factors: RecordingFactors, estimates: Estimates
+) -> gtsam.NonlinearFactorGraph:
+    """Priors, IMU and zero-velocity factors with a fixed gauge."""
     graph = gtsam.NonlinearFactorGraph(inertial)
-    graph.push_back(cost.projections)
-    graph.push_back(factors.gauge(values))
-    return graph, graph.linearize(values).eliminateMultifrontal(cost.ordering)
+    graph.push_back(factors.gauge(estimates.states))
+    return graph

@@ -16,7 +16,6 @@ Keyframe k has the pose X(k), the velocity V(k) and the bias B(k), feature j the
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -30,9 +29,7 @@ from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
-from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
 from slam_graph.backend.smoothing.imu_noise_estimation import (
     ImuNoiseFactors,
     TimesCovariance,
@@ -160,25 +157,6 @@ class RecordingFactors:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
         return _graph(self._prior(values) + self._dynamics(values))
 
-    def projections(
-        self, obs: Observations, variances: FloatArray, sigma_px: float, rolling: RigProjection
-    ) -> gtsam.NonlinearFactorGraph:
-        """One projection factor for each observation.
-
-        Args:
-            obs: of the keyframes; frame indices are those of keyframes.
-            variances: (N,) relative to that of a single observation.
-            sigma_px: standard deviation of a single observation.
-            rolling: with the motions of the keyframes, for rolling shutters.
-        """
-        loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
-        factors: list[gtsam.NonlinearFactor] = []
-        for variance in np.unique(variances).tolist():  # one noise model for each group size
-            noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
-            group = obs.rows(variances == variance)
-            factors += ProjectionFactors(self._rig, noise).of(group, rolling)
-        return _graph(factors)
-
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
         """A prior that fixes position and yaw of the anchor.
 
@@ -232,7 +210,9 @@ class RecordingFactors:
         found = [inertial.at(i) for i in range(inertial.size())]
         factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
         moving = [k for k in range(len(factors)) if not self._in_gap(k) and not self._still(k)]
-        ratios = variance_ratios([factors[k] for k in moving], values, times_covariance)
+        keyframes = len(self._segment.keyframes)
+        chosen = [factors[k] for k in moving]
+        ratios = variance_ratios(chosen, values, keyframes, times_covariance)
         noise = self.noise.times(ratios)
         learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
         if noise.near(self.noise, learned):

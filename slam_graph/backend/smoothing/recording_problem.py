@@ -16,16 +16,22 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
+from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
-from slam_graph.backend.smoothing.learned_imu_noise import SolvedCost, cliques_at_minimum
+from slam_graph.backend.smoothing.learned_imu_noise import states_at_minimum
+from slam_graph.backend.smoothing.recording_cost import (
+    Estimates,
+    RecordingCost,
+    ReprojectionCost,
+)
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
     averaged,
@@ -46,8 +52,7 @@ from slam_graph.backend.smoothing.state_covariances import (
     keyframe_covariances,
     with_covariances,
 )
-from slam_graph.backend.solve.state import stacked_points, stacked_poses
-from slam_graph.errors import EstimationError
+from slam_graph.backend.solve.state import stacked_poses
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
 
@@ -61,8 +66,6 @@ _MIN_KEYFRAMES = 3
 _RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
 _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
-_MAX_LAMBDA = 1e5
-"""Steps end when the damping of Levenberg-Marquardt exceeds this."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -212,8 +215,8 @@ class BundleAdjustment:
         self, obs: Observations, points: FloatArray, good: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """The same with the current estimates of the features that have one."""
-        known = np.array([self._values.exists(L(j)) for j in obs.ids.tolist()], np.bool_)
-        points[known] = stacked_points(self._values, obs.ids[known].tolist())
+        known = np.isin(obs.ids, self._cost.images.obs.ids)  # both are ascending
+        points[known] = self._minimum.points
         return points, good | known
 
     def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
@@ -280,34 +283,22 @@ class BundleAdjustment:
         Returns:
             The minimum, and the part of IMU and priors in it.
         """
-        start = gtsam.Values()
-        for k in range(len(self._segment.keyframes)):
-            start.insert(X(k), self._values.atPose3(X(k)))
-            start.insert(V(k), self._values.atVector(V(k)))
-            start.insert(B(k), self._values.atConstantBias(B(k)))
-        for j, point in zip(obs.ids.tolist(), points, strict=True):
-            start.insert(L(j), point)
         inertial = self._factors.inertial(self._values)
-        graph = gtsam.NonlinearFactorGraph(inertial)
-        projections = self._factors.projections(obs, variances, self._sigma_px, self._projection)
-        graph.push_back(projections)
-        params = gtsam.LevenbergMarquardtParams()
-        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-        params.setOrdering(ordering)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
-        cost = optimizer.error()
-        for _ in range(self._config.max_iterations):
-            optimizer.iterate()
-            self._count_step()
-            decrease = cost - optimizer.error()
-            cost = optimizer.error()
-            if decrease <= tolerance * cost or optimizer.lambda_() > _MAX_LAMBDA:
-                break
-        if not math.isfinite(cost):
-            raise EstimationError("the cost of the bundle adjustment is not finite")
+        self._cost = RecordingCost(
+            inertial,
+            ReprojectionCost(
+                obs,
+                self._sigma_px * np.sqrt(variances),
+                self._projection,
+                RobustLoss(self._config.robust_loss, self._config.robust_width),
+            ),
+            len(self._segment.keyframes),
+        )
+        start = Estimates(self._values, points)
+        steps = self._config.max_iterations
+        self._minimum, cost = minimized(self._cost, start, tolerance, steps, self._count_step)
         self._passes += 1
-        self._values = optimizer.values()
-        self._solved = SolvedCost(graph, inertial, projections, ordering)
+        self._values = self._minimum.states
         return cost, inertial.error(self._values)
 
     def _count_step(self) -> None:
@@ -324,10 +315,8 @@ class BundleAdjustment:
         """
         poses = stacked_poses(self._given, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
-        values = gtsam.Values(self._given)
-        for j, point, known in zip(obs.ids.tolist(), points, good, strict=True):
-            values.insert(L(j), point if known else self._values.atPoint3(L(j)))
-        return float(self._solved.graph.error(values))
+        points[~good] = self._minimum.points[~good]
+        return self._cost.value(Estimates(self._given, points))
 
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""
@@ -335,14 +324,14 @@ class BundleAdjustment:
         nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
-            cliques = cliques_at_minimum(
-                self._solved,
+            states = states_at_minimum(
+                self._cost,
                 self._factors,
-                self._values,
+                self._minimum,
                 self._config.learn_imu_noise,
                 self._count_step,
             )
-            return keyframe_covariances(cliques, self._values, weights)
+            return keyframe_covariances(states, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None

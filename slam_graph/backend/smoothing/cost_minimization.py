@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt over a recording, with a factor that serves several steps.
+
+A factor costs several times as much as a gradient and a solution by it. Where the cost is nearly
+quadratic, the factor of an earlier step is nearly that of the current estimates, and steps by it
+still converge, linearly and fast (the chord method: Kelley 1995, ch. 5). A new one is made where a
+step brings more than a part of what the one before did.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from slam_graph.backend.smoothing.recording_cost import Estimates, Factor, RecordingCost
+from slam_graph.errors import EstimationError
+
+_FIRST_DAMPING = 1e-5
+_MAX_DAMPING = 1e5
+"""Steps end when the damping exceeds this."""
+_CONTRACTION = 0.2
+"""A factor is kept while a step lowers the cost by less than this part of what the last one did."""
+_CAUTION = 0.01
+"""Steps by an earlier factor converge linearly: in the end their decrease must be less by this."""
+
+
+def minimized(
+    cost: RecordingCost,
+    estimates: Estimates,
+    tolerance: float,
+    max_steps: int,
+    count_step: Callable[[], None],
+) -> tuple[Estimates, float]:
+    """Go to the minimum of a cost.
+
+    Args:
+        cost: the cost.
+        estimates: where to start.
+        tolerance: steps end when the relative decrease of the cost is less.
+        max_steps: largest number of steps.
+        count_step: is called after each step.
+
+    Returns:
+        The minimum, and the cost there.
+
+    Raises:
+        EstimationError: if the cost is not finite.
+    """
+    value, damping = cost.value(estimates), _FIRST_DAMPING
+    factor: Factor | None = None
+    before = math.inf
+    for _ in range(max_steps):
+        linear = cost.linearized(estimates)
+        while True:
+            fresh = factor is None
+            try:
+                factor = factor or linear.factor(damping)
+                moved = estimates.moved(factor.step(linear))
+                after = cost.value(moved)
+            except (np.linalg.LinAlgError, RuntimeError):
+                after = math.nan
+            if after <= value or damping > _MAX_DAMPING:
+                break
+            factor = None
+            damping *= 10.0 if fresh else 1.0
+        if not after <= value:
+            break
+        decrease, estimates, value = value - after, moved, after
+        count_step()
+        if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
+            break
+        if fresh:
+            damping *= 0.1
+        elif decrease > _CONTRACTION * before:
+            factor = None
+        before = decrease
+    if not math.isfinite(value):
+        raise EstimationError("the cost of the bundle adjustment is not finite")
+    return estimates, value
