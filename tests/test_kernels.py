@@ -27,6 +27,7 @@ from slam_graph.kernels.gate import (
     track_distances,
     track_distances_numpy,
 )
+from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
@@ -269,6 +270,16 @@ def test_eliminate_features() -> None:
         eliminate(by_pose, by_point, frame, views, starts, 0.3, information, roots, T)
         results.append((np.tril(information), roots, T))
     assert all(same(own, other) for own, other in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("count", [0, 40])
+def test_near_pairs(count: int) -> None:
+    rng = np.random.default_rng(8)
+    one, other = rng.uniform(0.0, 100.0, (count, 2)), rng.uniform(0.0, 100.0, (300, 2))
+    found = near_pairs(one, other, 8.0)
+    assert np.array_equal(found, near_pairs_numpy(one, other, 8.0))
+    assert found.shape[1] == 2
+    assert len(found) > count or count == 0
 
 
 def test_a_division_by_zero_is_no_exception() -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
@@ -186,7 +186,7 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned = self._states(), None
+        states, aligned = self._states(self._segment.stamps_ns), None
         known = self._covariances()
         if known is not None:
             densities = self._factors.densities()
@@ -194,14 +194,17 @@ class BundleAdjustment:
             states, aligned = with_covariances(states, known, frames)
         return AdjustedSegment(states, figures, aligned)
 
-    def solve_loosely(self) -> list[NavState]:
-        """The states of all frames near the minimum, with outliers, to a loose tolerance.
+    def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
+        """States near the minimum, with outliers, to a loose tolerance.
+
+        Args:
+            stamps_ns: of the states, ascending; those of the keyframes among them.
 
         Raises:
             EstimationError: if there is no minimum.
         """
         self._minimize_loosely()
-        return self._states()
+        return self._states(stamps_ns)
 
     # --- features --------------------------------------------------------------------------------
 
@@ -251,7 +254,7 @@ class BundleAdjustment:
         own = Geometry(*stacked_poses(self._values, obs.frames), points)
         limit_px = OUTLIER_WIDTH * self._sigma_px
         if self._config.average_frames:
-            states = self._states()
+            states = self._states(self._segment.stamps_ns)
             matrices = np.array([s.world_T_body.matrix() for s in states])
             all_frames = Geometry(matrices[:, :3, :3], matrices[:, :3, 3], points)
             nearest = nearest_keyframe(self._segment.stamps_ns, self._segment.keyframes)
@@ -342,10 +345,10 @@ class BundleAdjustment:
             motions = row_motions(self._keyframe_states(), self._segment.imu, self._task.rig)
             self._projection = self._projection.moving(motions)
 
-    def _states(self) -> list[NavState]:
-        """The states of all frames."""
-        stamps_ns, imu = self._segment.stamps_ns, self._segment.imu
-        return fill_in(self._keyframe_states(), stamps_ns, imu, self._task.preintegration)
+    def _states(self, stamps_ns: IntArray) -> list[NavState]:
+        """The states at some times, those of the keyframes among them."""
+        imu, preintegration = self._segment.imu, self._task.preintegration
+        return fill_in(self._keyframe_states(), stamps_ns, imu, preintegration)
 
     def _keyframe_states(self) -> list[NavState]:
         """The states of the keyframes."""
