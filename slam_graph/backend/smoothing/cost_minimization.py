@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Levenberg-Marquardt over a recording, with a factor that serves several steps.
+"""Levenberg-Marquardt over a recording, with factors that serve several steps.
 
-A factor costs several times as much as a gradient and a solution by it. Where the cost is nearly
-quadratic, the factor of an earlier step is nearly that of the current estimates, and steps by it
-still converge, linearly and fast (the chord method: Kelley 1995, ch. 5). A new one is made where a
-step brings more than a part of what the one before did.
+A factor costs many times as much as a gradient and a solution by it. After a step that hardly
+changes the cost, the factor is nearly that of the new estimates, and steps by it converge, linearly
+and fast (the chord method: Kelley 1995, ch. 5).
 """
 
 from __future__ import annotations
@@ -16,13 +15,16 @@ from collections.abc import Callable
 import numpy as np
 
 from slam_graph.backend.smoothing.recording_cost import Estimates, Factor, RecordingCost
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.errors import EstimationError
 
 _FIRST_DAMPING = 1e-5
 _MAX_DAMPING = 1e5
 """Steps end when the damping exceeds this."""
+_SMALL_STEP = 0.02
+"""A factor is kept after a step that lowers the cost by less than this part of it,"""
 _CONTRACTION = 0.2
-"""A factor is kept while a step lowers the cost by less than this part of what the last one did."""
+"""and by less than this part of what the step before did."""
 _CAUTION = 0.01
 """Steps by an earlier factor converge linearly: in the end their decrease must be less by this."""
 
@@ -33,7 +35,7 @@ def minimized(
     tolerance: float,
     max_steps: int,
     count_step: Callable[[], None],
-) -> tuple[Estimates, float]:
+) -> tuple[Estimates, float, EliminatedStates]:
     """Go to the minimum of a cost.
 
     Args:
@@ -44,13 +46,14 @@ def minimized(
         count_step: is called after each step.
 
     Returns:
-        The minimum, and the cost there.
+        The minimum, the cost there, and the last factor that was made, near it.
 
     Raises:
-        EstimationError: if the cost is not finite.
+        EstimationError: if the cost is not finite, or does not determine its variables.
     """
     value, damping = cost.value(estimates), _FIRST_DAMPING
     factor: Factor | None = None
+    known: EliminatedStates | None = None
     before = math.inf
     for _ in range(max_steps):
         linear = cost.linearized(estimates)
@@ -58,6 +61,7 @@ def minimized(
             fresh = factor is None
             try:
                 factor = factor or linear.factor(damping)
+                known = factor.states
                 moved = estimates.moved(factor.step(linear))
                 after = cost.value(moved)
             except (np.linalg.LinAlgError, RuntimeError):
@@ -72,11 +76,12 @@ def minimized(
         count_step()
         if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
             break
-        if fresh:
-            damping *= 0.1
-        elif decrease > _CONTRACTION * before:
+        damping *= 0.1 if fresh else 1.0
+        if decrease > _SMALL_STEP * value or (not fresh and decrease > _CONTRACTION * before):
             factor = None
         before = decrease
     if not math.isfinite(value):
         raise EstimationError("the cost of the bundle adjustment is not finite")
-    return estimates, value
+    if known is None:
+        raise EstimationError("the bundle adjustment does not determine all of its variables")
+    return estimates, value, known

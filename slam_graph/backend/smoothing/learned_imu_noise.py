@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import gtsam
 
@@ -13,11 +14,10 @@ from slam_graph.backend.smoothing.recording_cost import (
     EliminatedFeatures,
     Estimates,
     Factor,
-    LinearCost,
     RecordingCost,
 )
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
-from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.errors import EstimationError
 
 logger = logging.getLogger(__name__)
@@ -26,12 +26,23 @@ _ROUNDS = 3
 """The noise is estimated this many times at most, each at the minimum under the last estimate."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """Where a cost was minimised.
+
+    Attributes:
+        cost: the cost.
+        estimates: the minimum.
+        states: the last factor that was made on the way there.
+    """
+
+    cost: RecordingCost
+    estimates: Estimates
+    states: EliminatedStates
+
+
 def states_at_minimum(
-    cost: RecordingCost,
-    factors: RecordingFactors,
-    estimates: Estimates,
-    learn: bool,
-    count_step: Callable[[], None],
+    found: Minimum, factors: RecordingFactors, learn: bool, count_step: Callable[[], None]
 ) -> EliminatedStates:
     """The factor of the cost with its gauge fixed, which its covariances follow from.
 
@@ -40,9 +51,8 @@ def states_at_minimum(
     way, so that their Jacobians remain those of the minimum.
 
     Args:
-        cost: that was minimised.
+        found: the minimum.
         factors: of the IMU; their noise becomes what was learned.
-        estimates: the minimum.
         learn: whether to estimate the noise of the IMU.
         count_step: is called after each step.
 
@@ -50,20 +60,19 @@ def states_at_minimum(
         RuntimeError: if GTSAM cannot linearise a factor.
         LinAlgError: if the cost does not determine all variables.
     """
+    cost, estimates = found.cost, found.estimates
     features = EliminatedFeatures(cost.images.linearized(estimates), cost.keyframes)
-    inertial = _with_gauge(cost.inertial, factors, estimates)
-    chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
-    states = EliminatedStates(features.poses, chain)
+    inertial, states = cost.inertial, None
+    known = found.states  # enough to say how much of the residuals the images can contradict
     for _ in range(_ROUNDS if learn else 0):
         assumed = factors.noise
-        if not factors.learn_noise(inertial, estimates.states, states.times_covariance):
+        if not factors.learn_noise(inertial, estimates.states, known.times_covariance):
             break
         try:
-            inertial = _with_gauge(factors.inertial(estimates.states), factors, estimates)
-            under = cost.with_inertial(inertial)
-            chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
-            linear = LinearCost(chain, cost.images.linearized(estimates))
-            known = EliminatedStates(features.poses, chain)
+            changed = factors.inertial(estimates.states)
+            under = cost.with_inertial(_with_gauge(changed, factors, estimates))
+            linear = under.linearized(estimates)
+            known = EliminatedStates(features.poses.copy(), linear.chain)
             moved = estimates.moved(Factor(features, known).step(linear))
             if not under.value(moved) <= under.value(estimates):
                 raise EstimationError("a step under it raises the cost")
@@ -71,8 +80,11 @@ def states_at_minimum(
             logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
-        estimates, states = moved, known
+        inertial, estimates, states = changed, moved, known
         count_step()
+    if states is None:
+        under = cost.with_inertial(_with_gauge(inertial, factors, estimates))
+        states = EliminatedStates(features.poses, under.linearized(estimates).chain)
     return states
 
 

@@ -137,7 +137,8 @@ class EliminatedFeatures:
         damping: is added to the diagonal.
 
     Attributes:
-        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`.
+        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`; until
+            `EliminatedStates` overwrites it.
     """
 
     def __init__(self, linear: LinearReprojection, keyframes: int, damping: float = 0.0) -> None:

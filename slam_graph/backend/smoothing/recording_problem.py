@@ -26,7 +26,7 @@ from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
-from slam_graph.backend.smoothing.learned_imu_noise import states_at_minimum
+from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
     RecordingCost,
@@ -218,8 +218,8 @@ class BundleAdjustment:
         self, obs: Observations, points: FloatArray, good: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """The same with the current estimates of the features that have one."""
-        known = np.isin(obs.ids, self._cost.images.obs.ids)  # both are ascending
-        points[known] = self._minimum.points
+        known = np.isin(obs.ids, self._minimum.cost.images.obs.ids)  # both are ascending
+        points[known] = self._minimum.estimates.points
         return points, good | known
 
     def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
@@ -287,7 +287,7 @@ class BundleAdjustment:
             The minimum, and the part of IMU and priors in it.
         """
         inertial = self._factors.inertial(self._values)
-        self._cost = RecordingCost(
+        cost = RecordingCost(
             inertial,
             ReprojectionCost(
                 obs,
@@ -299,10 +299,11 @@ class BundleAdjustment:
         )
         start = Estimates(self._values, points)
         steps = self._config.max_iterations
-        self._minimum, cost = minimized(self._cost, start, tolerance, steps, self._count_step)
+        end, value, factor = minimized(cost, start, tolerance, steps, self._count_step)
         self._passes += 1
-        self._values = self._minimum.states
-        return cost, inertial.error(self._values)
+        self._values = end.states
+        self._minimum = Minimum(cost, end, factor)
+        return value, inertial.error(self._values)
 
     def _count_step(self) -> None:
         self.iterations += 1
@@ -318,8 +319,8 @@ class BundleAdjustment:
         """
         poses = stacked_poses(self._given, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
-        points[~good] = self._minimum.points[~good]
-        return self._cost.value(Estimates(self._given, points))
+        points[~good] = self._minimum.estimates.points[~good]
+        return self._minimum.cost.value(Estimates(self._given, points))
 
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""
@@ -328,11 +329,7 @@ class BundleAdjustment:
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
             states = states_at_minimum(
-                self._cost,
-                self._factors,
-                self._minimum,
-                self._config.learn_imu_noise,
-                self._count_step,
+                self._minimum, self._factors, self._config.learn_imu_noise, self._count_step
             )
             return keyframe_covariances(states, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:

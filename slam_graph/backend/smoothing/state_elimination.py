@@ -121,7 +121,7 @@ class EliminatedStates:
 
     Args:
         poses: (n, n) lower triangle of the information of poses, with room for `StateColumns`
-            behind them; it is not kept.
+            behind them, zero so far. It is overwritten, as it is large.
         chain: the other factors.
         damping: is added to the diagonal.
 
@@ -132,7 +132,7 @@ class EliminatedStates:
     def __init__(self, poses: FloatArray, chain: ChainEquations, damping: float = 0.0) -> None:
         self._columns = columns = StateColumns.of(len(chain.gradient))
         self._blocks = []
-        S = poses.copy()
+        S = poses
         S.flat[:: len(S) + 1] += damping
         for block in range(len(columns.joints) - 1):
             M = _joined(chain.information[columns.joints[block] : columns.joints[block + 1]])
