@@ -35,7 +35,7 @@ def minimized(
     tolerance: float,
     max_steps: int,
     count_step: Callable[[], None],
-) -> tuple[Estimates, float, EliminatedStates]:
+) -> tuple[Estimates, float, EliminatedStates | None]:
     """Go to the minimum of a cost.
 
     Args:
@@ -46,10 +46,11 @@ def minimized(
         count_step: is called after each step.
 
     Returns:
-        The minimum, the cost there, and the last factor that was made, near it.
+        The minimum, the cost there, and the factor by which the last step was taken; None if
+        another one was tried in vain afterwards.
 
     Raises:
-        EstimationError: if the cost is not finite, or does not determine its variables.
+        EstimationError: if the cost is not finite.
     """
     value, damping = cost.value(estimates), _FIRST_DAMPING
     factor: Factor | None = None
@@ -60,8 +61,9 @@ def minimized(
         while True:
             fresh = factor is None
             try:
-                factor = factor or linear.factor(damping)
-                known = factor.states
+                if factor is None:
+                    known = None  # it is large
+                    factor = linear.factor(damping)
                 moved = estimates.moved(factor.step(linear))
                 after = cost.value(moved)
             except (np.linalg.LinAlgError, RuntimeError):
@@ -70,8 +72,9 @@ def minimized(
                 break
             factor = None
             damping *= 10.0 if fresh else 1.0
-        if not after <= value:
+        if factor is None or not after <= value:
             break
+        known = factor.states
         decrease, estimates, value = value - after, moved, after
         count_step()
         if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
@@ -82,6 +85,4 @@ def minimized(
         before = decrease
     if not math.isfinite(value):
         raise EstimationError("the cost of the bundle adjustment is not finite")
-    if known is None:
-        raise EstimationError("the bundle adjustment does not determine all of its variables")
     return estimates, value, known

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
 from slam_graph.backend.smoothing.recording_cost import (
     EliminatedFeatures,
@@ -17,7 +18,7 @@ from slam_graph.backend.smoothing.recording_cost import (
     RecordingCost,
 )
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
-from slam_graph.backend.smoothing.state_elimination import EliminatedStates
+from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.errors import EstimationError
 
 logger = logging.getLogger(__name__)
@@ -33,16 +34,18 @@ class Minimum:
     Attributes:
         cost: the cost.
         estimates: the minimum.
-        states: the last factor that was made on the way there.
     """
 
     cost: RecordingCost
     estimates: Estimates
-    states: EliminatedStates
 
 
 def states_at_minimum(
-    found: Minimum, factors: RecordingFactors, learn: bool, count_step: Callable[[], None]
+    found: Minimum,
+    near: EliminatedStates | None,
+    factors: RecordingFactors,
+    learn: bool,
+    count_step: Callable[[], None],
 ) -> EliminatedStates:
     """The factor of the cost with its gauge fixed, which its covariances follow from.
 
@@ -52,6 +55,8 @@ def states_at_minimum(
 
     Args:
         found: the minimum.
+        near: the factor of the cost somewhere near, if there is one. It is good enough to say how
+            much of the residuals the images can contradict.
         factors: of the IMU; their noise becomes what was learned.
         learn: whether to estimate the noise of the IMU.
         count_step: is called after each step.
@@ -63,7 +68,7 @@ def states_at_minimum(
     cost, estimates = found.cost, found.estimates
     features = EliminatedFeatures(cost.images.linearized(estimates), cost.keyframes)
     inertial, states = cost.inertial, None
-    known = found.states  # enough to say how much of the residuals the images can contradict
+    known = near or _eliminated(features, cost, factors, estimates)
     for _ in range(_ROUNDS if learn else 0):
         assumed = factors.noise
         if not factors.learn_noise(inertial, estimates.states, known.times_covariance):
@@ -76,16 +81,25 @@ def states_at_minimum(
             moved = estimates.moved(Factor(features, known).step(linear))
             if not under.value(moved) <= under.value(estimates):
                 raise EstimationError("a step under it raises the cost")
-        except (EstimationError, RuntimeError) as error:
+        except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
         inertial, estimates, states = changed, moved, known
         count_step()
-    if states is None:
-        under = cost.with_inertial(_with_gauge(inertial, factors, estimates))
-        states = EliminatedStates(features.poses, under.linearized(estimates).chain)
-    return states
+    return states or _eliminated(features, cost, factors, estimates)
+
+
+def _eliminated(
+    features: EliminatedFeatures,
+    cost: RecordingCost,
+    factors: RecordingFactors,
+    estimates: Estimates,
+) -> EliminatedStates:
+    """The factor of the states with a fixed gauge."""
+    inertial = _with_gauge(cost.inertial, factors, estimates)
+    chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
+    return EliminatedStates(features.poses.copy(), chain)
 
 
 def _with_gauge(

@@ -52,6 +52,7 @@ from slam_graph.backend.smoothing.state_covariances import (
     keyframe_covariances,
     with_covariances,
 )
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.state import stacked_poses
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
@@ -153,6 +154,7 @@ class BundleAdjustment:
         self._sigma_px = backend.noise.pixel_sigma
         self._values = values_of(start.states)
         self._given = values_of(start.given or start.states)
+        self._factor: EliminatedStates | None = None
         self._note_motions()
 
     @property
@@ -299,10 +301,11 @@ class BundleAdjustment:
         )
         start = Estimates(self._values, points)
         steps = self._config.max_iterations
-        end, value, factor = minimized(cost, start, tolerance, steps, self._count_step)
+        self._factor = None  # it is large
+        end, value, self._factor = minimized(cost, start, tolerance, steps, self._count_step)
         self._passes += 1
         self._values = end.states
-        self._minimum = Minimum(cost, end, factor)
+        self._minimum = Minimum(cost, end)
         return value, inertial.error(self._values)
 
     def _count_step(self) -> None:
@@ -329,7 +332,11 @@ class BundleAdjustment:
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
             states = states_at_minimum(
-                self._minimum, self._factors, self._config.learn_imu_noise, self._count_step
+                self._minimum,
+                self._factor,
+                self._factors,
+                self._config.learn_imu_noise,
+                self._count_step,
             )
             return keyframe_covariances(states, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
