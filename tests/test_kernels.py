@@ -16,6 +16,10 @@ from slam_graph.kernels.epipolar import (
     sampson_distances,
     sampson_distances_numpy,
 )
+from slam_graph.kernels.feature_elimination import (
+    eliminate_features,
+    eliminate_features_numpy,
+)
 from slam_graph.kernels.feature_sums import sum_of_features, sum_of_features_numpy
 from slam_graph.kernels.gate import (
     observation_distances,
@@ -23,6 +27,7 @@ from slam_graph.kernels.gate import (
     track_distances,
     track_distances_numpy,
 )
+from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
@@ -248,6 +253,33 @@ def test_undistort_radtan() -> None:
     q = model.distort(m, coefficients)[0]
     assert same(model.undistort(q, coefficients), m)
     assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+def test_eliminate_features() -> None:
+    """Features in one or two cameras, some with gaps in their tracks."""
+    rng, frames, features = np.random.default_rng(7), 12, 30
+    seen = [np.flatnonzero(rng.random(frames) < rng.uniform(0.4, 1.0)) for _ in range(features)]
+    frame, starts = np.concatenate(seen), np.append(0, np.cumsum([len(own) for own in seen]))
+    views = np.append(0, np.cumsum(rng.integers(1, 3, len(frame))))
+    by_pose, by_point = rng.normal(size=(views[-1], 2, 6)), rng.normal(size=(views[-1], 2, 3))
+    given = np.tril(rng.normal(size=(6 * frames + 9,) * 2))
+    results = []
+    for eliminate in (eliminate_features, eliminate_features_numpy):
+        information, T = given.copy(), np.empty((len(frame), 3, 6))
+        roots = np.empty((features, 3, 3))
+        eliminate(by_pose, by_point, frame, views, starts, 0.3, information, roots, T)
+        results.append((np.tril(information), roots, T))
+    assert all(same(own, other) for own, other in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("count", [0, 40])
+def test_near_pairs(count: int) -> None:
+    rng = np.random.default_rng(8)
+    one, other = rng.uniform(0.0, 100.0, (count, 2)), rng.uniform(0.0, 100.0, (300, 2))
+    found = near_pairs(one, other, 8.0)
+    assert np.array_equal(found, near_pairs_numpy(one, other, 8.0))
+    assert found.shape[1] == 2
+    assert len(found) > count or count == 0
 
 
 def test_a_division_by_zero_is_no_exception() -> None:

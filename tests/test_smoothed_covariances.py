@@ -2,26 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariances of the smoothed trajectory: those the dense inverse, and honest."""
 
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import B, V, X
 
 from benchmarks.policy_product import FLIGHT
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing.bayes_tree import (
-    Clique,
-    cliques_of,
-    joint_root_covariances,
-    solved,
-)
+from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.recording_cost import (
+    EliminatedFeatures,
+    LinearCost,
+    LinearReprojection,
+)
 from slam_graph.backend.smoothing.recording_problem import (
     BundleAdjustment,
     SegmentStart,
@@ -37,7 +38,11 @@ from slam_graph.backend.smoothing.state_covariances import (
     gauge_motion,
     keyframe_covariances,
 )
-from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.smoothing.state_elimination import (
+    ChainEquations,
+    EliminatedStates,
+    StateColumns,
+)
 from slam_graph.backend.solve.state import dim, stacked_poses
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import mean_bounds
@@ -52,118 +57,140 @@ from slam_graph.simulation.simulation_config import (
 )
 from slam_graph.simulation.simulator import simulate
 
-KEYFRAMES, FEATURES = 6, 8
+KEYFRAMES, FEATURES = 45, 60
 FLIGHTS = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 5)
 DURATION_S = 5.0
 FALSE_ALARMS = 1e-3
 """Probability that a mean leaves its band although all covariances are right."""
 
 
+@dataclass(frozen=True)
+class Problem:
+    """A random linear problem with the structure of a bundle adjustment, and its dense inverse."""
+
+    values: gtsam.Values
+    chain: ChainEquations
+    images: LinearReprojection
+    gradient: FloatArray
+    P: FloatArray
+
+    @property
+    def states(self) -> EliminatedStates:
+        features = EliminatedFeatures(self.images, KEYFRAMES)
+        return EliminatedStates(features.poses, self.chain)
+
+    def joint(self, *keyframes: int) -> FloatArray:
+        """The covariance of some states."""
+        rows = np.concatenate([np.arange(15 * k, 15 * k + 15) for k in keyframes])
+        return self.P[np.ix_(rows, rows)]
+
+
 def random_values(rng: np.random.Generator) -> gtsam.Values:
-    """Keyframe states and features anywhere."""
+    """Keyframe poses anywhere."""
     values = gtsam.Values()
     for k in range(KEYFRAMES):
         turn = gtsam.Rot3.Expmap(rng.normal(size=3))
         values.insert(X(k), gtsam.Pose3(turn, rng.normal(0.0, 3.0, 3)))
-        values.insert(V(k), rng.normal(size=3))
-        values.insert(B(k), gtsam.imuBias.ConstantBias(rng.normal(size=3), rng.normal(size=3)))
-    for j in range(FEATURES):
-        values.insert(L(j), rng.normal(size=3))
     return values
 
 
-def random_graph(rng: np.random.Generator, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-    """Linear factors between the pairs of variables that a bundle adjustment connects."""
-    states = [(X(k), V(k), B(k)) for k in range(KEYFRAMES)]
-    pairs = {pair for a, b in pairwise(states) for pair in combinations(a + b, 2)}
-    for j in range(FEATURES):
-        pairs |= {(X(k), L(j)) for k in range(j % 3, min(j % 3 + 3 + j % 2, KEYFRAMES))}
-    graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(2)
+def random_chain(rng: np.random.Generator) -> gtsam.GaussianFactorGraph:
+    """Factors between the variables of neighbouring states, and a prior on the first pose."""
+    keys = [(X(k), V(k), B(k)) for k in range(KEYFRAMES)]
+    pairs = {pair for a, b in pairwise(keys) for pair in combinations(a + b, 2)}
+    graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(2)
     for a, b in sorted(pairs):
         A, C = rng.normal(size=(2, dim(a))), rng.normal(size=(2, dim(b)))
-        factor = gtsam.JacobianFactor(a, A, b, C, np.zeros(2), unit)
-        graph.push_back(gtsam.LinearContainerFactor(factor, values))
-    graph.push_back(
-        gtsam.PriorFactorPose3(X(0), values.atPose3(X(0)), gtsam.noiseModel.Unit.Create(6))
-    )
+        graph.push_back(gtsam.JacobianFactor(a, A, b, C, rng.normal(size=2), unit))
+    one = gtsam.noiseModel.Unit.Create(6)
+    graph.push_back(gtsam.JacobianFactor(X(0), np.eye(6), np.zeros(6), one))
     return graph
 
 
-class Dense:
-    """The dense inverse of the information of a graph."""
-
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        keys = list(values.keys())
-        ordering = gtsam.Ordering()
-        for key in keys:
-            ordering.push_back(key)
-        information, _ = graph.linearize(values).hessian(ordering)
-        self.P = np.linalg.inv(information)
-        ends = np.cumsum([dim(key) for key in keys]).tolist()
-        self.rows = {k: np.arange(a, b) for k, a, b in zip(keys, [0, *ends], ends, strict=False)}
-
-    def joint(self, keys: list[int]) -> FloatArray:
-        rows = np.concatenate([self.rows[key] for key in keys])
-        return np.asarray(self.P[np.ix_(rows, rows)])
+def random_images(rng: np.random.Generator) -> LinearReprojection:
+    """Linear errors of features in two cameras; some have gaps in their tracks."""
+    starts = rng.integers(0, KEYFRAMES - 8, FEATURES)
+    seen = [j + np.delete(np.arange(8), range(3, 3 + n % 3)) for n, j in enumerate(starts)]
+    feature = np.repeat(np.arange(FEATURES), [2 * len(frames) for frames in seen])
+    frame = np.repeat(np.concatenate(seen), 2)
+    count = len(frame)
+    camera, places = np.arange(count) % 2, np.zeros((count, 2))
+    frames = tuple(range(KEYFRAMES))
+    obs = Observations(np.arange(FEATURES), frames, feature, frame, camera, places, places)
+    r, by_pose = rng.normal(size=(count, 2)), rng.normal(size=(count, 2, 6))
+    return LinearReprojection(obs, r, by_pose, rng.normal(size=(count, 2, 3)))
 
 
 @pytest.fixture
-def problem() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Dense]:
+def problem() -> Problem:
     rng = np.random.default_rng(3)
-    values = random_values(rng)
-    graph = random_graph(rng, values)
-    return graph, values, Dense(graph, values)
+    graph, images = random_chain(rng), random_images(rng)
+    ordering = gtsam.Ordering()
+    for k in range(KEYFRAMES):
+        for key in (X(k), V(k), B(k)):
+            ordering.push_back(key)
+    A, b = graph.jacobian(ordering)
+    H = np.zeros((2 * len(images.obs), A.shape[1] + 3 * FEATURES))
+    for n, (k, j) in enumerate(zip(images.obs.frame, images.obs.feature, strict=True)):
+        H[2 * n : 2 * n + 2, 15 * k : 15 * k + 6] = images.by_pose[n]
+        first = A.shape[1] + 3 * j
+        H[2 * n : 2 * n + 2, first : first + 3] = images.by_point[n]
+    whole = np.concatenate([np.pad(A, ((0, 0), (0, 3 * FEATURES))), H])
+    right = np.concatenate([b, images.r.ravel()])
+    P = np.linalg.inv(whole.T @ whole)
+    chain = ChainEquations.of(graph, KEYFRAMES)
+    return Problem(random_values(rng), chain, images, whole.T @ right, P)
 
 
-Problem = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Dense]
+def test_a_step_is_that_of_the_dense_equations(problem: Problem) -> None:
+    step = (
+        LinearCost(problem.chain, problem.images)
+        .factor(0.0)
+        .step(LinearCost(problem.chain, problem.images))
+    )
+    found = np.concatenate([step.states.ravel(), step.points.ravel()])
+    np.testing.assert_allclose(found, problem.P @ problem.gradient, rtol=1e-6, atol=1e-8)
 
 
-def test_covariances_of_cliques_are_those_of_the_dense_inverse(problem: Problem) -> None:
-    graph, values, dense = problem
-    ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-    wanted = {key for key in values.keys() if dim(key) != 3 or key >= V(0)}  # noqa: SIM118
-    cliques = cliques_of(graph.linearize(values).eliminateMultifrontal(ordering), wanted)
-    covered = set()
-    for clique, U in joint_root_covariances(cliques):
-        assert not np.tril(U, -1).any()
-        expected = dense.joint(list(clique.layout.dims))
-        np.testing.assert_allclose(U @ U.T, expected, rtol=1e-6, atol=1e-9)
-        covered |= set(clique.frontals)
-    assert covered >= wanted
-    right = {X(k): np.random.default_rng(k).normal(size=(6, 2)) for k in range(KEYFRAMES)}
-    found = solved(cliques, right)
-    keys = list(right)
-    expected = dense.joint(keys) @ np.concatenate(list(right.values()))
-    np.testing.assert_allclose(np.concatenate([found[k] for k in keys]), expected, rtol=1e-6)
+def test_products_with_the_covariance_are_those_of_the_dense_inverse(problem: Problem) -> None:
+    right = np.random.default_rng(0).normal(size=(KEYFRAMES, 15, 2))
+    expected = problem.joint(*range(KEYFRAMES)) @ right.reshape(-1, 2)
+    found = problem.states.times_covariance(right)
+    np.testing.assert_allclose(found.reshape(-1, 2), expected, rtol=1e-6, atol=1e-8)
 
 
 def test_a_difference_that_is_known_far_better_than_its_parts_is_not_lost() -> None:
-    """A parent knows x - y to 1e-7 and x + y to 1; its child is 1e7 (x - y) with an error of 1."""
-    rows = np.array([[1e7, -1e7, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    lever = np.zeros((3, 3))
-    lever[0, :2] = -1e7, 1e7
-    above, both = Layout({V(0): 3}), Layout({V(1): 3, V(0): 3})
-    parent = Clique(above, [V(0)], np.linalg.qr(rows)[1], np.zeros((3, 0)), -1, np.r_[:0])
-    child = Clique(both, [V(1)], np.eye(3), lever, 0, np.arange(3))
-    _, (_, U) = joint_root_covariances([parent, child])
-    np.testing.assert_allclose((U @ U.T)[:3, :3], np.diag([2.0, 1.0, 1.0]), atol=1e-6)
+    """Neighbouring states are equal to 1e-5, one of them is known to 1."""
+    keyframes, close = 3, 1e10 * np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(15))
+    information = np.tile(close, (keyframes - 1, 1, 1))
+    information[0, :15, :15] += np.eye(15)
+    chain = ChainEquations(information, np.zeros((keyframes, 15)))
+    none = np.zeros((StateColumns.of(keyframes).size,) * 2)
+    apart = np.concatenate([np.eye(15), -np.eye(15)], axis=1)
+    for P in EliminatedStates(none, chain).pair_covariances():
+        np.testing.assert_allclose(apart @ P @ apart.T, 1e-10 * np.eye(15), atol=1e-14)
+        np.testing.assert_allclose(P[:15, :15], np.eye(15), atol=1e-4)
+
+
+def test_what_is_not_determined_is_refused() -> None:
+    chain = ChainEquations(np.zeros((2, 30, 30)), np.zeros((3, 15)))
+    with pytest.raises(np.linalg.LinAlgError):
+        EliminatedStates(np.zeros((StateColumns.of(3).size,) * 2), chain)
 
 
 def test_covariances_at_keyframes_and_after_alignment_are_those_of_the_dense_inverse(
     problem: Problem,
 ) -> None:
-    graph, values, dense = problem
-    ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
     weights = np.full(KEYFRAMES, 1.0 / KEYFRAMES)
-    tree = graph.linearize(values).eliminateMultifrontal(ordering)
-    wanted = {key(k) for key in (X, V, B) for k in range(KEYFRAMES)}
-    known = keyframe_covariances(cliques_of(tree, wanted), values, weights)
+    known = keyframe_covariances(problem.states, problem.values, weights)
+    for k, pair in enumerate(known.pairs):
+        np.testing.assert_allclose(pair, problem.joint(k, k + 1), rtol=1e-6, atol=1e-9)
     stamps = np.arange(KEYFRAMES) * 10**8
     frames = FrameInterpolation.of(stamps, np.arange(KEYFRAMES), np.zeros((KEYFRAMES - 1, 2)))
-    rotations, positions = stacked_poses(values, range(KEYFRAMES))
+    rotations, positions = stacked_poses(problem.values, range(KEYFRAMES))
     states = frame_covariances(known, frames, rotations)
     for k in range(KEYFRAMES):
-        np.testing.assert_allclose(states[k], dense.joint([X(k), V(k), B(k)]), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(states[k], problem.joint(k), rtol=1e-6, atol=1e-9)
     turn = np.zeros((6 * KEYFRAMES, 6 * KEYFRAMES))  # from the body frame into the world
     for k, R in enumerate(rotations):
         turn[6 * k : 6 * k + 3, 6 * k : 6 * k + 3] = R
@@ -171,7 +198,8 @@ def test_covariances_at_keyframes_and_after_alignment_are_those_of_the_dense_inv
     N = gauge_motion(positions - positions.mean(axis=0)).reshape(-1, 4)
     W = np.where(np.arange(6 * KEYFRAMES)[:, None] % 6 < 3, 0.0, N)
     aligned = np.eye(6 * KEYFRAMES) - N @ np.linalg.solve(W.T @ W, W.T)
-    P = turn.T @ aligned @ turn @ dense.joint([X(k) for k in range(KEYFRAMES)])
+    poses = (15 * np.arange(KEYFRAMES)[:, None] + np.arange(6)).ravel()
+    P = turn.T @ aligned @ turn @ problem.P[np.ix_(poses, poses)]
     P = P @ turn.T @ aligned.T @ turn
     found = aligned_covariances(known, frames, rotations, positions)
     assert found is not None

@@ -82,7 +82,7 @@ class ImuData:
         # GTSAM turns the specific force by the attitude at the start of a step; this is half a
         # step on
         half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
-        accel = accel + np.cross(half_turn, accel - bias.accelerometer())
+        accel = accel + _cross(half_turn, accel - bias.accelerometer())
         for a, w, dt in zip(accel, gyro, durations_s.tolist(), strict=True):
             pim.integrateMeasurement(a, w, dt)
         return pim
@@ -92,6 +92,12 @@ class ImuData:
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])
         return np.diff(self.stamps_ns) * 1e-9, gyro, accel
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (N, 3); NumPy's own takes twice as long for so few rows."""
+    (a0, a1, a2), (b0, b1, b2) = a.T, b.T
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,8 +18,7 @@ of w = Σ W_iᵀ z_i is Σ tr W_i P W_iᵀ. The redundancy has a standard deviat
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,8 +27,6 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.adaptive_imu_noise import MAX_FACTOR
-from slam_graph.backend.solve.square_root import Layout
-from slam_graph.backend.solve.state import dims_of
 from slam_graph.sensors import ImuNoise
 
 _ROWS = (slice(0, 3), slice(6, 9), slice(9, 12), slice(12, 15))
@@ -41,9 +38,8 @@ _PROBES = 16
 _PRIOR_REDUNDANCY = 10.0
 """Redundancy that the assumed noise counts for: what the images cannot tell stays as it is."""
 
-TimesCovariance = Callable[[Mapping[int, FloatArray]], Mapping[int, FloatArray]]
-"""The product of a covariance with the (n, m) parts of a matrix by variable; where there is no
-part it is zero."""
+TimesCovariance = Callable[[FloatArray], FloatArray]
+"""The product (K, 15, m) of the covariance of K states with a matrix (K, 15, m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,62 +96,57 @@ class ImuNoiseFactors:
 
 
 def variance_ratios(
-    factors: list[gtsam.CombinedImuFactor], values: gtsam.Values, times_covariance: TimesCovariance
+    factors: list[gtsam.CombinedImuFactor],
+    values: gtsam.Values,
+    keyframes: int,
+    times_covariance: TimesCovariance,
 ) -> FloatArray:
     """By how much variances of the IMU are larger than assumed.
 
     Args:
-        factors: between neighbouring keyframes, at whose residuals to look.
+        factors: M of them between neighbouring keyframes, at whose residuals to look.
         values: the minimum.
-        times_covariance: the product of the covariance of all states with what it is given.
+        keyframes: number K of keyframes.
+        times_covariance: the product of the covariance of their states with what it is given.
 
     Returns:
         (4,) of white noise of gyroscope and accelerometer, random walk of accelerometer and
         gyroscope.
     """
+    if not factors:
+        return np.ones(len(_ROWS))
     rng = np.random.default_rng(0)
-    squares, probes = np.zeros(len(_ROWS)), len(_ROWS) * _PROBES
-    right: dict[int, FloatArray] = defaultdict(lambda: np.zeros((1, probes)))
-    for factor in factors:
-        r, A, Q = _residual(factor, values)
-        w = np.empty((A.shape[1], probes))
-        for kind, rows in enumerate(_ROWS):
-            white = np.linalg.inv(np.linalg.cholesky(Q[rows, rows]))
-            squares[kind] += float(np.sum((white @ r[rows]) ** 2))
-            signs = rng.choice([-1.0, 1.0], (3, _PROBES))
-            w[:, kind * _PROBES : (kind + 1) * _PROBES] = (white @ A[rows]).T @ signs
-        own = Layout(dims_of(_in_order(factor)))
-        for key, columns in own.columns.items():
-            right[key] = right[key] + w[columns]
-    found = times_covariance(right) if right else {}
-    products = sum((np.sum(w * found[key], axis=0) for key, w in right.items()), np.zeros(probes))
-    predicted = products.reshape(len(_ROWS), _PROBES).mean(axis=1)
+    squares, kinds = np.zeros(len(_ROWS)), len(_ROWS)
+    signs = rng.choice([-1.0, 1.0], (len(factors), kinds, 3, _PROBES))
+    r, A, Q = _residuals(factors, values)
+    w = np.empty((len(factors), A.shape[2], kinds, _PROBES))
+    for kind, rows in enumerate(_ROWS):
+        white = np.linalg.inv(np.linalg.cholesky(Q[:, rows, rows]))
+        squares[kind] = np.sum((white @ r[:, rows, None]) ** 2)
+        w[:, :, kind] = (white @ A[:, rows]).transpose(0, 2, 1) @ signs[:, kind]
+    w = w.reshape(len(factors), 2, -1, kinds * _PROBES)  # of the first state, and of the second
+    first = np.array([gtsam.symbolIndex(factor.keys()[0]) for factor in factors])
+    right = np.zeros((keyframes, *w.shape[2:]))
+    np.add.at(right, first, w[:, 0])
+    np.add.at(right, first + 1, w[:, 1])
+    products = np.sum(right * times_covariance(right), axis=(0, 1))
+    predicted = products.reshape(kinds, _PROBES).mean(axis=1)
     redundancy = np.maximum(3.0 * len(factors) - predicted, 0.0) + _PRIOR_REDUNDANCY
     return np.asarray((squares + _PRIOR_REDUNDANCY) / redundancy)
 
 
-def _in_order(factor: gtsam.CombinedImuFactor) -> list[int]:
-    """Keys of pose, velocity and bias of the first state of a factor, then of the second."""
-    x, v, y, w, a, b = factor.keys()
-    return [x, v, a, y, w, b]
-
-
-def _residual(
-    factor: gtsam.CombinedImuFactor, values: gtsam.Values
+def _residuals(
+    factors: list[gtsam.CombinedImuFactor], values: gtsam.Values
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residual (15,), Jacobian (15, 30) by pose, velocity, bias of both states, and covariance."""
-    linear = gtsam.JacobianFactor(factor.linearize(values))
-    order = gtsam.Ordering()
-    for key in _in_order(factor):
-        order.push_back(key)
-    whitened, d = gtsam.JacobianFactor(_alone(linear), order).jacobian()
-    model: Any = factor.noiseModel()
-    unwhiten = np.linalg.inv(model.R())
-    return -unwhiten @ d, unwhiten @ whitened, unwhiten @ unwhiten.T
+    """Residuals (M, 15), Jacobians (M, 15, 30) by pose, velocity, bias of both states, covariances.
 
-
-def _alone(factor: gtsam.JacobianFactor) -> gtsam.GaussianFactorGraph:
-    """A graph of one factor."""
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(factor)
-    return graph
+    GTSAM's factor has pose and velocity of the first state, of the second, bias of the first and of
+    the second.
+    """
+    by_state = np.r_[0:9, 18:24, 9:18, 24:30]
+    linear = [gtsam.JacobianFactor(factor.linearize(values)).jacobian() for factor in factors]
+    models: list[Any] = [factor.noiseModel() for factor in factors]
+    unwhiten = np.linalg.inv(np.array([model.R() for model in models]))
+    A = unwhiten @ np.array([whitened for whitened, _ in linear])[:, :, by_state]
+    d = np.array([d for _, d in linear])
+    return -(unwhiten @ d[:, :, None])[:, :, 0], A, unwhiten @ unwhiten.transpose(0, 2, 1)

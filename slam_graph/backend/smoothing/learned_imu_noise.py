@@ -7,12 +7,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import gtsam
+import numpy as np
 
-from slam_graph.backend.smoothing.bayes_tree import Clique, cliques_of, solved
+from slam_graph.backend.smoothing.recording_cost import (
+    EliminatedFeatures,
+    Estimates,
+    Factor,
+    RecordingCost,
+)
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
+from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.errors import EstimationError
 
 logger = logging.getLogger(__name__)
@@ -22,76 +28,84 @@ _ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SolvedCost:
-    """A cost that was minimised.
+class Minimum:
+    """Where a cost was minimised.
 
     Attributes:
-        graph: all of it.
-        inertial: priors, IMU and zero-velocity factors.
-        projections: the other factors.
-        ordering: of the elimination.
+        cost: the cost.
+        estimates: the minimum.
     """
 
-    graph: gtsam.NonlinearFactorGraph
-    inertial: gtsam.NonlinearFactorGraph
-    projections: gtsam.NonlinearFactorGraph
-    ordering: gtsam.Ordering
+    cost: RecordingCost
+    estimates: Estimates
 
 
-def cliques_at_minimum(
-    cost: SolvedCost,
+def states_at_minimum(
+    found: Minimum,
+    near: EliminatedStates | None,
     factors: RecordingFactors,
-    values: gtsam.Values,
     learn: bool,
     count_step: Callable[[], None],
-) -> list[Clique]:
-    """The linearised cost with its gauge fixed, which its covariances follow from.
+) -> EliminatedStates:
+    """The factor of the cost with its gauge fixed, which its covariances follow from.
 
-    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. It takes
-    the same elimination as the covariances. The states that are reported stay those of the given
-    minimum; what follows is linearised where these steps lead.
+    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. The states
+    that are reported stay those of the given minimum. What images say of them hardly changes on the
+    way, so that their Jacobians remain those of the minimum.
 
     Args:
-        cost: that was minimised.
+        found: the minimum.
+        near: the factor of the cost somewhere near, if there is one. It is good enough to say how
+            much of the residuals the images can contradict.
         factors: of the IMU; their noise becomes what was learned.
-        values: the minimum.
         learn: whether to estimate the noise of the IMU.
         count_step: is called after each step.
 
     Raises:
-        RuntimeError: if the cost does not determine all variables.
+        RuntimeError: if GTSAM cannot linearise a factor.
+        LinAlgError: if the cost does not determine all variables.
     """
-    inertial = cost.inertial
-    wanted = {k for k in values.keys() if chr(gtsam.symbolChr(k)) in "xvb"}  # noqa: SIM118
-    graph, tree = _eliminated(cost, inertial, factors, values)
-    cliques = cliques_of(tree, wanted)
+    cost, estimates = found.cost, found.estimates
+    features = EliminatedFeatures(cost.images.linearized(estimates), cost.keyframes)
+    inertial, states = cost.inertial, None
+    known = near or _eliminated(features, cost, factors, estimates)
     for _ in range(_ROUNDS if learn else 0):
         assumed = factors.noise
-        if not factors.learn_noise(inertial, values, partial(solved, cliques)):
+        if not factors.learn_noise(inertial, estimates.states, known.times_covariance):
             break
         try:
-            inertial = factors.inertial(values)
-            graph, tree = _eliminated(cost, inertial, factors, values)
-            moved = values.retract(tree.optimize())
-            if not graph.error(moved) <= graph.error(values):
+            changed = factors.inertial(estimates.states)
+            under = cost.with_inertial(_with_gauge(changed, factors, estimates))
+            linear = under.linearized(estimates)
+            known = EliminatedStates(features.poses.copy(), linear.chain)
+            moved = estimates.moved(Factor(features, known).step(linear))
+            if not under.value(moved) <= under.value(estimates):
                 raise EstimationError("a step under it raises the cost")
-        except (EstimationError, RuntimeError) as error:
+        except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
-        values, cliques = moved, cliques_of(tree, wanted)
+        inertial, estimates, states = changed, moved, known
         count_step()
-    return cliques
+    return states or _eliminated(features, cost, factors, estimates)
 
 
 def _eliminated(
-    cost: SolvedCost,
-    inertial: gtsam.NonlinearFactorGraph,
+    features: EliminatedFeatures,
+    cost: RecordingCost,
     factors: RecordingFactors,
-    values: gtsam.Values,
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.GaussianBayesTree]:
-    """The cost with other inertial factors and a fixed gauge; its linearisation's Bayes tree."""
+    estimates: Estimates,
+) -> EliminatedStates:
+    """The factor of the states with a fixed gauge."""
+    inertial = _with_gauge(cost.inertial, factors, estimates)
+    chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
+    return EliminatedStates(features.poses.copy(), chain)
+
+
+def _with_gauge(
+    inertial: gtsam.NonlinearFactorGraph, factors: RecordingFactors, estimates: Estimates
+) -> gtsam.NonlinearFactorGraph:
+    """Priors, IMU and zero-velocity factors with a fixed gauge."""
     graph = gtsam.NonlinearFactorGraph(inertial)
-    graph.push_back(cost.projections)
-    graph.push_back(factors.gauge(values))
-    return graph, graph.linearize(values).eliminateMultifrontal(cost.ordering)
+    graph.push_back(factors.gauge(estimates.states))
+    return graph

@@ -22,12 +22,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.kernels.near_pairs import near_pairs
 
 _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
 """Standard deviation of the drift between visits, a weak prior: shift (m) and yaw (rad)."""
@@ -214,13 +214,8 @@ def _around(
     inside = np.sum(normalized**2, axis=1) < np.max(np.sum(seen.normalized[rows] ** 2, axis=1))
     others, pixels = others[inside], projection.cameras[camera].distort(normalized[inside])[0]
     rows = rows[scene.usable[seen.feature[rows]]]
-    # balancing the trees does not pay off for a single search
-    seen_at, projected_to = (
-        cKDTree(places, compact_nodes=False, balanced_tree=False)
-        for places in (seen.pixels[rows], pixels)
-    )
-    near = seen_at.sparse_distance_matrix(projected_to, around_px, output_type="ndarray")
-    rows, hit = rows[near["i"]], near["j"]
+    near, hit = near_pairs(seen.pixels[rows], pixels, around_px).T
+    rows = rows[near]
     return seen.feature[rows], others[hit], pixels[hit] - seen.pixels[rows]
 
 

@@ -16,7 +16,6 @@ Keyframe k has the pose X(k), the velocity V(k) and the bias B(k), feature j the
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -30,9 +29,7 @@ from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
-from slam_graph.backend.gtsam_smoothers.smoother_features import ProjectionFactors, pixel_noise
 from slam_graph.backend.smoothing.imu_noise_estimation import (
     ImuNoiseFactors,
     TimesCovariance,
@@ -155,29 +152,14 @@ class RecordingFactors:
         self._segment, self._anchor, self._rig = segment, anchor, rig
         self._backend, self._config = backend, config
         self.noise = ImuNoiseFactors()
+        between = list(pairwise(segment.keyframe_stamps_ns.tolist()))
+        self._samples = [segment.imu.between(*interval) for interval in between]
+        longest_s = backend.noise.max_imu_gap_s
+        self._gaps = [segment.imu.largest_gap_s(*interval) > longest_s for interval in between]
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
         return _graph(self._prior(values) + self._dynamics(values))
-
-    def projections(
-        self, obs: Observations, variances: FloatArray, sigma_px: float, rolling: RigProjection
-    ) -> gtsam.NonlinearFactorGraph:
-        """One projection factor for each observation.
-
-        Args:
-            obs: of the keyframes; frame indices are those of keyframes.
-            variances: (N,) relative to that of a single observation.
-            sigma_px: standard deviation of a single observation.
-            rolling: with the motions of the keyframes, for rolling shutters.
-        """
-        loss = RobustLoss(self._config.robust_loss, self._config.robust_width)
-        factors: list[gtsam.NonlinearFactor] = []
-        for variance in np.unique(variances).tolist():  # one noise model for each group size
-            noise = pixel_noise(sigma_px * math.sqrt(variance), loss)
-            group = obs.rows(variances == variance)
-            factors += ProjectionFactors(self._rig, noise).of(group, rolling)
-        return _graph(factors)
 
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
         """A prior that fixes position and yaw of the anchor.
@@ -231,8 +213,10 @@ class RecordingFactors:
         """
         found = [inertial.at(i) for i in range(inertial.size())]
         factors = [factor for factor in found if isinstance(factor, gtsam.CombinedImuFactor)]
-        moving = [k for k in range(len(factors)) if not self._in_gap(k) and not self._still(k)]
-        ratios = variance_ratios([factors[k] for k in moving], values, times_covariance)
+        moving = [k for k in range(len(factors)) if not self._gaps[k] and not self._still(k)]
+        keyframes = len(self._segment.keyframes)
+        chosen = [factors[k] for k in moving]
+        ratios = variance_ratios(chosen, values, keyframes, times_covariance)
         noise = self.noise.times(ratios)
         learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
         if noise.near(self.noise, learned):
@@ -245,14 +229,9 @@ class RecordingFactors:
         i, j = self._segment.keyframes[k : k + 2]
         return bool(self._segment.still[i : j + 1].any())
 
-    def _in_gap(self, k: int) -> bool:
-        """Whether IMU samples are missing after keyframe k."""
-        start_ns, end_ns = self._segment.keyframe_stamps_ns[k : k + 2].tolist()
-        return self._segment.imu.largest_gap_s(start_ns, end_ns) > self._backend.noise.max_imu_gap_s
-
     def _noise_factors(self, k: int) -> tuple[float, float, float]:
         """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
-        scale = self._backend.noise.imu_scale * (IMU_GAP_SCALE if self._in_gap(k) else 1.0)
+        scale = self._backend.noise.imu_scale * (IMU_GAP_SCALE if self._gaps[k] else 1.0)
         i, j = self._segment.keyframes[k : k + 2]
         # variances of non-stationary noise add up
         learned = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
@@ -261,12 +240,10 @@ class RecordingFactors:
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
         factors: list[gtsam.NonlinearFactor] = []
-        imu, noise = self._segment.imu, self._backend.noise
+        noise = self._backend.noise
         calibrated, before = self.noise.walks(self._rig.imu), None
-        stamps_ns = self._segment.keyframe_stamps_ns.tolist()
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
-            start_ns, end_ns = stamps_ns[k], stamps_ns[k + 1]
-            samples = imu.between(start_ns, end_ns)
+            samples = self._samples[k]
             imu_noise = calibrated
             if noise.adaptive.enabled:
                 imu_noise = MotionChange.between(before, samples).added_to(calibrated)

@@ -16,16 +16,22 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
+from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
-from slam_graph.backend.smoothing.learned_imu_noise import SolvedCost, cliques_at_minimum
+from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
+from slam_graph.backend.smoothing.recording_cost import (
+    Estimates,
+    RecordingCost,
+    ReprojectionCost,
+)
 from slam_graph.backend.smoothing.recording_factors import (
     RecordingFactors,
     averaged,
@@ -46,8 +52,8 @@ from slam_graph.backend.smoothing.state_covariances import (
     keyframe_covariances,
     with_covariances,
 )
-from slam_graph.backend.solve.state import stacked_points, stacked_poses
-from slam_graph.errors import EstimationError
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
+from slam_graph.backend.solve.state import stacked_poses
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
 
@@ -61,8 +67,6 @@ _MIN_KEYFRAMES = 3
 _RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
 _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
-_MAX_LAMBDA = 1e5
-"""Steps end when the damping of Levenberg-Marquardt exceeds this."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -150,6 +154,7 @@ class BundleAdjustment:
         self._sigma_px = backend.noise.pixel_sigma
         self._values = values_of(start.states)
         self._given = values_of(start.given or start.states)
+        self._factor: EliminatedStates | None = None
         self._note_motions()
 
     @property
@@ -183,7 +188,7 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned = self._states(), None
+        states, aligned = self._states(self._segment.stamps_ns), None
         known = self._covariances()
         if known is not None:
             densities = self._factors.densities()
@@ -191,14 +196,17 @@ class BundleAdjustment:
             states, aligned = with_covariances(states, known, frames)
         return AdjustedSegment(states, figures, aligned)
 
-    def solve_loosely(self) -> list[NavState]:
-        """The states of all frames near the minimum, with outliers, to a loose tolerance.
+    def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
+        """States near the minimum, with outliers, to a loose tolerance.
+
+        Args:
+            stamps_ns: of the states, ascending; those of the keyframes among them.
 
         Raises:
             EstimationError: if there is no minimum.
         """
         self._minimize_loosely()
-        return self._states()
+        return self._states(stamps_ns)
 
     # --- features --------------------------------------------------------------------------------
 
@@ -212,8 +220,8 @@ class BundleAdjustment:
         self, obs: Observations, points: FloatArray, good: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """The same with the current estimates of the features that have one."""
-        known = np.array([self._values.exists(L(j)) for j in obs.ids.tolist()], np.bool_)
-        points[known] = stacked_points(self._values, obs.ids[known].tolist())
+        known = np.isin(obs.ids, self._minimum.cost.images.obs.ids)  # both are ascending
+        points[known] = self._minimum.estimates.points
         return points, good | known
 
     def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
@@ -248,7 +256,7 @@ class BundleAdjustment:
         own = Geometry(*stacked_poses(self._values, obs.frames), points)
         limit_px = OUTLIER_WIDTH * self._sigma_px
         if self._config.average_frames:
-            states = self._states()
+            states = self._states(self._segment.stamps_ns)
             matrices = np.array([s.world_T_body.matrix() for s in states])
             all_frames = Geometry(matrices[:, :3, :3], matrices[:, :3, 3], points)
             nearest = nearest_keyframe(self._segment.stamps_ns, self._segment.keyframes)
@@ -280,35 +288,25 @@ class BundleAdjustment:
         Returns:
             The minimum, and the part of IMU and priors in it.
         """
-        start = gtsam.Values()
-        for k in range(len(self._segment.keyframes)):
-            start.insert(X(k), self._values.atPose3(X(k)))
-            start.insert(V(k), self._values.atVector(V(k)))
-            start.insert(B(k), self._values.atConstantBias(B(k)))
-        for j, point in zip(obs.ids.tolist(), points, strict=True):
-            start.insert(L(j), point)
         inertial = self._factors.inertial(self._values)
-        graph = gtsam.NonlinearFactorGraph(inertial)
-        projections = self._factors.projections(obs, variances, self._sigma_px, self._projection)
-        graph.push_back(projections)
-        params = gtsam.LevenbergMarquardtParams()
-        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-        params.setOrdering(ordering)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
-        cost = optimizer.error()
-        for _ in range(self._config.max_iterations):
-            optimizer.iterate()
-            self._count_step()
-            decrease = cost - optimizer.error()
-            cost = optimizer.error()
-            if decrease <= tolerance * cost or optimizer.lambda_() > _MAX_LAMBDA:
-                break
-        if not math.isfinite(cost):
-            raise EstimationError("the cost of the bundle adjustment is not finite")
+        cost = RecordingCost(
+            inertial,
+            ReprojectionCost(
+                obs,
+                self._sigma_px * np.sqrt(variances),
+                self._projection,
+                RobustLoss(self._config.robust_loss, self._config.robust_width),
+            ),
+            len(self._segment.keyframes),
+        )
+        start = Estimates(self._values, points)
+        steps = self._config.max_iterations
+        self._factor = None  # it is large
+        end, value, self._factor = minimized(cost, start, tolerance, steps, self._count_step)
         self._passes += 1
-        self._values = optimizer.values()
-        self._solved = SolvedCost(graph, inertial, projections, ordering)
-        return cost, inertial.error(self._values)
+        self._values = end.states
+        self._minimum = Minimum(cost, end)
+        return value, inertial.error(self._values)
 
     def _count_step(self) -> None:
         self.iterations += 1
@@ -324,10 +322,8 @@ class BundleAdjustment:
         """
         poses = stacked_poses(self._given, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
-        values = gtsam.Values(self._given)
-        for j, point, known in zip(obs.ids.tolist(), points, good, strict=True):
-            values.insert(L(j), point if known else self._values.atPoint3(L(j)))
-        return float(self._solved.graph.error(values))
+        points[~good] = self._minimum.estimates.points[~good]
+        return self._minimum.cost.value(Estimates(self._given, points))
 
     def _covariances(self) -> KeyframeCovariances | None:
         """Covariances at the minimum; None if it does not determine all variables."""
@@ -335,14 +331,14 @@ class BundleAdjustment:
         nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
-            cliques = cliques_at_minimum(
-                self._solved,
+            states = states_at_minimum(
+                self._minimum,
+                self._factor,
                 self._factors,
-                self._values,
                 self._config.learn_imu_noise,
                 self._count_step,
             )
-            return keyframe_covariances(cliques, self._values, weights)
+            return keyframe_covariances(states, self._values, weights)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None
@@ -353,10 +349,10 @@ class BundleAdjustment:
             motions = row_motions(self._keyframe_states(), self._segment.imu, self._task.rig)
             self._projection = self._projection.moving(motions)
 
-    def _states(self) -> list[NavState]:
-        """The states of all frames."""
-        stamps_ns, imu = self._segment.stamps_ns, self._segment.imu
-        return fill_in(self._keyframe_states(), stamps_ns, imu, self._task.preintegration)
+    def _states(self, stamps_ns: IntArray) -> list[NavState]:
+        """The states at some times, those of the keyframes among them."""
+        imu, preintegration = self._segment.imu, self._task.preintegration
+        return fill_in(self._keyframe_states(), stamps_ns, imu, preintegration)
 
     def _keyframe_states(self) -> list[NavState]:
         """The states of the keyframes."""

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariances of smoothed states, from the information of the bundle adjustment's own problem.
 
-Neighbouring keyframes share a clique of the Bayes tree, as an IMU factor connects them, so that
-their joint covariance is known (`bayes_tree.py`). A frame in between is interpolated in
+The joint covariances of neighbouring keyframes are parts of the inverse of the information
+(`state_elimination.py`). A frame in between is interpolated in
 `keyframe_states.py`, and so is its error: with axes of the world, where the errors of neighbouring
 frames are nearly the same,
 
@@ -21,19 +21,13 @@ S-transformation: Baarda 1973; Triggs et al. 2000, sec. 9).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.smoothing.bayes_tree import (
-    Clique,
-    joint_root_covariances,
-    solved,
-)
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.state import stacked_poses
 from slam_graph.geometry import NavState
 
@@ -103,19 +97,18 @@ class FrameInterpolation:
 
 
 def keyframe_covariances(
-    cliques: list[Clique], values: gtsam.Values, weights: FloatArray
+    states: EliminatedStates, values: gtsam.Values, weights: FloatArray
 ) -> KeyframeCovariances:
     """Covariances of the keyframes 0 to K-1.
 
     Args:
-        cliques: of the linearised cost; its gauge is what the covariances are relative to.
+        states: the factor of the cost; its gauge is what the covariances are relative to.
         values: the minimum.
         weights: (K,) of the keyframes in an alignment; their sum is one.
     """
     count = len(weights)
-    numbers = {key(k): k for key in (X, V, B) for k in range(count)}
     rotations, positions = stacked_poses(values, range(count))
-    pairs = _pairs(cliques, numbers, count)
+    pairs = states.pair_covariances()
     centre = weights @ positions
     arms = np.cross([0.0, 0.0, 1.0], positions - centre)
     extent = float(weights @ np.sum(arms**2, axis=1))
@@ -124,27 +117,10 @@ def keyframe_covariances(
     W = np.zeros((count, 6, 4))  # g = Wᵀ e of all errors e, with axes of the world
     W[:, 3:, :3] = weights[:, None, None] * np.eye(3)
     W[:, 3:, 3] = weights[:, None] * arms / extent
-    turned = _turned(rotations, W, transpose=True)
-    found = solved(cliques, {X(k): turned[k] for k in range(count)})
-    C = _turned(rotations, np.array([found[X(k)] for k in range(count)]))
+    turned = np.zeros((count, _ERROR, 4))
+    turned[:, _POSE] = _turned(rotations, W, transpose=True)
+    C = _turned(rotations, states.times_covariance(turned)[:, _POSE])
     return KeyframeCovariances(rotations, pairs, C, np.einsum("kij,kil->jl", W, C), centre)
-
-
-def _pairs(cliques: list[Clique], numbers: Mapping[int, int], count: int) -> FloatArray:
-    """The joint covariances (K-1, 30, 30) of neighbouring keyframes."""
-    pairs = np.full((count - 1, 2 * _ERROR, 2 * _ERROR), np.nan)
-    missing = np.ones(len(pairs), np.bool_)
-    for clique, root in joint_root_covariances(cliques):
-        ours = {numbers[key] for key in clique.frontals if key in numbers}
-        for k in sorted({k - 1 for k in ours} | ours):
-            if not 0 <= k < len(pairs) or not missing[k]:
-                continue
-            keys = [key(i) for i in (k, k + 1) for key in (X, V, B)]
-            if all(key in clique.layout for key in keys):
-                rows = root[clique.layout.indices(keys)]
-                pairs[k] = rows @ rows.T
-                missing[k] = False
-    return pairs
 
 
 def _turned(rotations: FloatArray, columns: FloatArray, transpose: bool = False) -> FloatArray:

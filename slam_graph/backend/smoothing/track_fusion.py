@@ -88,9 +88,9 @@ def with_fused_features(
         thin = replace(segment, keyframes=segment.keyframes[chosen])
         start = SegmentStart(thin, [states[k] for k in chosen], fixed)
         problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds))
-        everywhere = problem.solve_loosely()
+        states = problem.solve_loosely(segment.keyframe_stamps_ns)
         steps, rounds = steps + problem.iterations, rounds + 1
-        return [everywhere[frame] for frame in segment.keyframes]
+        return states
 
     states, own = adjusted(segment, states), np.arange(len(segment.seen.ids))
     before = own

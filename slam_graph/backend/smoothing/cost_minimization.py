@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt over a recording, with factors that serve several steps.
+
+A factor costs many times as much as a gradient and a solution by it. After a step that hardly
+changes the cost, the factor is nearly that of the new estimates, and steps by it converge, linearly
+and fast (the chord method: Kelley 1995, ch. 5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from slam_graph.backend.smoothing.recording_cost import Estimates, Factor, RecordingCost
+from slam_graph.backend.smoothing.state_elimination import EliminatedStates
+from slam_graph.errors import EstimationError
+
+_FIRST_DAMPING = 1e-5
+_MAX_DAMPING = 1e5
+"""Steps end when the damping exceeds this."""
+_SMALL_STEP = 0.02
+"""A factor is kept after a step that lowers the cost by less than this part of it,"""
+_CONTRACTION = 0.2
+"""and by less than this part of what the step before did."""
+_CAUTION = 0.01
+"""Steps by an earlier factor converge linearly: in the end their decrease must be less by this."""
+
+
+def minimized(
+    cost: RecordingCost,
+    estimates: Estimates,
+    tolerance: float,
+    max_steps: int,
+    count_step: Callable[[], None],
+) -> tuple[Estimates, float, EliminatedStates | None]:
+    """Go to the minimum of a cost.
+
+    Args:
+        cost: the cost.
+        estimates: where to start.
+        tolerance: steps end when the relative decrease of the cost is less.
+        max_steps: largest number of steps.
+        count_step: is called after each step.
+
+    Returns:
+        The minimum, the cost there, and the factor by which the last step was taken; None if
+        another one was tried in vain afterwards.
+
+    Raises:
+        EstimationError: if the cost is not finite.
+    """
+    value, damping = cost.value(estimates), _FIRST_DAMPING
+    factor: Factor | None = None
+    known: EliminatedStates | None = None
+    before = math.inf
+    for _ in range(max_steps):
+        linear = cost.linearized(estimates)
+        while True:
+            fresh = factor is None
+            try:
+                if factor is None:
+                    known = None  # it is large
+                    factor = linear.factor(damping)
+                moved = estimates.moved(factor.step(linear))
+                after = cost.value(moved)
+            except (np.linalg.LinAlgError, RuntimeError):
+                after = math.nan
+            if after <= value or damping > _MAX_DAMPING:
+                break
+            factor = None
+            damping *= 10.0 if fresh else 1.0
+        if factor is None or not after <= value:
+            break
+        known = factor.states
+        decrease, estimates, value = value - after, moved, after
+        count_step()
+        if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
+            break
+        damping *= 0.1 if fresh else 1.0
+        if decrease > _SMALL_STEP * value or (not fresh and decrease > _CONTRACTION * before):
+            factor = None
+        before = decrease
+    if not math.isfinite(value):
+        raise EstimationError("the cost of the bundle adjustment is not finite")
+    return estimates, value, known

@@ -1,0 +1,254 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cost over a recording as a function of all states and features, and its normal equations.
+
+IMU factors and priors are GTSAM's. Reprojection errors are those of the recursive back end
+(`cost/reprojection.py`): a recording has hundreds of thousands of them, which are linearised in
+one pass, and whose features a compiled kernel eliminates (`kernels/feature_elimination.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.smoothing.state_elimination import (
+    ChainEquations,
+    EliminatedStates,
+    StateColumns,
+)
+from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.kernels.feature_elimination import eliminate_features
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """Values of all variables.
+
+    Attributes:
+        states: X(k), V(k) and B(k) of the keyframes.
+        points: (J, 3) features in the world.
+    """
+
+    states: gtsam.Values
+    points: FloatArray
+
+    def moved(self, step: Step) -> Estimates:
+        """The estimates after a step."""
+        delta = gtsam.VectorValues()
+        for k, state in enumerate(step.states):
+            delta.insert(X(k), state[:6])
+            delta.insert(V(k), state[6:9])
+            delta.insert(B(k), state[9:])
+        return Estimates(self.states.retract(delta), self.points + step.points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """Increments of keyframe states (K, 15) and features (J, 3)."""
+
+    states: FloatArray
+    points: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReprojectionCost:
+    """The robust reprojection errors of features in keyframes.
+
+    Attributes:
+        obs: of the keyframes; frame indices are those of keyframes.
+        sigmas_px: (N,) standard deviations of the observations.
+        projection: of the rig, with the motions of the keyframes for rolling shutters.
+        loss: of the length of a whitened residual.
+    """
+
+    obs: Observations
+    sigmas_px: FloatArray
+    projection: RigProjection
+    loss: RobustLoss
+
+    def at(self, estimates: Estimates) -> Geometry:
+        """Poses and features."""
+        return Geometry(*stacked_poses(estimates.states, self.obs.frames), estimates.points)
+
+    def value(self, estimates: Estimates) -> float:
+        """The cost. That of a point behind the camera is constant, and large."""
+        residuals, depths = self.projection.residuals(self.obs, self.at(estimates))
+        lengths = np.hypot(residuals[:, 0], residuals[:, 1])
+        behind = np.flatnonzero(depths <= 0.0)
+        focal = np.array([camera.fx for camera in self.projection.cameras])
+        lengths[behind] = np.sqrt(8.0) * focal[self.obs.camera[behind]]
+        return float(np.sum(self.loss.value(lengths / self.sigmas_px)))
+
+    def linearized(self, estimates: Estimates) -> LinearReprojection:
+        """Whitened residuals and Jacobians, weighted by the loss."""
+        obs, at, projection = self.obs, self.at(estimates), self.projection
+        views = projection.views(obs, at)
+        by_pose, by_point, _ = projection.derivatives(obs, at, views)
+        residuals = obs.pixels - views.pixels
+        lengths = np.hypot(residuals[:, 0], residuals[:, 1]) / self.sigmas_px
+        weights = np.sqrt(self.loss.weights(lengths)) / self.sigmas_px
+        weights[views.in_camera[:, 2] <= 0.0] = 0.0
+        residuals *= weights[:, None]
+        by_pose *= weights[:, None, None]
+        by_point *= weights[:, None, None]
+        return LinearReprojection(obs, residuals, by_pose, by_point)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearReprojection:
+    """Linearised reprojection errors r - Jₓ δₓ - Jₚ δₚ, whitened.
+
+    Attributes:
+        obs: the observations.
+        r: (N, 2).
+        by_pose: (N, 2, 6) Jₓ, by the observing pose.
+        by_point: (N, 2, 3) Jₚ, by the feature.
+    """
+
+    obs: Observations
+    r: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+
+    def gradient(self, keyframes: int) -> tuple[FloatArray, FloatArray]:
+        """Jᵀ r by the poses (K, 6) and the features (J, 3)."""
+        of_pose = np.einsum("nik,ni->kn", self.by_pose, self.r)
+        of_point = np.einsum("nik,ni->kn", self.by_point, self.r)
+        frame, feature, features = self.obs.frame, self.obs.feature, len(self.obs.ids)
+        poses = [np.bincount(frame, column, keyframes) for column in of_pose]
+        points = [np.bincount(feature, column, features) for column in of_point]
+        return np.stack(poses, axis=1), np.stack(points, axis=1)
+
+
+class EliminatedFeatures:
+    """The factor of the features in the normal equations, and what it leaves of the poses.
+
+    Args:
+        linear: the linearised reprojection errors.
+        keyframes: number of keyframes K.
+        damping: is added to the diagonal.
+
+    Attributes:
+        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`; until
+            `EliminatedStates` overwrites it.
+    """
+
+    def __init__(self, linear: LinearReprojection, keyframes: int, damping: float = 0.0) -> None:
+        obs = linear.obs
+        new = np.ones(len(obs), np.bool_)
+        new[1:] = (np.diff(obs.feature) != 0) | (np.diff(obs.frame) != 0)
+        first = np.flatnonzero(new)
+        self._feature, self._frame = obs.feature[first], obs.frame[first]
+        self._inverse_roots = np.empty((len(obs.ids), 3, 3))
+        self._T = np.empty((len(first), 3, 6))
+        self.poses = np.zeros((StateColumns.of(keyframes).size,) * 2)
+        eliminate_features(
+            linear.by_pose,
+            linear.by_point,
+            self._frame,
+            np.append(first, len(obs)),
+            np.searchsorted(self._feature, np.arange(len(obs.ids) + 1)),
+            damping,
+            self.poses,
+            self._inverse_roots,
+            self._T,
+        )
+
+    def reduced(self, by_pose: FloatArray, by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The gradient (K, 6) by the poses without features, and L⁻¹ times that (J, 3) by these."""
+        t = np.einsum("jab,jb->ja", self._inverse_roots, by_point)
+        held = np.einsum("vka,vk->av", self._T, t[self._feature])
+        sums = [np.bincount(self._frame, column, len(by_pose)) for column in held]
+        return by_pose - np.stack(sums, axis=1), t
+
+    def points(self, t: FloatArray, poses: FloatArray) -> FloatArray:
+        """Increments (J, 3) of the features, given those (K, 6) of the poses.
+
+        Args:
+            t: (J, 3) see `reduced`.
+            poses: (K, 6).
+        """
+        moved = np.einsum("vka,va->kv", self._T, poses[self._frame])
+        sums = [np.bincount(self._feature, column, len(t)) for column in moved]
+        rest = t - np.stack(sums, axis=1)
+        return np.asarray(np.einsum("jba,jb->ja", self._inverse_roots, rest))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Factor:
+    """The factor of the normal equations.
+
+    Attributes:
+        features: what was eliminated first.
+        states: the rest.
+    """
+
+    features: EliminatedFeatures
+    states: EliminatedStates
+
+    def step(self, linear: LinearCost) -> Step:
+        """The Gauss-Newton step from where a cost is linearised, by the factor at any estimates."""
+        by_state = linear.chain.gradient.copy()
+        by_pose, by_point = linear.images.gradient(len(by_state))
+        reduced, t = self.features.reduced(by_pose, by_point)
+        by_state[:, :6] += reduced
+        states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
+        return Step(states, self.features.points(t, states[:, :6]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearCost:
+    """A linearised cost.
+
+    Attributes:
+        chain: priors, IMU and zero-velocity factors.
+        images: the reprojection errors.
+    """
+
+    chain: ChainEquations
+    images: LinearReprojection
+
+    def factor(self, damping: float) -> Factor:
+        """The factor of the normal equations, damped.
+
+        Raises:
+            LinAlgError: if they are not positive definite.
+        """
+        features = EliminatedFeatures(self.images, len(self.chain.gradient), damping)
+        return Factor(features, EliminatedStates(features.poses, self.chain, damping))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordingCost:
+    """All of the cost.
+
+    Attributes:
+        inertial: priors, IMU and zero-velocity factors.
+        images: the reprojection errors.
+        keyframes: number of keyframes.
+    """
+
+    inertial: gtsam.NonlinearFactorGraph
+    images: ReprojectionCost
+    keyframes: int
+
+    def value(self, estimates: Estimates) -> float:
+        """The cost."""
+        return float(self.inertial.error(estimates.states)) + self.images.value(estimates)
+
+    def linearized(self, estimates: Estimates) -> LinearCost:
+        """Both parts linearised."""
+        chain = ChainEquations.of(self.inertial.linearize(estimates.states), self.keyframes)
+        return LinearCost(chain, self.images.linearized(estimates))
+
+    def with_inertial(self, inertial: gtsam.NonlinearFactorGraph) -> RecordingCost:
+        """The cost with other priors, IMU and zero-velocity factors."""
+        return replace(self, inertial=inertial)
