@@ -120,8 +120,8 @@ class LucasKanade:
         """Where points (N, 2) are in another image, and whether they were found (N,)."""
         if self._window_px != WINDOW_PX:
             return self._by_opencv(source, target, points, start, levels)
-        while levels > 0 and min(source.shape) >> levels <= WINDOW_PX:
-            levels -= 1  # a level must be larger than the window
+        while levels > 0 and -(-min(source.shape) >> levels) <= WINDOW_PX:
+            levels -= 1  # a level, of a size rounded up, must be larger than the window
         points = np.ascontiguousarray(points, np.float32)
         moved = np.ascontiguousarray(start, np.float32) / np.float32(1 << levels)
         found = np.ones(len(points), np.bool_)
