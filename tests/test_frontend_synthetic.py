@@ -34,6 +34,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import build_frontend
+from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera
@@ -317,3 +318,20 @@ def test_recorded_tracks_are_handed_on() -> None:
         frontend.track(CameraFrame(2, (None,)))
     with pytest.raises(DataError, match="features of 2 cameras"):
         frontend.track(FeatureFrame(2, (seen, seen)))
+
+
+@pytest.mark.parametrize("window_px", [17, 21])
+@pytest.mark.parametrize("side", [40, 200])
+def test_a_shift_is_found_with_any_window_and_image(window_px: int, side: int) -> None:
+    """By the kernel or by OpenCV; a pyramid ends where a window does not fit into its level."""
+    noise = np.random.default_rng(0).integers(0, 256, (side, side)).astype(np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    target = cv2.warpAffine(image, np.array([[1.0, 0.0, 1.5], [0.0, 1.0, -1.0]]), (side, side))
+    image.flags.writeable = False  # as some readers of recordings return them
+    inner = np.linspace(16.0, side - 16.0, 5, dtype=np.float32)
+    points = np.stack(np.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
+    lucas_kanade = LucasKanade(FrontendConfig(window_px=window_px), images=2)
+    flow = lucas_kanade.flow(image, target, points, points, levels=3)
+    assert flow.found.all()
+    assert np.abs(flow.points - points - (1.5, -1.0)).max() < 0.1
+    assert flow.error_px.max() < 0.1

@@ -46,6 +46,7 @@ from slam_graph.kernels.spacing import (
     clear_disks,
     clear_disks_numpy,
 )
+from slam_graph.kernels.window_tracking import WINDOW_PX, track_level, track_level_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
 from slam_graph.sensors.lens_models import RadialTangential
@@ -289,3 +290,55 @@ def test_a_division_by_zero_is_no_exception() -> None:
     R_f, T, information = np.zeros((1, 3, 3)), np.zeros((1, 3, 13)), np.zeros((13, 13))
     sum_of_features(r, by_pose, np.zeros((2, 2, 3)), none, frame, starts, R_f, T, information)
     assert np.isnan(information).any()
+
+
+def two_images() -> tuple[np.ndarray, np.ndarray]:
+    noise = np.random.default_rng(7).integers(0, 256, (120, 150)).astype(np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    image[70:, 100:] = 90  # no texture
+    image[:20, :20] = np.where(np.arange(20) % 4 < 2, 0, 255)  # the largest sums
+    shift = np.array([[1.0, 0.02, 2.6], [-0.02, 1.0, -1.7]])
+    return image, cv2.warpAffine(image, shift, (150, 120), borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_track_level(level: int) -> None:
+    rng = np.random.default_rng(8)
+    image, other = two_images()
+    points = rng.uniform(-9.0, 160.0, (150, 2)).astype(np.float32)  # some outside
+    start = points + rng.normal(0.0, 2.0, points.shape).astype(np.float32)
+    points *= 1 << level
+    results = []
+    for form in (track_level, track_level_numpy):
+        guess, good = start.copy(), np.ones(len(points), np.bool_)
+        form(image, other, points, guess, good, level, 15, 0.02, 1e-3)
+        results.append((guess, good))
+    (ours, found), (theirs, expected) = results
+    assert np.array_equal(ours, theirs)
+    assert np.array_equal(found, expected)
+    assert level > 0 or 20 < np.count_nonzero(found) < 140
+
+
+def test_track_level_is_that_of_opencv() -> None:
+    rng = np.random.default_rng(9)
+    image, other = two_images()
+    points = rng.uniform(-3.0, 153.0, (400, 2)).astype(np.float32)
+    start = points + rng.normal(0.0, 1.5, points.shape).astype(np.float32)
+    theirs, status, _ = cv2.calcOpticalFlowPyrLK(
+        image,
+        other,
+        points,
+        start.copy(),
+        winSize=(WINDOW_PX, WINDOW_PX),
+        maxLevel=0,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-3,
+    )
+    ours, found = start.copy(), np.ones(len(points), np.bool_)
+    track_level(image, other, points, ours, found, 0, 15, 0.02, 1e-3)
+    assert np.array_equal(found, status[:, 0] == 1)
+    error_px = np.abs(ours - theirs).max(axis=1)[found]
+    # OpenCV's sums are rounded; a point at the limit of the last step may take one more
+    assert np.median(error_px) == 0.0
+    assert error_px.max() < 0.05

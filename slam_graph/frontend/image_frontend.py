@@ -20,7 +20,7 @@ from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.prediction import ImuMotion, PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
-from slam_graph.sensors import Camera, CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
+from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
 
 _FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""
@@ -85,14 +85,16 @@ class ImageFrontend:
         self._references = reference_cameras(rig)
         masks = _masks(rig, config)
         rng = np.random.default_rng(seed)
+        lucas_kanade = LucasKanade(config, images=2 * len(rig.cameras))
         self._trackers: list[CameraTracker] = []
         self._matchers: dict[int, StereoMatcher] = {}
         for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
             camera, reference = mounted.camera, self._references[i]
             extractor = FeatureExtractor(config, camera.width, camera.height, mask)
-            associator: Associator = CornerTracking(extractor, config)
+            associator: Associator = CornerTracking(extractor, lucas_kanade, config)
             if reference == i:
-                associator = _associator(camera, extractor, config, mask)
+                if config.method in DESCRIPTORS:
+                    associator = DescriptorMatching(camera, extractor, config, mask)
             else:
                 # it tracks its features itself only while the reference camera has no image
                 pose = rig.cameras[reference].body_T_camera
@@ -100,7 +102,7 @@ class ImageFrontend:
                     camera,
                     rig.cameras[reference].camera,
                     mounted.body_T_camera.between(pose),
-                    LucasKanade(config),
+                    lucas_kanade,
                     extractor,
                     config,
                 )
@@ -223,15 +225,6 @@ class ImageFrontend:
             self._stats.add("stereo", matcher.counts.matched)
             self._stats.add("rejected_stereo", matcher.counts.rejected)
             return matches
-
-
-def _associator(
-    camera: Camera, extractor: FeatureExtractor, config: FrontendConfig, mask: Image | None
-) -> Associator:
-    """Matching of the descriptor that the method names, or Lucas-Kanade."""
-    if config.method in DESCRIPTORS:
-        return DescriptorMatching(camera, extractor, config, mask)
-    return CornerTracking(extractor, config)
 
 
 def _masks(rig: Rig, config: FrontendConfig) -> list[Image | None]:

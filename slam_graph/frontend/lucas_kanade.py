@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -16,12 +17,15 @@ from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
+from slam_graph.kernels.window_tracking import WINDOW_PX, track_level
 
 _ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
 
 _STEP_PX = 0.02
 """Iterations end when a step is smaller than this, which is well below the noise of a track."""
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
 
 _MIN_EIGENVALUE = 1e-3
 """Windows with less gradient than this are not tracked (OpenCV's `minEigThreshold`)."""
@@ -55,12 +59,38 @@ class Flow:
     error_px: NDArray[np.float32]
 
 
-class LucasKanade:
-    """Pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check (Kalal et al. 2010)."""
+class _Pyramids:
+    """The halvings of the images that were tracked last.
 
-    def __init__(self, config: FrontendConfig) -> None:
+    Args:
+        count: how many images are in use at a time.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._latest: deque[tuple[Image, list[Image]]] = deque(maxlen=count)
+
+    def level(self, image: Image, level: int) -> Image:
+        """A level of the pyramid of an image, which must not change; 0 is the image itself."""
+        pyramid = next((levels for one, levels in self._latest if one is image), None)
+        if pyramid is None:
+            pyramid = [np.require(image, requirements=("C", "W"))]  # as the kernel wants it
+            self._latest.append((image, pyramid))
+        while len(pyramid) <= level:
+            pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), np.uint8))
+        return pyramid[level]
+
+
+class LucasKanade:
+    """Pyramidal Lucas-Kanade (Bouguet 2000) with a forward-backward check (Kalal et al. 2010).
+
+    Args:
+        config: settings.
+        images: how many images are in use at a time: those before and those now.
+    """
+
+    def __init__(self, config: FrontendConfig, images: int) -> None:
         self._window_px = config.window_px
-        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
+        self._pyramids = _Pyramids(images)
 
     def flow(
         self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
@@ -87,6 +117,34 @@ class LucasKanade:
     def _lucas_kanade(
         self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
     ) -> tuple[Pixels, BoolArray]:
+        """Where points (N, 2) are in another image, and whether they were found (N,)."""
+        if self._window_px != WINDOW_PX:
+            return self._by_opencv(source, target, points, start, levels)
+        while levels > 0 and -(-min(source.shape) >> levels) <= WINDOW_PX:
+            levels -= 1  # a level, of a size rounded up, must be larger than the window
+        points = np.ascontiguousarray(points, np.float32)
+        moved = np.ascontiguousarray(start, np.float32) / np.float32(1 << levels)
+        found = np.ones(len(points), np.bool_)
+        for level in range(levels, -1, -1):
+            track_level(
+                self._pyramids.level(source, level),
+                self._pyramids.level(target, level),
+                points,
+                moved,
+                found,
+                level,
+                _ITERATIONS,
+                _STEP_PX,
+                _MIN_EIGENVALUE,
+            )
+            if level > 0:
+                moved *= np.float32(2.0)
+        return moved, found
+
+    def _by_opencv(
+        self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
+    ) -> tuple[Pixels, BoolArray]:
+        """The same for windows of any size, in more time."""
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,
@@ -94,7 +152,7 @@ class LucasKanade:
             start.astype(np.float32),  # a copy: it is overwritten
             winSize=(self._window_px, self._window_px),
             maxLevel=levels,
-            criteria=self._criteria,
+            criteria=_CRITERIA,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=_MIN_EIGENVALUE,
         )
@@ -104,9 +162,11 @@ class LucasKanade:
 class CornerTracking:
     """Tracks the corners of one camera by Lucas-Kanade: an `Associator`."""
 
-    def __init__(self, extractor: FeatureExtractor, config: FrontendConfig) -> None:
+    def __init__(
+        self, extractor: FeatureExtractor, lucas_kanade: LucasKanade, config: FrontendConfig
+    ) -> None:
         self._extractor = extractor
-        self._lucas_kanade = LucasKanade(config)
+        self._lucas_kanade = lucas_kanade
         self._levels = config.pyramid_levels
         self._largest_px = config.forward_backward_px
 

@@ -1,0 +1,308 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Lucas-Kanade on one level of a pyramid (Bouguet 2000).
+
+OpenCV's `calcOpticalFlowPyrLK` builds the pyramids and derivatives of both images in every call.
+Here pyramids are given, and derivatives are taken where they are needed. Positions, weights of 14
+bits and windows of whole numbers are those of OpenCV; the sums over a window are exact, while
+OpenCV's are rounded in an order that depends on the machine.
+
+A window is a flat array, in rows of `_STRIDE` numbers of which the last three are not used: a loop
+over all of it is made of vectors, if the compiler knows the _STRIDE. `np.int32(…)` around a product
+keeps Numba from computing in 64 bits, which would double their number.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import BoolArray, IntArray
+from slam_graph.kernels.compilation import compiled
+
+__all__ = ["WINDOW_PX", "track_level", "track_level_numpy"]
+
+WINDOW_PX = 17
+"""Side of the window."""
+
+_STRIDE = WINDOW_PX + 3
+_WEIGHT_BITS = 14
+_IMAGE_BITS = _WEIGHT_BITS - 5
+"""Bits that are rounded off: grey values in a window keep five after the point."""
+
+_ONE, _WHOLE = np.float32(1.0), np.float32(1 << _WEIGHT_BITS)
+_SCALE = np.float32(1.0 / (1 << 20))
+"""Of sums of products, so that the smallest eigenvalue is in OpenCV's unit."""
+
+_SINGULAR = np.float32(np.finfo(np.float32).eps)
+_OSCILLATION_PX = 0.01
+"""Two steps that cancel to within this end the iteration, half way between their ends."""
+
+_BLOCK = 64
+"""So many products are added in 32 bits: 64 * 4080 * 8160, derivative times grey, is below 2^31."""
+
+_LENGTH = -(-WINDOW_PX * _STRIDE // _BLOCK) * _BLOCK
+"""Of a window, made up to whole blocks."""
+
+_VECTOR = 32
+"""Pixels that are copied at once. The next row overwrites those that are too many."""
+
+_at = np.uintp
+"""An index without a sign. Numba would test others for negative ones, and not use vectors."""
+
+_Image = NDArray[np.uint8]
+_Window = NDArray[np.int16]
+_Pixels = NDArray[np.float32]
+_Weights = tuple[np.int32, np.int32, np.int32, np.int32]
+
+
+@compiled()
+def _cell(x: np.float32, y: np.float32) -> tuple[int, int, _Weights]:
+    """The pixel (u, v) at the upper left of a place, and the weights of the four around it."""
+    u, v = math.floor(x), math.floor(y)
+    a, b = x - np.float32(u), y - np.float32(v)
+    ul = np.int32(np.rint((_ONE - a) * (_ONE - b) * _WHOLE))
+    ur = np.int32(np.rint(a * (_ONE - b) * _WHOLE))
+    ll = np.int32(np.rint((_ONE - a) * b * _WHOLE))
+    return u, v, (ul, ur, ll, np.int32(_WHOLE - ul - ur - ll))
+
+
+@compiled()
+def _outside(u: int, v: int, image: _Image) -> bool:
+    """Whether a window whose upper left pixel is (u, v) lies outside of an image."""
+    return u < -WINDOW_PX or v < -WINDOW_PX or u >= image.shape[1] or v >= image.shape[0]
+
+
+@compiled()
+def _reflected(place: int, length: int) -> int:
+    """Where a line is continued beyond its ends, as by OpenCV's BORDER_REFLECT_101."""
+    while not 0 <= place < length:
+        place = -place if place < 0 else 2 * length - 2 - place
+    return place
+
+
+@compiled()
+def _copy(image: _Image, u: int, v: int, rows: int, out: _Window) -> None:
+    """Rows of pixels from (u, v) on, reflected at the edges of the image."""
+    height, width = image.shape
+    if u >= 0 and v >= 0 and u + _STRIDE <= width and v + rows <= height:
+        columns = min(width - u, _VECTOR)
+        for i in range(rows):
+            for j in range(columns):
+                out[_at(i * _STRIDE + j)] = image[_at(v + i), _at(u + j)]
+    else:
+        for i in range(rows):
+            y = _reflected(v + i, height)
+            for j in range(_STRIDE):
+                out[_at(i * _STRIDE + j)] = image[_at(y), _at(_reflected(u + j, width))]
+
+
+@compiled()
+def _blend(values: _Window, start: int, weights: _Weights, bits: int, out: _Window) -> None:
+    """Bilinear interpolation between four values each, with `bits` rounded off."""
+    a, b, c, d = weights
+    half = np.int32(1 << (bits - 1))
+    for k in range(_LENGTH):
+        m = _at(start + k)
+        upper = np.int32(a * values[m]) + np.int32(b * values[m + _at(1)])
+        m += _at(_STRIDE)
+        lower = np.int32(c * values[m]) + np.int32(d * values[m + _at(1)])
+        out[_at(k)] = np.int16(np.int32(upper + lower + half) >> bits)
+
+
+@compiled()
+def _differentiate(pixels: _Window, dx: _Window, dy: _Window) -> None:
+    """Scharr's derivatives, from the second pixel of the second row on."""
+    three, ten = np.int16(3), np.int16(10)
+    for k in range(_LENGTH + _STRIDE + 1):
+        m, n = _at(k + _STRIDE), _at(k + 2 * _STRIDE)
+        falling = np.int16(pixels[n + _at(2)] - pixels[_at(k)])
+        rising = np.int16(pixels[_at(k + 2)] - pixels[n])
+        right = np.int16(pixels[m + _at(2)] - pixels[m])
+        down = np.int16(pixels[n + _at(1)] - pixels[_at(k + 1)])
+        corners_x, corners_y = np.int16(falling + rising), np.int16(falling - rising)
+        dx[_at(k)] = np.int16(np.int16(three * corners_x) + np.int16(ten * right))
+        dy[_at(k)] = np.int16(np.int16(three * corners_y) + np.int16(ten * down))
+
+
+@compiled()
+def _clear_outside(values: _Window, u: int, v: int, image: _Image) -> None:
+    """No derivatives beyond the edges of an image."""
+    for k in range(len(values)):
+        x, y = u + k % _STRIDE, v + k // _STRIDE
+        if x < 0 or x >= image.shape[1] or y < 0 or y >= image.shape[0]:
+            values[k] = 0
+
+
+@compiled()
+def _sums(
+    values: _Window, less: _Window, gx: _Window, gy: _Window
+) -> tuple[np.float32, np.float32]:
+    """Sums of (values - less) times two other windows."""
+    total_x = total_y = np.int64(0)
+    for start in range(0, _LENGTH, _BLOCK):
+        x = y = np.int32(0)
+        for k in range(_BLOCK):
+            m = _at(start + k)
+            difference = np.int32(np.int16(values[m] - less[m]))
+            x = np.int32(x + difference * np.int32(gx[m]))
+            y = np.int32(y + difference * np.int32(gy[m]))
+        total_x += x
+        total_y += y
+    return np.float32(total_x) * _SCALE, np.float32(total_y) * _SCALE
+
+
+@compiled("void(u1[:, ::1], u1[:, ::1], f4[:, ::1], f4[:, ::1], b1[::1], i8, i8, f8, f4)")
+def track_level(
+    source: _Image,
+    target: _Image,
+    points: _Pixels,
+    guess: _Pixels,
+    good: BoolArray,
+    level: int,
+    iterations: int,
+    step_px: float,
+    least_eigenvalue: float,
+) -> None:
+    """Find points of one image in another, on one level of their pyramids.
+
+    Args:
+        source: a level of the one image.
+        target: the same level of the other.
+        points: (N, 2) pixels of level 0 in `source`.
+        guess: (N, 2) where to start, in pixels of this level of `target`; then what was found.
+        good: (N,) made false, on level 0, where a window has too little gradient or is outside.
+        level: of the pyramid; 0 is the image itself.
+        iterations: most steps.
+        step_px: a step that is not longer than this is the last one.
+        least_eigenvalue: smallest eigenvalue of the moments of the gradient, per pixel.
+    """
+    half, scale = np.float32((WINDOW_PX - 1) * 0.5), np.float32(1.0 / (1 << level))
+    # One by one: Numba does not see that the rows of a larger array are contiguous
+    size = _LENGTH + 4 * _STRIDE + _VECTOR
+    pixels, dx, dy = np.zeros(size, np.int16), np.zeros(size, np.int16), np.zeros(size, np.int16)
+    grey, moved = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
+    gx, gy = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
+    used, zero = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
+    for row in range(WINDOW_PX):
+        used[row * _STRIDE : row * _STRIDE + WINDOW_PX] = -1  # all bits
+    for i in range(len(points)):
+        x, y = points[i, 0] * scale - half, points[i, 1] * scale - half
+        u, v, weights = _cell(x, y)
+        if _outside(u, v, source):
+            good[i] &= level > 0
+            continue
+        _copy(source, u - 1, v - 1, _STRIDE, pixels)
+        _blend(pixels, _STRIDE + 1, weights, _IMAGE_BITS, grey)
+        _differentiate(pixels, dx, dy)
+        if u < 0 or v < 0 or u + WINDOW_PX >= source.shape[1] or v + WINDOW_PX >= source.shape[0]:
+            _clear_outside(dx, u, v, source)
+            _clear_outside(dy, u, v, source)
+        _blend(dx, 0, weights, _WEIGHT_BITS, gx)
+        _blend(dy, 0, weights, _WEIGHT_BITS, gy)
+        for k in range(_LENGTH):
+            gx[_at(k)] &= used[_at(k)]
+            gy[_at(k)] &= used[_at(k)]
+        (xx, xy), (_, yy) = _sums(gx, zero, gx, gy), _sums(gy, zero, gx, gy)
+        determinant = xx * yy - xy * xy
+        root = np.sqrt((xx - yy) * (xx - yy) + np.float32(4.0) * xy * xy)
+        eigenvalue = (yy + xx - root) / np.float32(2 * WINDOW_PX * WINDOW_PX)
+        if eigenvalue < least_eigenvalue or determinant < _SINGULAR:
+            good[i] &= level > 0
+            continue
+        inverse = _ONE / determinant
+        x, y = guess[i, 0] - half, guess[i, 1] - half
+        last_x = last_y = np.float32(0.0)
+        for k in range(iterations):
+            u, v, weights = _cell(x, y)
+            if _outside(u, v, target):
+                break
+            _copy(target, u, v, WINDOW_PX + 1, pixels)
+            _blend(pixels, 0, weights, _IMAGE_BITS, moved)
+            bx, by = _sums(moved, grey, gx, gy)
+            step_x, step_y = (xy * by - yy * bx) * inverse, (xy * bx - xx * by) * inverse
+            x += step_x
+            y += step_y
+            guess[i, 0], guess[i, 1] = x + half, y + half
+            if float(step_x) * float(step_x) + float(step_y) * float(step_y) <= step_px * step_px:
+                break
+            if k > 0 and abs(step_x + last_x) < _OSCILLATION_PX > abs(step_y + last_y):
+                guess[i, 0] -= step_x * np.float32(0.5)
+                guess[i, 1] -= step_y * np.float32(0.5)
+                break
+            last_x, last_y = step_x, step_y
+        u, v, weights = _cell(guess[i, 0] - half, guess[i, 1] - half)
+        if _outside(u, v, target):
+            good[i] &= level > 0
+
+
+def track_level_numpy(
+    source: _Image,
+    target: _Image,
+    points: _Pixels,
+    guess: _Pixels,
+    good: BoolArray,
+    level: int,
+    iterations: int,
+    step_px: float,
+    least_eigenvalue: float,
+) -> None:
+    """`track_level` in NumPy."""
+    half, scale = np.float32((WINDOW_PX - 1) * 0.5), np.float32(1.0 / (1 << level))
+    reach, size = WINDOW_PX + 1, np.array(source.shape[::-1])
+    grey, others = (
+        np.pad(image.astype(np.int64), reach, mode="reflect") for image in (source, target)
+    )
+    derivatives = [
+        np.pad(cv2.Scharr(source, cv2.CV_16S, *order).astype(np.int64), reach)
+        for order in ((1, 0), (0, 1))
+    ]
+
+    def window(image: IntArray, place: _Pixels, bits: int) -> IntArray | None:
+        corner = np.floor(place)
+        if np.any(corner < -WINDOW_PX) or np.any(corner >= size):
+            return None
+        (a, b), (u, v) = place - corner, corner.astype(int) + reach
+        weights = [(_ONE - a) * (_ONE - b), a * (_ONE - b), (_ONE - a) * b]
+        w = [int(np.rint(weight * _WHOLE)) for weight in weights]
+        rows = image[v : v + WINDOW_PX + 1, u : u + WINDOW_PX + 1]
+        upper = w[0] * rows[:-1, :-1] + w[1] * rows[:-1, 1:]
+        lower = w[2] * rows[1:, :-1] + ((1 << _WEIGHT_BITS) - sum(w)) * rows[1:, 1:]
+        return (upper + lower + (1 << (bits - 1))) >> bits
+
+    def total(a: IntArray, b: IntArray) -> np.float32:
+        return np.float32(np.sum(a * b)) * _SCALE
+
+    def found(start: _Pixels, place: _Pixels) -> bool:
+        patch = window(grey, start, _IMAGE_BITS)
+        gx, gy = (window(image, start, _WEIGHT_BITS) for image in derivatives)
+        if patch is None or gx is None or gy is None:
+            return False
+        xx, xy, yy = total(gx, gx), total(gx, gy), total(gy, gy)
+        determinant = xx * yy - xy * xy
+        root = np.sqrt((xx - yy) * (xx - yy) + np.float32(4.0) * xy * xy)
+        eigenvalue = (yy + xx - root) / np.float32(2 * WINDOW_PX * WINDOW_PX)
+        if eigenvalue < least_eigenvalue or determinant < _SINGULAR:
+            return False
+        last, x = np.zeros(2, np.float32), place - half
+        for k in range(iterations):
+            moved = window(others, x, _IMAGE_BITS)
+            if moved is None:
+                return False
+            bx, by = total(moved - patch, gx), total(moved - patch, gy)
+            step = np.array([xy * by - yy * bx, xy * bx - xx * by]) * (_ONE / determinant)
+            x = x + step
+            place[:] = x + half
+            if np.sum(step.astype(np.float64) ** 2) <= step_px * step_px:
+                break
+            if k > 0 and np.all(np.abs(step + last) < _OSCILLATION_PX):
+                place -= step * np.float32(0.5)
+                break
+            last = step
+        return window(others, place - half, _IMAGE_BITS) is not None
+
+    for i, point in enumerate(points):
+        good[i] &= found(point * scale - half, guess[i]) or level > 0
