@@ -74,6 +74,7 @@ def eliminate_columns_numpy(
 ) -> None:
     """`eliminate_columns` by one QR decomposition; rows have any sign."""
     given = carried[order[: len(carried)] >= len(R)]
-    triangle = np.linalg.qr(np.concatenate([given, R[:, order]]), mode="r")
+    rows = np.concatenate([given, R[:, order]])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     carried[:] = triangle[: len(carried)]
     kept[:] = triangle[len(carried) :, len(carried) :][: len(kept)]
