@@ -14,8 +14,10 @@ from slam_graph.kernels.compilation import compiled
 __all__ = ["eliminate_columns", "eliminate_columns_numpy"]
 
 
-@compiled("void(f8[:, ::1], i8[::1], f8[:, ::1])")
-def eliminate_columns(rows: FloatArray, gone: IntArray, carried: FloatArray) -> None:
+@compiled("void(f8[:, :], i8[::1], f8[:, ::1], f8[:, :])")
+def eliminate_columns(
+    R: FloatArray, order: IntArray, carried: FloatArray, kept: FloatArray
+) -> None:
     """Take columns out of the rows of a triangle, from the bottom up.
 
     A row whose own column is eliminated is carried upwards. Each row above is rotated with all that
@@ -23,22 +25,31 @@ def eliminate_columns(rows: FloatArray, gone: IntArray, carried: FloatArray) -> 
     row begins with, so that it stays a row of a triangle.
 
     Args:
-        rows: (n, w + k) first rows of a triangle, the w eliminated columns moved to the front. The
-            rows of columns that stay have lost the others afterwards.
-        gone: (w,) where these columns stood in the triangle, ascending; some behind row n.
-        carried: (w, w + k) the rows that are carried; those of columns that stood behind row n are
-            given, all of them are filled afterwards.
+        R: (n, w + k) first rows of an upper triangle.
+        order: (w + k,) where its columns go: first the w that are eliminated, then those that stay;
+            both ascending as far as they are among the first n.
+        carried: (w, w + k) the rows that are carried, in the new order of columns; those of columns
+            that stood behind row n are given, zeros otherwise. All are filled afterwards.
+        kept: (m, k) zeros; filled with the rows of columns that stay.
     """
     w, width = carried.shape
     top = 0
-    while top < w and gone[top] < len(rows):
+    while top < w and order[top] < len(R):
         top += 1
-    for i in range(len(rows) - 1, -1, -1):
-        if top > 0 and gone[top - 1] == i:
+    row = np.empty(width)
+    for i in range(len(R) - 1, -1, -1):
+        eliminated = top > 0 and order[top - 1] == i
+        if eliminated:
             top -= 1
-            carried[top] = rows[i]
+            row = carried[top]
+        first = w + i - top
+        for k in range(top, w):
+            row[k] = R[i, order[k]]
+        for k in range(first, width):
+            row[k] = R[i, order[k]]
+        if eliminated:
+            row = np.empty(width)
             continue
-        row, first = rows[i], w + i - top
         for column in range(top, w):
             x = row[column]
             if x == 0.0:
@@ -54,11 +65,16 @@ def eliminate_columns(rows: FloatArray, gone: IntArray, carried: FloatArray) -> 
                 above, below = row[k], other[k]
                 row[k] = c * above - s * below
                 other[k] = c * below + s * above
+        for k in range(first, width):
+            kept[i - top, k - w] = row[k]
 
 
-def eliminate_columns_numpy(rows: FloatArray, gone: IntArray, carried: FloatArray) -> None:
+def eliminate_columns_numpy(
+    R: FloatArray, order: IntArray, carried: FloatArray, kept: FloatArray
+) -> None:
     """`eliminate_columns` by one QR decomposition; rows have any sign."""
-    stays = ~np.isin(np.arange(len(rows)), gone)
-    R = np.linalg.qr(np.concatenate([carried[gone >= len(rows)], rows]), mode="r")
-    carried[:] = R[: len(gone)]
-    rows[stays] = R[len(gone) : len(gone) + np.count_nonzero(stays)]
+    given = carried[order[: len(carried)] >= len(R)]
+    rows = np.concatenate([given, R[:, order]])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+    carried[:] = triangle[: len(carried)]
+    kept[:] = triangle[len(carried) :, len(carried) :][: len(kept)]

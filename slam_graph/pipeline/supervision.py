@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -37,18 +38,11 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
     Raises:
         DivergenceError: naming what is beyond its limit.
     """
-    parts = (
-        state.world_T_body.matrix().ravel(),
-        state.velocity,
-        state.gyro_bias,
-        state.accel_bias,
-        np.zeros(0) if state.covariance is None else np.diag(state.covariance),
-    )
-    if not all(np.isfinite(part).all() for part in parts):
+    variances = np.zeros(15) if state.covariance is None else np.diag(state.covariance)
+    pose, biases = state.world_T_body.matrix().ravel(), (state.gyro_bias, state.accel_bias)
+    if not np.isfinite(np.concatenate([pose, state.velocity, *biases, variances])).all():
         raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
-    sigma_m = 0.0
-    if state.covariance is not None:
-        sigma_m = float(np.sqrt(np.max(np.diag(state.covariance)[3:6])))
+    sigma_m = math.sqrt(max(float(variances[3:6].max()), 0.0))
     for what, value, limit in (
         ("speed of {} m/s", float(np.linalg.norm(state.velocity)), limits.max_speed),
         ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),

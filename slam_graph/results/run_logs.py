@@ -7,7 +7,8 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ class StepLog:
 
 
 _INNOVATION_COLUMNS = tuple(field.name for field in fields(Innovations))
+_values_of = attrgetter(*_INNOVATION_COLUMNS)
 
 
 class InnovationLog:
@@ -81,7 +83,7 @@ class InnovationLog:
         """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
             self._stamps_ns.append(stamp_ns)
-            self._rows.extend(map(float, astuple(innovations)))
+            self._rows.extend(_values_of(innovations))
 
     @property
     def stamps_ns(self) -> IntArray:

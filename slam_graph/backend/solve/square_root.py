@@ -20,7 +20,7 @@ from scipy.linalg import lapack
 from slam_graph.arrays import FloatArray
 from slam_graph.kernels.elimination import eliminate_columns
 
-_BLOCK_SIZE = 32
+_BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
 
 
@@ -162,11 +162,16 @@ class SquareRootInformation:
         Ab = Ab[:, first:]
         if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
-        triangle = np.asfortranarray(self.Rd[first:, first:])
+        triangle, rows = self.Rd[first:, first:].copy(order="F"), Ab.copy(order="F")
         block = min(_BLOCK_SIZE, len(triangle))
-        triangle, _, _, info = lapack.dtpqrt(0, block, triangle, np.asfortranarray(Ab))
+        # in the copies themselves: new memory costs as much as the arithmetic
+        triangle, _, _, info = lapack.dtpqrt(
+            0, block, triangle, rows, overwrite_a=True, overwrite_b=True
+        )
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
+        if first == 0:
+            return SquareRootInformation(self.layout, triangle)
         Rd = self.Rd.copy(order="F")
         Rd[first:, first:] = triangle
         return SquareRootInformation(self.layout, Rd)
@@ -231,11 +236,7 @@ class SquareRootInformation:
         Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
         carried = np.zeros((w, len(order)))
         carried[lead_gone:, tail] = triangle[: w - lead_gone]
-        rows = np.ascontiguousarray(self.Rd[:lead, order])
-        eliminate_columns(rows, order[:w], carried)
-        stays = np.ones(lead, np.bool_)
-        stays[order[:lead_gone]] = False
-        Rd[:top] = rows[stays, w:]
+        eliminate_columns(self.Rd[:lead], order, carried, Rd[:top])
         return Conditional(gone, kept, carried), SquareRootInformation(kept, Rd)
 
     def _unmoved(self, keep: Sequence[int]) -> int:

@@ -121,7 +121,8 @@ class State:
 
     Attributes:
         first: linearisation point of every variable.
-        offsets: tangent (dim,) of every variable at its linearisation point.
+        offsets: tangent (dim,) of every variable at its linearisation point; copies share these, so
+            they are replaced and never changed.
         estimate: current values, first ⊕ offsets.
         frozen: keys whose linearisation point no longer moves.
         motions: of each frame with a pose, where a time offset is estimated or a shutter rolls.
@@ -143,7 +144,7 @@ class State:
     def assign(self, other: State) -> None:
         """Take over all values of another state."""
         self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
-        self.offsets = {key: offset.copy() for key, offset in other.offsets.items()}
+        self.offsets = dict(other.offsets)
         self.frozen = set(other.frozen)
         self.motions = dict(other.motions)
 
@@ -186,13 +187,13 @@ class State:
 
     def relinearize(self) -> None:
         """Move the linearisation points of all variables that are not frozen to their estimates."""
-        moved = gtsam.Values()
+        tangents = gtsam.VectorValues()
         for key, offset in self.offsets.items():
             if key not in self.frozen and offset.any():
-                _copy(self.estimate, moved, key)
-                offset[:] = 0.0
-        if moved.size():
-            self.first.update(moved)
+                tangents.insert(key, offset)
+                self.offsets[key] = np.zeros(len(offset))
+        if tangents.size():  # as the estimates were made, so that they are the same to the bit
+            self.first = self.first.retract(tangents)
 
     def freeze(self, keys: Iterable[int]) -> None:
         """Hold the linearisation points of variables where they are."""
@@ -210,9 +211,9 @@ class State:
 
     def update(self, layout: Layout, delta: FloatArray) -> None:
         """Add an increment (n,) to the tangents at the linearisation points."""
-        tangents = gtsam.VectorValues()
+        tangents, moved = gtsam.VectorValues(), self.offset(layout) + delta
         for key, columns in layout.columns.items():
-            self.offsets[key] = self.offsets[key] + delta[columns]
+            self.offsets[key] = moved[columns]
         for key, offset in self.offsets.items():
             tangents.insert(key, offset)
         self.estimate = self.first.retract(tangents)
@@ -228,19 +229,6 @@ class State:
             gyro_bias=np.asarray(bias.gyroscope()),
             covariance=covariance,
         )
-
-
-def _copy(source: gtsam.Values, target: gtsam.Values, key: int) -> None:
-    """Insert the value of `key` in `source` into `target`."""
-    kind, _ = letter_and_index(key)
-    if kind in "xe":
-        target.insert(key, source.atPose3(key))
-    elif kind == "b":
-        target.insert(key, source.atConstantBias(key))
-    elif kind == "l":
-        target.insert(key, source.atPoint3(key))
-    else:
-        target.insert(key, source.atVector(key))
 
 
 def stacked_poses(values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
