@@ -16,7 +16,12 @@ from slam_graph.kernels.epipolar import (
     sampson_distances,
     sampson_distances_numpy,
 )
-from slam_graph.kernels.feature_sums import sum_of_features, sum_of_features_numpy
+from slam_graph.kernels.feature_sums import (
+    block_sums,
+    block_sums_numpy,
+    sum_of_features,
+    sum_of_features_numpy,
+)
 from slam_graph.kernels.gate import (
     observation_distances,
     observation_distances_numpy,
@@ -177,6 +182,15 @@ def test_eliminate_columns(gone: list[int]) -> None:
     eliminate_columns(own, np.array(gone, np.int64), carried)
     assert same(np.abs(own[stays]), np.abs(rows[stays]))
     assert same(np.abs(carried), np.abs(expected))
+
+
+def test_block_sums() -> None:
+    r, _, by_point, _, camera, starts = tracks(np.random.default_rng(7), 0)
+    found = np.empty((2, 3, len(starts) - 1, 2))
+    block_sums(r, by_point, camera % 2, starts, 3, found[0])
+    block_sums_numpy(r, by_point, camera % 2, starts, 3, found[1])
+    assert same(*found)
+    assert np.any(found[0] == 0.0)
 
 
 def disk(radius: int) -> np.ndarray:

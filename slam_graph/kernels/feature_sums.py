@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What many features say of the poses together, by the Schur complement of their positions."""
+"""Sums over the observations of features whose positions are eliminated.
+
+What many features say of the poses together, by the Schur complement of their positions; and the
+means of their residuals over blocks, as the noise of the pixels is read from them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["sum_of_features", "sum_of_features_numpy"]
+__all__ = ["block_sums", "block_sums_numpy", "sum_of_features", "sum_of_features_numpy"]
 
 _REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
@@ -145,10 +149,110 @@ def sum_of_features_numpy(
             H[2 * k : 2 * k + 2, 6 * i : 6 * i + 6] = by_pose[rows][k]
         H[:, first:-1] = by_calibration[rows].reshape(len(H), -1)
         H[:, -1] = r[rows].ravel()
-        Q, R = by_point[rows].reshape(-1, 3), np.eye(3)
-        for _ in range(2):
-            squares = Q.T @ Q
-            root = np.linalg.cholesky(squares + _REGULARISATION * np.trace(squares) * np.eye(3)).T
-            Q, R = Q @ np.linalg.inv(root), root @ R
-        R_f[j], T[j] = R, Q.T @ H
+        Q, R_f[j] = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
+        T[j] = Q.T @ H
         information += H.T @ H - T[j].T @ T[j]
+
+
+def _orthonormalize_numpy(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    R = np.eye(3)
+    for _ in range(2):
+        squares = Q.T @ Q
+        root = np.linalg.cholesky(squares + _REGULARISATION * np.trace(squares) * np.eye(3)).T
+        Q, R = Q @ np.linalg.inv(root), root @ R
+    return Q, R
+
+
+@compiled("void(f8[:, ::1], f8[:, :, ::1], i8[:], i8[::1], i8, f8[:, :, ::1])")
+def block_sums(
+    r: FloatArray,
+    by_point: FloatArray,
+    camera: IntArray,
+    starts: IntArray,
+    block: int,
+    sums: FloatArray,
+) -> None:
+    """How large the means of residuals are over blocks of consecutive observations of a camera.
+
+    With the whitened residuals e = P ε of a track, P = I - Q Qᵀ the projection off the directions
+    H_f = Q R_f of its point, the rows B that average over its blocks in one camera, and
+    S = B P Bᵀ.
+
+    Args:
+        r: (N, 2) residuals of the observations, those of one feature after the other.
+        by_point: (N, 2, 3) their derivatives by the position of the feature.
+        camera: (N,) camera of each observation.
+        starts: (J + 1,) first observation of each feature, and N.
+        block: observations in a block; those that fill none are left out.
+        sums: (3, J, C), filled: ‖B e‖², tr(S) and tr(S²) of each feature in each camera; NaN where
+            the observations of a feature do not determine its position.
+    """
+    longest = 0
+    for j in range(len(starts) - 1):
+        longest = max(longest, starts[j + 1] - starts[j])
+    Q, R, e = np.empty((2 * longest, 3)), np.empty((3, 3)), np.empty(2 * longest)
+    along, gram, mean = np.empty(3), np.empty((3, 3)), np.empty((2, 4))
+    for j in range(len(starts) - 1):
+        begin, count = starts[j], starts[j + 1] - starts[j]
+        for row in range(2 * count):
+            for k in range(3):
+                Q[row, k] = by_point[begin + row // 2, row % 2, k]
+        _orthonormalize(Q, 2 * count, R)
+        for k in range(3):
+            along[k] = 0.0
+            for row in range(2 * count):
+                along[k] += Q[row, k] * r[begin + row // 2, row % 2]
+        for row in range(2 * count):
+            e[row] = r[begin + row // 2, row % 2]
+            for k in range(3):
+                e[row] -= Q[row, k] * along[k]
+        for c in range(sums.shape[2]):
+            blocks, filled, square = 0, 0, 0.0
+            mean[:], gram[:] = 0.0, 0.0  # gram is (B Q)ᵀ B Q
+            for n in range(count):
+                if camera[begin + n] != c:
+                    continue
+                for i in range(2):
+                    mean[i, 3] += e[2 * n + i] / block
+                    for k in range(3):
+                        mean[i, k] += Q[2 * n + i, k] / block
+                filled += 1
+                if filled == block:
+                    for i in range(2):
+                        square += mean[i, 3] * mean[i, 3]
+                        for k in range(3):
+                            for m in range(3):
+                                gram[k, m] += mean[i, k] * mean[i, m]
+                    mean[:], filled, blocks = 0.0, 0, blocks + 1
+            # S = I / block - B Q (B Q)ᵀ, with two rows for each block
+            trace, squares = gram[0, 0] + gram[1, 1] + gram[2, 2], 0.0
+            for k in range(3):
+                for m in range(3):
+                    squares += gram[k, m] * gram[k, m]
+            sums[0, j, c] = square
+            sums[1, j, c] = 2.0 * blocks / block - trace
+            sums[2, j, c] = (2.0 * blocks / block - 2.0 * trace) / block + squares
+
+
+def block_sums_numpy(
+    r: FloatArray,
+    by_point: FloatArray,
+    camera: IntArray,
+    starts: IntArray,
+    block: int,
+    sums: FloatArray,
+) -> None:
+    """`block_sums` in NumPy, by the definition."""
+    for j in range(len(starts) - 1):
+        rows = slice(starts[j], starts[j + 1])
+        Q, _ = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
+        P = np.eye(len(Q)) - Q @ Q.T
+        for c in range(sums.shape[2]):
+            seen = np.flatnonzero(camera[rows] == c)
+            seen = seen[: len(seen) // block * block]
+            averages = np.zeros((len(seen) // block, len(camera[rows])))
+            averages[np.arange(len(seen)) // block, seen] = 1.0 / block
+            B = np.kron(averages, np.eye(2))
+            S = B @ P @ B.T
+            means = B @ P @ r[rows].ravel()
+            sums[:, j, c] = means @ means, np.trace(S), np.sum(S**2)

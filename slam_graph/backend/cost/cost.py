@@ -247,12 +247,12 @@ class Cost:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
         rows = []
         for factor in self.factors:
+            assert isinstance(factor, gtsam.NoiseModelFactor)
             jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first))
             A, _ = jacobian.jacobian()
-            b = gtsam.JacobianFactor(factor.linearize(self.state.estimate)).jacobian()[1]
-            Ab = np.zeros((len(b), layout.size + 1))
+            Ab = np.zeros((len(A), layout.size + 1))
             Ab[:, layout.indices(jacobian.keys())] = A
-            Ab[:, -1] = b
+            Ab[:, -1] = -factor.whitenedError(self.state.estimate)
             rows.append(Ab)
         return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
 

@@ -42,10 +42,6 @@ from slam_graph.backend.solve.state import POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
-_REGULARISATION = 1e-15
-"""Information that is added to a feature, relative to what its observations say of it."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SummedFeatures:
     """J features over the poses of F frames and C columns of the calibration, summed up.
@@ -109,18 +105,6 @@ def information_root(information: FloatArray) -> FloatArray:
     rows[:rank, n] = b
     rows[rank, n] = np.sqrt(max(information[n, n] - b @ b, 0.0))
     return rows
-
-
-def orthonormal_columns(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q (J, m, 3) with orthonormal columns and R_f (J, 3, 3) of the m rows of each feature."""
-    Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(by_point), 3, 3))
-    for _ in range(2):
-        squares = Q.transpose(0, 2, 1) @ Q
-        trace = np.trace(squares, axis1=1, axis2=2)
-        squares += _REGULARISATION * trace[:, None, None] * np.eye(3)
-        R = np.linalg.cholesky(squares).transpose(0, 2, 1)
-        Q, R_f = Q @ np.linalg.inv(R), R @ R_f
-    return Q, R_f
 
 
 @dataclass(frozen=True, slots=True, eq=False)

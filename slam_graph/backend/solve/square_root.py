@@ -193,9 +193,14 @@ class SquareRootInformation:
         """A root (m, k) of the covariance of some variables: columns of R⁻ᵀ, without zero rows."""
         columns = self.layout.indices(keys)
         first = int(columns.min(initial=self.layout.size))
-        right = np.zeros((self.layout.size - first, len(columns)), order="F")
-        right[columns - first, np.arange(len(columns))] = 1.0
-        root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
+        size = self.layout.size - first
+        if 3 * len(columns) > size:  # the inverse of all is cheaper: it leaves zeros out
+            inverse, info = lapack.dtrtri(self.R[first:, first:])
+            root = np.ascontiguousarray(inverse[columns - first]).T
+        else:
+            right = np.zeros((size, len(columns)), order="F")
+            right[columns - first, np.arange(len(columns))] = 1.0
+            root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(root, dtype=np.float64)

@@ -150,10 +150,12 @@ class State:
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-        for values in (self.estimate, self.first):
-            values.insert(X(frame), state.world_T_body)
-            values.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
-            values.insert(B(frame), bias)
+        new = gtsam.Values()  # one by one a bias takes 20 µs to insert
+        new.insert(X(frame), state.world_T_body)
+        new.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
+        new.insert(B(frame), bias)
+        self.estimate.insert(new)
+        self.first.insert(new)
         for key in imu_state_keys(frame):
             self.offsets[key] = np.zeros(dim(key))
 
