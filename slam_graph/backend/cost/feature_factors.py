@@ -42,6 +42,7 @@ from slam_graph.backend.solve.state import POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SummedFeatures:
     """J features over the poses of F frames and C columns of the calibration, summed up.

@@ -24,7 +24,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.backend.cost.feature_tracks import is_in
+from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0
@@ -127,7 +127,7 @@ class StandstillDetector:
 
     def add_dynamic(self, ids: IntArray) -> None:
         """Add features (N,) that were found to be dynamic in another way."""
-        self.dynamic = np.union1d(self.dynamic, ids)
+        self.dynamic = ascending_union(self.dynamic, ids)
 
     def _measure_noise(self, start_ns: int) -> None:
         """Measure the noise of the tracks over the window."""
@@ -202,7 +202,7 @@ class StandstillDetector:
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
             disparity_px = np.linalg.norm(motion, axis=1)
-            self.dynamic = np.union1d(self.dynamic, ids[disparity_px > limit_px])
+            self.dynamic = ascending_union(self.dynamic, ids[disparity_px > limit_px])
 
     def _imu_is_still(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
         """Whether rate and specific force are constant but for noise."""
