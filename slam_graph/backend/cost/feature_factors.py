@@ -34,11 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
@@ -252,3 +253,38 @@ def eliminate_points(
     A, B = stacked.reshape(J, 2 * M, 3), beside.reshape(J, 2 * M, -1)
     triangularize_features(A, B)
     return np.triu(A[:, :3]), B
+
+
+def state_rows(
+    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """The rows of observations of features of the state."""
+    Ab = np.zeros((len(columns), 2, layout.size + 1))
+    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
+    Ab[:, :, -1] = linear.r
+    return Ab.reshape(-1, layout.size + 1)
+
+
+def null_space_rows(
+    linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """What new features say of all else, at most 6 F + C + 1 rows."""
+    Ab = np.zeros((len(linear.rows), layout.size + 1))
+    Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
+    return Ab
+
+
+def new_variable_rows(
+    linear: SummedFeatures,
+    new: IntArray,
+    keys: list[int],
+    columns: NDArray[np.intp],
+    layout: Layout,
+) -> FloatArray:
+    """The three rows that determine each feature (K,) of J that becomes a variable, and its key."""
+    Ab = np.zeros((len(new), POINT_DIM, layout.size + 1))
+    for row, j, key in zip(Ab, new, keys, strict=True):
+        row[:, layout.columns[key]] = linear.R_f[j]
+    Ab[:, :, columns] = linear.T[new]
+    Ab[:, :, -1] = linear.r_1[new]
+    return Ab.reshape(-1, layout.size + 1)

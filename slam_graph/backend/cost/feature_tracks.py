@@ -175,10 +175,11 @@ class FeatureTracks:
     def _group(self) -> None:
         """Find the features, and where the observations of each begin."""
         self._ids, self._frames, self._cameras = self._numbers
-        changes = np.flatnonzero(self._ids[1:] != self._ids[:-1]) + 1
-        self._starts = np.concatenate([[0], changes]) if len(self._ids) else changes
+        begins = np.ones(len(self._ids) + 1, np.bool_)  # the last one is the end
+        np.not_equal(self._ids[1:], self._ids[:-1], out=begins[1:-1])
+        bounds = np.flatnonzero(begins)
+        self._starts, self._counts = bounds[:-1], bounds[1:] - bounds[:-1]
         self._features = self._ids[self._starts]
-        self._counts = np.diff(self._starts, append=len(self._ids))
 
     def __len__(self) -> int:
         """How many observations wait."""
@@ -314,9 +315,8 @@ class FeatureTracks:
         again = self._frames[1:] == self._frames[:-1]  # by the next camera
         again[self._starts[1:] - 1] = False
         seen_again = np.concatenate([[False], again])
-        return self._features, self._counts - np.add.reduceat(
-            seen_again, self._starts, dtype=np.int64
-        )
+        repeated: IntArray = np.add.reduceat(seen_again, self._starts, dtype=np.int64)
+        return self._features, self._counts - repeated
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
         """The waiting observations of some features (ascending ids) in some or all frames."""

@@ -40,6 +40,7 @@ class Layout:
         for key, dim in self.dims.items():
             self.columns[key] = slice(self.size, self.size + dim)
             self.size += dim
+        self._numbers = np.arange(self.size)
 
     def __contains__(self, key: int) -> bool:
         return key in self.dims
@@ -50,7 +51,7 @@ class Layout:
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given."""
-        parts = [np.arange(self.columns[k].start, self.columns[k].stop) for k in keys]
+        parts = [self._numbers[self.columns[k]] for k in keys]
         return np.concatenate(parts) if parts else np.zeros(0, np.intp)
 
 
