@@ -24,30 +24,35 @@ _REGULARISATION = 1e-15
 @compiled()
 def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
     """Make the columns of (m, 3) rows orthonormal; R (3, 3) is what they were multiplied with."""
-    squares, L, before = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    L, before = np.zeros((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             R[a, b] = 1.0 if a == b else 0.0
     for _ in range(2):
+        s00 = s10 = s11 = s20 = s21 = s22 = 0.0
+        for i in range(m):
+            x, y, z = Q[i, 0], Q[i, 1], Q[i, 2]
+            s00 += x * x
+            s10 += y * x
+            s11 += y * y
+            s20 += z * x
+            s21 += z * y
+            s22 += z * z
+        added = _REGULARISATION * (s00 + s11 + s22)
+        L[0, 0] = math.sqrt(s00 + added)
+        L[1, 0], L[2, 0] = s10 / L[0, 0], s20 / L[0, 0]
+        L[1, 1] = math.sqrt(s11 + added - L[1, 0] * L[1, 0])
+        L[2, 1] = (s21 - L[2, 0] * L[1, 0]) / L[1, 1]
+        L[2, 2] = math.sqrt(s22 + added - L[2, 0] * L[2, 0] - L[2, 1] * L[2, 1])
+        i0, i1, i2 = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
+        l10, l20, l21 = L[1, 0], L[2, 0], L[2, 1]
+        for i in range(m):
+            x = Q[i, 0] * i0
+            y = (Q[i, 1] - l10 * x) * i1
+            Q[i, 0], Q[i, 1], Q[i, 2] = x, y, (Q[i, 2] - l20 * x - l21 * y) * i2
         for a in range(3):
             for b in range(3):
-                squares[a, b], before[a, b] = 0.0, R[a, b]
-        for i in range(m):
-            for a in range(3):
-                for b in range(3):
-                    squares[a, b] += Q[i, a] * Q[i, b]
-        added = _REGULARISATION * (squares[0, 0] + squares[1, 1] + squares[2, 2])
-        for a in range(3):
-            for b in range(a + 1):
-                rest = squares[a, b] + (added if a == b else 0.0)
-                for k in range(b):
-                    rest -= L[a, k] * L[b, k]
-                L[a, b] = math.sqrt(rest) if a == b else rest / L[b, b]
-        for i in range(m):
-            for a in range(3):
-                for k in range(a):
-                    Q[i, a] -= L[a, k] * Q[i, k]
-                Q[i, a] /= L[a, a]
+                before[a, b] = R[a, b]
         for a in range(3):
             for b in range(3):
                 R[a, b] = 0.0
@@ -68,12 +73,12 @@ def sum_of_features(
     starts: IntArray,
     R_f: FloatArray,
     T: FloatArray,
-    information: FloatArray,
+    products: FloatArray,
 ) -> None:
-    """Eliminate the positions of J features, and add up what is left.
+    """Eliminate the positions of J features, and add up the products of their rows.
 
-    With H_f = Q R_f by two rounds of Cholesky QR and H = [H_x r], T = Qᵀ H, and the information is
-    Σ Hᵀ H - Tᵀ T.
+    With H_f = Q R_f by two rounds of Cholesky QR and H = [H_x r], T = Qᵀ H. The information is
+    Σ Hᵀ H - Tᵀ T; its second part is one product of matrices, best left to BLAS.
 
     Args:
         r: (N, 2) residuals of the observations, those of one feature after the other.
@@ -84,20 +89,17 @@ def sum_of_features(
         starts: (J + 1,) first observation of each feature, and N.
         R_f: (J, 3, 3), filled: upper triangular.
         T: (J, 3, n + 1), filled; n = 6 F + C, of F poses and the calibration.
-        information: (n + 1, n + 1), filled.
+        products: (n + 1, n + 1), filled: Σ Hᵀ H.
     """
-    width, C = len(information), by_calibration.shape[2]
+    width, C = len(products), by_calibration.shape[2]
     first = width - 1 - C
     for a in range(width):
         for b in range(width):
-            information[a, b] = 0.0
+            products[a, b] = 0.0
     longest = 0
     for j in range(len(T)):
         longest = max(longest, starts[j + 1] - starts[j])
-    Q = np.empty((2 * longest, 3))
-    columns, h = np.empty(7 + C, np.int64), np.empty(7 + C)
-    for k in range(C + 1):
-        columns[6 + k] = first + k
+    Q, others = np.empty((2 * longest, 3)), np.empty(C + 1)
     for j in range(len(T)):
         begin, m = starts[j], 2 * (starts[j + 1] - starts[j])
         for k in range(3):
@@ -108,24 +110,26 @@ def sum_of_features(
         _orthonormalize(Q, m, R_f[j])
         for row in range(m):
             n, i = begin + row // 2, row % 2
-            for k in range(6):
-                columns[k], h[k] = 6 * frame[n] + k, by_pose[n, i, k]
+            pose, h = 6 * frame[n], by_pose[n, i]
             for k in range(C):
-                h[6 + k] = by_calibration[n, i, k]
-            h[6 + C] = r[n, i]
-            for a in range(7 + C):
-                for k in range(3):
-                    T[j, k, columns[a]] += Q[row, k] * h[a]
-                for b in range(a, 7 + C):
-                    information[columns[a], columns[b]] += h[a] * h[b]
-        for a in range(width):
-            t0, t1, t2 = T[j, 0, a], T[j, 1, a], T[j, 2, a]
-            if t0 != 0.0 or t1 != 0.0 or t2 != 0.0:
-                for b in range(a, width):
-                    information[a, b] -= t0 * T[j, 0, b] + t1 * T[j, 1, b] + t2 * T[j, 2, b]
+                others[k] = by_calibration[n, i, k]
+            others[C] = r[n, i]
+            for k in range(3):
+                for a in range(6):
+                    T[j, k, pose + a] += Q[row, k] * h[a]
+                for a in range(C + 1):
+                    T[j, k, first + a] += Q[row, k] * others[a]
+            for a in range(6):
+                for b in range(6):
+                    products[pose + a, pose + b] += h[a] * h[b]
+                for b in range(C + 1):
+                    products[pose + a, first + b] += h[a] * others[b]
+            for a in range(C + 1):
+                for b in range(C + 1):
+                    products[first + a, first + b] += others[a] * others[b]
     for a in range(width):
-        for b in range(a):
-            information[a, b] = information[b, a]
+        for b in range(first, width):
+            products[b, a] = products[a, b]
 
 
 def sum_of_features_numpy(
@@ -137,21 +141,21 @@ def sum_of_features_numpy(
     starts: IntArray,
     R_f: FloatArray,
     T: FloatArray,
-    information: FloatArray,
+    products: FloatArray,
 ) -> None:
     """`sum_of_features` in NumPy, feature by feature."""
-    first = len(information) - 1 - by_calibration.shape[2]
-    information[:] = 0.0
+    first = len(products) - 1 - by_calibration.shape[2]
+    products[:] = 0.0
     for j in range(len(T)):
         rows = slice(starts[j], starts[j + 1])
-        H = np.zeros((2 * (starts[j + 1] - starts[j]), len(information)))
+        H = np.zeros((2 * (starts[j + 1] - starts[j]), len(products)))
         for k, i in enumerate(frame[rows]):
             H[2 * k : 2 * k + 2, 6 * i : 6 * i + 6] = by_pose[rows][k]
         H[:, first:-1] = by_calibration[rows].reshape(len(H), -1)
         H[:, -1] = r[rows].ravel()
         Q, R_f[j] = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
         T[j] = Q.T @ H
-        information += H.T @ H - T[j].T @ T[j]
+        products += H.T @ H
 
 
 def _orthonormalize_numpy(Q: FloatArray) -> tuple[FloatArray, FloatArray]:

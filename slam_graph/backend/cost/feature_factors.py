@@ -85,6 +85,8 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
     R_f, T, information = np.empty((J, 3, 3)), np.empty((J, 3, width)), np.empty((width, width))
     parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
     sum_of_features(*parts, obs.frame, obs.starts, R_f, T, information)
+    stacked = T.reshape(-1, width)
+    information -= stacked.T @ stacked
     if not np.all(np.isfinite(information)):
         raise np.linalg.LinAlgError("a feature is not determined by its observations")
     return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
