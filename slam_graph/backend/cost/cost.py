@@ -58,6 +58,8 @@ class TrackFeatures:
 
     def subset(self, keep: BoolArray) -> TrackFeatures:
         """The features where `keep` (J,) holds."""
+        if keep.all():
+            return self
         return TrackFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
 
 

@@ -121,7 +121,8 @@ class State:
 
     Attributes:
         first: linearisation point of every variable.
-        offsets: tangent (dim,) of every variable at its linearisation point.
+        offsets: tangent (dim,) of every variable at its linearisation point; replaced by others
+            and never changed, so that copies of the state share them.
         estimate: current values, first ⊕ offsets.
         frozen: keys whose linearisation point no longer moves.
         motions: of each frame with a pose, where a time offset is estimated or a shutter rolls.
@@ -143,7 +144,7 @@ class State:
     def assign(self, other: State) -> None:
         """Take over all values of another state."""
         self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
-        self.offsets = {key: offset.copy() for key, offset in other.offsets.items()}
+        self.offsets = dict(other.offsets)
         self.frozen = set(other.frozen)
         self.motions = dict(other.motions)
 
@@ -192,7 +193,7 @@ class State:
         for key, offset in self.offsets.items():
             if key not in self.frozen and offset.any():
                 _copy(self.estimate, moved, key)
-                offset[:] = 0.0
+                self.offsets[key] = np.zeros(len(offset))
         if moved.size():
             self.first.update(moved)
 
@@ -247,13 +248,15 @@ def _copy(source: gtsam.Values, target: gtsam.Values, key: int) -> None:
 
 def stacked_poses(values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
     """Rotations (F, 3, 3) and positions (F, 3) of the poses of some frames."""
-    matrices = np.array([values.atPose3(X(i)).matrix() for i in frames]).reshape(-1, 4, 4)
+    none = np.zeros((0, 4))
+    matrices = np.concatenate([none, *(values.atPose3(X(i)).matrix() for i in frames)])
+    matrices = matrices.reshape(-1, 4, 4)
     return matrices[:, :3, :3], matrices[:, :3, 3]
 
 
 def stacked_points(values: gtsam.Values, features: Iterable[int]) -> FloatArray:
     """Positions (J, 3) of some features."""
-    return np.array([values.atPoint3(L(j)) for j in features]).reshape(-1, 3)
+    return np.concatenate([np.zeros(0), *(values.atPoint3(L(j)) for j in features)]).reshape(-1, 3)
 
 
 def landmark_keys(ids: IntArray) -> list[int]:
