@@ -10,7 +10,7 @@ from slam_graph.backend.cost.adaptive_imu_noise import (
     ACCEL_SCALE_SIGMA,
     GYRO_SCALE_SIGMA,
     RESPONSE_TIME_S,
-    DensityScale,
+    DensityScales,
     DynamicsNoise,
     MotionChange,
 )
@@ -29,11 +29,11 @@ COVARIANCE = np.array([[2.0, 0.4, 0.0], [0.4, 1.0, -0.3], [0.0, -0.3, 0.5]])
 
 def factors(corrections: np.ndarray, fall_time_s: float = RESPONSE_TIME_S) -> np.ndarray:
     """The factor after each of some corrections (N, 3), whose covariance is said to be as above."""
-    scale = DensityScale(fall_time_s)
+    scale = DensityScales([fall_time_s])
     history = []
     for correction in corrections:
-        scale.observe(correction, COVARIANCE, DT_S)
-        history.append(scale.factor)
+        scale.observe(correction[None], COVARIANCE[None], DT_S)
+        history.append(float(scale.factors[0]))
     return np.array(history)
 
 

@@ -12,7 +12,7 @@ from slam_graph.backend.backend_config import BackendConfig, NoiseConfig
 from slam_graph.backend.cost import pixel_noise
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.pixel_noise import BLOCK, BlockMeans, PixelNoise, ProjectedTracks
+from slam_graph.backend.cost.pixel_noise import BLOCK, BlockMeans, PixelNoise, block_means
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
@@ -60,8 +60,7 @@ def dense(
 def test_block_means_are_those_of_the_definition(tracks: Tracks) -> None:
     obs, _, H = tracks
     e = np.random.default_rng(1).normal(size=(len(obs), 2))
-    for camera in range(CAMERAS):
-        found = ProjectedTracks.of(obs, e, H).block_means(camera)
+    for camera, found in enumerate(block_means(obs, e, H, CAMERAS)):
         sums = [dense(obs, e, H, j, camera) for j in range(len(obs.ids))]
         sums = [(s, S) for s, S in sums if len(S)]
         trace = np.array([np.trace(S) for _, S in sums])
@@ -76,7 +75,7 @@ def test_white_noise_has_a_winsorised_mean_of_one_and_these_degrees_of_freedom(
     obs, _, H = tracks
     rng = np.random.default_rng(2)
     noise = (rng.normal(size=(len(obs), 2)) for _ in range(100))
-    draws = [ProjectedTracks.of(obs, e, H).block_means(0) for e in noise]
+    draws = [block_means(obs, e, H, CAMERAS)[0] for e in noise]
     squares = np.array([draw.squares for draw in draws])
     assert squares.size > 5000
     dof = draws[0].dof
@@ -102,7 +101,7 @@ def test_errors_that_last_count_for_more_than_their_size(tracks: Tracks) -> None
         if key in last:
             e[row] = memory * last[key] + np.sqrt(1.0 - memory**2) * e[row]
         last[key] = e[row]
-    found = ProjectedTracks.of(obs, e, H).block_means(0)
+    found = block_means(obs, e, H, CAMERAS)[0]
     assert np.average(found.squares, weights=found.dof) > 2.0
 
 

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What many features say of the poses together, by the Schur complement of their positions."""
+"""Sums over the observations of features whose positions are eliminated.
+
+What many features say of the poses together, by the Schur complement of their positions; and the
+means of their residuals over blocks, as the noise of the pixels is read from them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["sum_of_features", "sum_of_features_numpy"]
+__all__ = ["block_sums", "block_sums_numpy", "sum_of_features", "sum_of_features_numpy"]
 
 _REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
@@ -20,30 +24,35 @@ _REGULARISATION = 1e-15
 @compiled()
 def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
     """Make the columns of (m, 3) rows orthonormal; R (3, 3) is what they were multiplied with."""
-    squares, L, before = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    L, before = np.zeros((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             R[a, b] = 1.0 if a == b else 0.0
     for _ in range(2):
+        s00 = s10 = s11 = s20 = s21 = s22 = 0.0
+        for i in range(m):
+            x, y, z = Q[i, 0], Q[i, 1], Q[i, 2]
+            s00 += x * x
+            s10 += y * x
+            s11 += y * y
+            s20 += z * x
+            s21 += z * y
+            s22 += z * z
+        added = _REGULARISATION * (s00 + s11 + s22)
+        L[0, 0] = math.sqrt(s00 + added)
+        L[1, 0], L[2, 0] = s10 / L[0, 0], s20 / L[0, 0]
+        L[1, 1] = math.sqrt(s11 + added - L[1, 0] * L[1, 0])
+        L[2, 1] = (s21 - L[2, 0] * L[1, 0]) / L[1, 1]
+        L[2, 2] = math.sqrt(s22 + added - L[2, 0] * L[2, 0] - L[2, 1] * L[2, 1])
+        i0, i1, i2 = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
+        l10, l20, l21 = L[1, 0], L[2, 0], L[2, 1]
+        for i in range(m):
+            x = Q[i, 0] * i0
+            y = (Q[i, 1] - l10 * x) * i1
+            Q[i, 0], Q[i, 1], Q[i, 2] = x, y, (Q[i, 2] - l20 * x - l21 * y) * i2
         for a in range(3):
             for b in range(3):
-                squares[a, b], before[a, b] = 0.0, R[a, b]
-        for i in range(m):
-            for a in range(3):
-                for b in range(3):
-                    squares[a, b] += Q[i, a] * Q[i, b]
-        added = _REGULARISATION * (squares[0, 0] + squares[1, 1] + squares[2, 2])
-        for a in range(3):
-            for b in range(a + 1):
-                rest = squares[a, b] + (added if a == b else 0.0)
-                for k in range(b):
-                    rest -= L[a, k] * L[b, k]
-                L[a, b] = math.sqrt(rest) if a == b else rest / L[b, b]
-        for i in range(m):
-            for a in range(3):
-                for k in range(a):
-                    Q[i, a] -= L[a, k] * Q[i, k]
-                Q[i, a] /= L[a, a]
+                before[a, b] = R[a, b]
         for a in range(3):
             for b in range(3):
                 R[a, b] = 0.0
@@ -64,12 +73,12 @@ def sum_of_features(
     starts: IntArray,
     R_f: FloatArray,
     T: FloatArray,
-    information: FloatArray,
+    products: FloatArray,
 ) -> None:
-    """Eliminate the positions of J features, and add up what is left.
+    """Eliminate the positions of J features, and add up the products of their rows.
 
-    With H_f = Q R_f by two rounds of Cholesky QR and H = [H_x r], T = Qᵀ H, and the information is
-    Σ Hᵀ H - Tᵀ T.
+    With H_f = Q R_f by two rounds of Cholesky QR and H = [H_x r], T = Qᵀ H. The information is
+    Σ Hᵀ H - Tᵀ T; its second part is one product of matrices, best left to BLAS.
 
     Args:
         r: (N, 2) residuals of the observations, those of one feature after the other.
@@ -80,20 +89,17 @@ def sum_of_features(
         starts: (J + 1,) first observation of each feature, and N.
         R_f: (J, 3, 3), filled: upper triangular.
         T: (J, 3, n + 1), filled; n = 6 F + C, of F poses and the calibration.
-        information: (n + 1, n + 1), filled.
+        products: (n + 1, n + 1), filled: Σ Hᵀ H.
     """
-    width, C = len(information), by_calibration.shape[2]
+    width, C = len(products), by_calibration.shape[2]
     first = width - 1 - C
     for a in range(width):
         for b in range(width):
-            information[a, b] = 0.0
+            products[a, b] = 0.0
     longest = 0
     for j in range(len(T)):
         longest = max(longest, starts[j + 1] - starts[j])
-    Q = np.empty((2 * longest, 3))
-    columns, h = np.empty(7 + C, np.int64), np.empty(7 + C)
-    for k in range(C + 1):
-        columns[6 + k] = first + k
+    Q, others = np.empty((2 * longest, 3)), np.empty(C + 1)
     for j in range(len(T)):
         begin, m = starts[j], 2 * (starts[j + 1] - starts[j])
         for k in range(3):
@@ -104,24 +110,26 @@ def sum_of_features(
         _orthonormalize(Q, m, R_f[j])
         for row in range(m):
             n, i = begin + row // 2, row % 2
-            for k in range(6):
-                columns[k], h[k] = 6 * frame[n] + k, by_pose[n, i, k]
+            pose, h = 6 * frame[n], by_pose[n, i]
             for k in range(C):
-                h[6 + k] = by_calibration[n, i, k]
-            h[6 + C] = r[n, i]
-            for a in range(7 + C):
-                for k in range(3):
-                    T[j, k, columns[a]] += Q[row, k] * h[a]
-                for b in range(a, 7 + C):
-                    information[columns[a], columns[b]] += h[a] * h[b]
-        for a in range(width):
-            t0, t1, t2 = T[j, 0, a], T[j, 1, a], T[j, 2, a]
-            if t0 != 0.0 or t1 != 0.0 or t2 != 0.0:
-                for b in range(a, width):
-                    information[a, b] -= t0 * T[j, 0, b] + t1 * T[j, 1, b] + t2 * T[j, 2, b]
+                others[k] = by_calibration[n, i, k]
+            others[C] = r[n, i]
+            for k in range(3):
+                for a in range(6):
+                    T[j, k, pose + a] += Q[row, k] * h[a]
+                for a in range(C + 1):
+                    T[j, k, first + a] += Q[row, k] * others[a]
+            for a in range(6):
+                for b in range(6):
+                    products[pose + a, pose + b] += h[a] * h[b]
+                for b in range(C + 1):
+                    products[pose + a, first + b] += h[a] * others[b]
+            for a in range(C + 1):
+                for b in range(C + 1):
+                    products[first + a, first + b] += others[a] * others[b]
     for a in range(width):
-        for b in range(a):
-            information[a, b] = information[b, a]
+        for b in range(first, width):
+            products[b, a] = products[a, b]
 
 
 def sum_of_features_numpy(
@@ -133,22 +141,122 @@ def sum_of_features_numpy(
     starts: IntArray,
     R_f: FloatArray,
     T: FloatArray,
-    information: FloatArray,
+    products: FloatArray,
 ) -> None:
     """`sum_of_features` in NumPy, feature by feature."""
-    first = len(information) - 1 - by_calibration.shape[2]
-    information[:] = 0.0
+    first = len(products) - 1 - by_calibration.shape[2]
+    products[:] = 0.0
     for j in range(len(T)):
         rows = slice(starts[j], starts[j + 1])
-        H = np.zeros((2 * (starts[j + 1] - starts[j]), len(information)))
+        H = np.zeros((2 * (starts[j + 1] - starts[j]), len(products)))
         for k, i in enumerate(frame[rows]):
             H[2 * k : 2 * k + 2, 6 * i : 6 * i + 6] = by_pose[rows][k]
         H[:, first:-1] = by_calibration[rows].reshape(len(H), -1)
         H[:, -1] = r[rows].ravel()
-        Q, R = by_point[rows].reshape(-1, 3), np.eye(3)
-        for _ in range(2):
-            squares = Q.T @ Q
-            root = np.linalg.cholesky(squares + _REGULARISATION * np.trace(squares) * np.eye(3)).T
-            Q, R = Q @ np.linalg.inv(root), root @ R
-        R_f[j], T[j] = R, Q.T @ H
-        information += H.T @ H - T[j].T @ T[j]
+        Q, R_f[j] = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
+        T[j] = Q.T @ H
+        products += H.T @ H
+
+
+def _orthonormalize_numpy(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    R = np.eye(3)
+    for _ in range(2):
+        squares = Q.T @ Q
+        root = np.linalg.cholesky(squares + _REGULARISATION * np.trace(squares) * np.eye(3)).T
+        Q, R = Q @ np.linalg.inv(root), root @ R
+    return Q, R
+
+
+@compiled("void(f8[:, ::1], f8[:, :, ::1], i8[:], i8[::1], i8, f8[:, :, ::1])")
+def block_sums(
+    r: FloatArray,
+    by_point: FloatArray,
+    camera: IntArray,
+    starts: IntArray,
+    block: int,
+    sums: FloatArray,
+) -> None:
+    """How large the means of residuals are over blocks of consecutive observations of a camera.
+
+    With the whitened residuals e = P ε of a track, P = I - Q Qᵀ the projection off the directions
+    H_f = Q R_f of its point, the rows B that average over its blocks in one camera, and
+    S = B P Bᵀ.
+
+    Args:
+        r: (N, 2) residuals of the observations, those of one feature after the other.
+        by_point: (N, 2, 3) their derivatives by the position of the feature.
+        camera: (N,) camera of each observation.
+        starts: (J + 1,) first observation of each feature, and N.
+        block: observations in a block; those that fill none are left out.
+        sums: (3, J, C), filled: ‖B e‖², tr(S) and tr(S²) of each feature in each camera; NaN where
+            the observations of a feature do not determine its position.
+    """
+    longest = 0
+    for j in range(len(starts) - 1):
+        longest = max(longest, starts[j + 1] - starts[j])
+    Q, R, e = np.empty((2 * longest, 3)), np.empty((3, 3)), np.empty(2 * longest)
+    along, gram, mean = np.empty(3), np.empty((3, 3)), np.empty((2, 4))
+    for j in range(len(starts) - 1):
+        begin, count = starts[j], starts[j + 1] - starts[j]
+        for row in range(2 * count):
+            for k in range(3):
+                Q[row, k] = by_point[begin + row // 2, row % 2, k]
+        _orthonormalize(Q, 2 * count, R)
+        for k in range(3):
+            along[k] = 0.0
+            for row in range(2 * count):
+                along[k] += Q[row, k] * r[begin + row // 2, row % 2]
+        for row in range(2 * count):
+            e[row] = r[begin + row // 2, row % 2]
+            for k in range(3):
+                e[row] -= Q[row, k] * along[k]
+        for c in range(sums.shape[2]):
+            blocks, filled, square = 0, 0, 0.0
+            mean[:], gram[:] = 0.0, 0.0  # gram is (B Q)ᵀ B Q
+            for n in range(count):
+                if camera[begin + n] != c:
+                    continue
+                for i in range(2):
+                    mean[i, 3] += e[2 * n + i] / block
+                    for k in range(3):
+                        mean[i, k] += Q[2 * n + i, k] / block
+                filled += 1
+                if filled == block:
+                    for i in range(2):
+                        square += mean[i, 3] * mean[i, 3]
+                        for k in range(3):
+                            for m in range(3):
+                                gram[k, m] += mean[i, k] * mean[i, m]
+                    mean[:], filled, blocks = 0.0, 0, blocks + 1
+            # S = I / block - B Q (B Q)ᵀ, with two rows for each block
+            trace, squares = gram[0, 0] + gram[1, 1] + gram[2, 2], 0.0
+            for k in range(3):
+                for m in range(3):
+                    squares += gram[k, m] * gram[k, m]
+            sums[0, j, c] = square
+            sums[1, j, c] = 2.0 * blocks / block - trace
+            sums[2, j, c] = (2.0 * blocks / block - 2.0 * trace) / block + squares
+
+
+def block_sums_numpy(
+    r: FloatArray,
+    by_point: FloatArray,
+    camera: IntArray,
+    starts: IntArray,
+    block: int,
+    sums: FloatArray,
+) -> None:
+    """`block_sums` in NumPy, by the definition."""
+    for j in range(len(starts) - 1):
+        rows = slice(starts[j], starts[j + 1])
+        Q, _ = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
+        P = np.eye(len(Q)) - Q @ Q.T
+        for c in range(sums.shape[2]):
+            seen = np.flatnonzero(camera[rows] == c)
+            seen = seen[: len(seen) // block * block]
+            averages = np.zeros((len(seen) // block, len(camera[rows])))
+            averages[np.arange(len(seen)) // block, seen] = 1.0 / block
+            B = np.kron(averages, np.eye(2))
+            S = B @ P @ B.T
+            means = B @ P @ r[rows].ravel()
+            sums[:, j, c] = means @ means, np.trace(S), np.sum(S**2)

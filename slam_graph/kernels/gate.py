@@ -128,18 +128,25 @@ def track_distances(
             rest[row, 0] = r[n, i]
             for k in range(3):
                 rest[row, 1 + k] = by_point[n, i, k]
+            P, h = covariance[6 * frame[n] : 6 * frame[n] + 6], by_pose[n, i]
             for column in range(size):
-                HP[column] = 0.0
-            for k in range(6 + C):
-                h = by_pose[n, i, k] if k < 6 else by_calibration[n, i, k - 6]
-                state = 6 * frame[n] + k if k < 6 else first + k - 6
+                HP[column] = (
+                    (h[0] * P[0, column] + h[1] * P[1, column])
+                    + (h[2] * P[2, column] + h[3] * P[3, column])
+                    + (h[4] * P[4, column] + h[5] * P[5, column])
+                )
+            for k in range(C):
                 for column in range(size):
-                    HP[column] += h * covariance[state, column]
+                    HP[column] += by_calibration[n, i, k] * covariance[first + k, column]
             for other in range(row, m):
                 o, i_o = begin + other // 2, other % 2
+                pose, h = 6 * frame[o], by_pose[o, i_o]
                 value = 1.0 if other == row else 0.0
-                for k in range(6):
-                    value += HP[6 * frame[o] + k] * by_pose[o, i_o, k]
+                value += (  # in pairs, which do not wait for each other
+                    (HP[pose] * h[0] + HP[pose + 1] * h[1])
+                    + (HP[pose + 2] * h[2] + HP[pose + 3] * h[3])
+                    + (HP[pose + 4] * h[4] + HP[pose + 5] * h[5])
+                )
                 for k in range(C):
                     value += HP[first + k] * by_calibration[o, i_o, k]
                 S[row, other] = value

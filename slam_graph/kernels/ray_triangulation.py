@@ -77,34 +77,39 @@ def _normal_equations(
     rhs: FloatArray,
 ) -> float:
     """Squared error, JᵀJ (3, 3) and Jᵀr (3,) of one feature at x (3,)."""
-    for i in range(3):
-        rhs[i] = 0.0
-        for k in range(3):
-            lhs[i, k] = 0.0
-    error = 0.0
-    J, r, p = np.empty((2, 3)), np.empty(2), np.empty(3)
+    l00 = l10 = l11 = l20 = l21 = l22 = 0.0
+    b0 = b1 = b2 = error = 0.0
     for n in range(first, last):
-        for i in range(3):
-            p[i] = R[n, i, 0] * x[0] + R[n, i, 1] * x[1] + R[n, i, 2] + x[2] * t[n, i]
-        z = max(p[2], _NEAREST)
-        for i in range(2):
-            m = p[i] / z
-            r[i] = normalized[n, i] - m
-            J[i, 0] = (R[n, i, 0] - m * R[n, 2, 0]) / z
-            J[i, 1] = (R[n, i, 1] - m * R[n, 2, 1]) / z
-            J[i, 2] = (t[n, i] - m * t[n, 2]) / z
+        A, d = R[n], t[n]
+        z = A[2, 0] * x[0] + A[2, 1] * x[1] + A[2, 2] + x[2] * d[2]
+        inverse = 1.0 / max(z, _NEAREST)
+        u = (A[0, 0] * x[0] + A[0, 1] * x[1] + A[0, 2] + x[2] * d[0]) * inverse
+        v = (A[1, 0] * x[0] + A[1, 1] * x[1] + A[1, 2] + x[2] * d[1]) * inverse
+        r, s = normalized[n, 0] - u, normalized[n, 1] - v
+        u0, v0 = (A[0, 0] - u * A[2, 0]) * inverse, (A[1, 0] - v * A[2, 0]) * inverse
+        u1, v1 = (A[0, 1] - u * A[2, 1]) * inverse, (A[1, 1] - v * A[2, 1]) * inverse
+        u2, v2 = (d[0] - u * d[2]) * inverse, (d[1] - v * d[2]) * inverse
         if len(weights):
             w = weights[n]
-            for k in range(3):
-                a, b = J[0, k], J[1, k]
-                J[0, k], J[1, k] = w[0, 0] * a + w[0, 1] * b, w[1, 0] * a + w[1, 1] * b
-            a, b = r[0], r[1]
-            r[0], r[1] = w[0, 0] * a + w[0, 1] * b, w[1, 0] * a + w[1, 1] * b
-        error += r[0] * r[0] + r[1] * r[1]
-        for i in range(3):
-            rhs[i] += J[0, i] * r[0] + J[1, i] * r[1]
-            for k in range(3):
-                lhs[i, k] += J[0, i] * J[0, k] + J[1, i] * J[1, k]
+            r, s = w[0, 0] * r + w[0, 1] * s, w[1, 0] * r + w[1, 1] * s
+            u0, v0 = w[0, 0] * u0 + w[0, 1] * v0, w[1, 0] * u0 + w[1, 1] * v0
+            u1, v1 = w[0, 0] * u1 + w[0, 1] * v1, w[1, 0] * u1 + w[1, 1] * v1
+            u2, v2 = w[0, 0] * u2 + w[0, 1] * v2, w[1, 0] * u2 + w[1, 1] * v2
+        error += r * r + s * s
+        b0 += u0 * r + v0 * s
+        b1 += u1 * r + v1 * s
+        b2 += u2 * r + v2 * s
+        l00 += u0 * u0 + v0 * v0
+        l10 += u1 * u0 + v1 * v0
+        l11 += u1 * u1 + v1 * v1
+        l20 += u2 * u0 + v2 * v0
+        l21 += u2 * u1 + v2 * v1
+        l22 += u2 * u2 + v2 * v2
+    rhs[0], rhs[1], rhs[2] = b0, b1, b2
+    lhs[0, 0], lhs[1, 1], lhs[2, 2] = l00, l11, l22
+    lhs[0, 1] = lhs[1, 0] = l10
+    lhs[0, 2] = lhs[2, 0] = l20
+    lhs[1, 2] = lhs[2, 1] = l21
     return error
 
 

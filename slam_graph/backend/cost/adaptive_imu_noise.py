@@ -25,6 +25,7 @@ motion does, and their random walks are larger there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -64,9 +65,10 @@ MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0
 """Mean squares are clipped here, which limits how fast the noise grows."""
-_ROTATION, _VELOCITY = slice(0, 3), slice(6, 9)
-_ACCEL_BIAS, _GYRO_BIAS = slice(9, 12), slice(12, 15)
-"""Rows of a state's covariance."""
+_GYRO, _ACCEL, _GYRO_WALK, _ACCEL_WALK = range(4)
+"""The densities."""
+_CORRECTED = slice(0, 3), slice(6, 9), slice(12, 15), slice(9, 12)
+"""Rows of a state's covariance whose corrections tell of each: rotation, velocity, biases."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +90,10 @@ class MotionChange:
         if before is None:
             return MotionChange()
         root_s = math.sqrt(float(samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9)
-        earlier, later = before.gyro.mean(axis=0), samples.gyro.mean(axis=0)
-        rate = np.linalg.norm(np.linalg.norm(later) * later - np.linalg.norm(earlier) * earlier)
-        force = np.linalg.norm(samples.accel.mean(axis=0) - before.accel.mean(axis=0))
-        return MotionChange(float(rate) / root_s, float(force) / root_s)
+        earlier, later = _mean(before.gyro), _mean(samples.gyro)
+        rate = _length(_length(later) * later - _length(earlier) * earlier)
+        force = _length(_mean(samples.accel) - _mean(before.accel))
+        return MotionChange(rate / root_s, force / root_s)
 
     def added_to(self, imu: ImuNoise) -> ImuNoise:
         """Noise whose random walks have errors of scale and alignment in them."""
@@ -105,47 +107,58 @@ class MotionChange:
 _STEADY = MotionChange()
 
 
-class DensityScale:
-    """The factor on one density of one sensor.
+def _mean(values: FloatArray) -> FloatArray:
+    """The mean (3,) of samples (N, 3); NumPy's takes twice as long."""
+    return np.asarray(np.add.reduce(values) / len(values))
+
+
+def _length(vector: FloatArray) -> float:
+    """The length of a vector (3,)."""
+    return math.sqrt(vector @ vector)
+
+
+class DensityScales:
+    """The factors on K densities, each of one sensor.
 
     Attributes:
-        factor: on the noise density, at least one.
-        fall_time_s: takes the place of `RESPONSE_TIME_S` while the factor falls.
+        factors: (K,) on the noise densities, at least one.
+        fall_times_s: (K,) take the place of `RESPONSE_TIME_S` while a factor falls.
     """
 
-    def __init__(self, fall_time_s: float = RESPONSE_TIME_S) -> None:
-        """Begin with the calibrated density.
+    def __init__(self, fall_times_s: Sequence[float]) -> None:
+        """Begin with the calibrated densities.
 
         Args:
-            fall_time_s: see the class.
+            fall_times_s: K of them; see the class.
         """
-        self.fall_time_s = fall_time_s
-        self._direction = np.zeros(3)
-        self._size = 1.0
-        self.factor = 1.0
+        self.fall_times_s = np.array(fall_times_s)
+        self._directions = np.zeros((len(fall_times_s), 3))
+        self._sizes, self.factors = np.ones((2, len(fall_times_s)))
 
-    def observe(self, correction: FloatArray, covariance: FloatArray, dt_s: float) -> None:
-        """Update the factor by the correction of one step.
+    def observe(self, corrections: FloatArray, covariances: FloatArray, dt_s: float) -> None:
+        """Update the factors by the corrections of one step.
 
         Args:
-            correction: (3,) of the predicted quantity, in the body frame or in the world.
-            covariance: (3, 3) that it has if the densities are right, in the same frame.
+            corrections: (K, 3) of the predicted quantities, each in the body frame or in the world.
+            covariances: (K, 3, 3) that they have if the densities are right, in the same frames.
             dt_s: time since the step before.
         """
-        variances, axes = np.linalg.eigh(covariance)
-        if not variances[0] > 0.0:  # no information in some direction
-            return
+        variances, axes = np.linalg.eigh(covariances)
+        known = variances[:, 0] > 0.0  # otherwise there is no information in some direction
+        roots = np.sqrt(np.where(known[:, None], variances, 1.0))
         # whitened by the symmetric root, which keeps the axes, so that directions can be compared
-        white = axes @ (axes.T @ correction / np.sqrt(variances))
-        memory = np.exp(-dt_s / PERSISTENCE_TIME_S)
-        self._direction = memory * self._direction + np.sqrt(1.0 - memory**2) * white
-        memory = np.exp(-dt_s / SIZE_TIME_S)
-        self._size = memory * self._size + (1.0 - memory) * float(white @ white) / 3.0
-        persistence = float(self._direction @ self._direction) / 3.0
-        surprise = min(persistence, self._size, _MAX_SQUARE) - 1.0
-        response_s = RESPONSE_TIME_S if surprise > 0.0 else self.fall_time_s
-        factor = self.factor * np.exp(0.5 * surprise * dt_s / response_s)
-        self.factor = float(np.clip(factor, 1.0, MAX_FACTOR))
+        along = (corrections[:, None] @ axes)[:, 0] / roots
+        white = (axes @ along[:, :, None])[:, :, 0]
+        memory = math.exp(-dt_s / PERSISTENCE_TIME_S)
+        directions = memory * self._directions + math.sqrt(1.0 - memory**2) * white
+        memory = math.exp(-dt_s / SIZE_TIME_S)
+        sizes = memory * self._sizes + (1.0 - memory) * np.sum(white * white, axis=1) / 3.0
+        persistence = np.sum(directions * directions, axis=1) / 3.0
+        surprise = np.minimum(np.minimum(persistence, sizes), _MAX_SQUARE) - 1.0
+        responses_s = np.where(surprise > 0.0, RESPONSE_TIME_S, self.fall_times_s)
+        factors = self.factors * np.exp(0.5 * surprise * dt_s / responses_s)
+        self._directions[known], self._sizes[known] = directions[known], sizes[known]
+        self.factors[known] = np.minimum(np.maximum(factors, 1.0), MAX_FACTOR)[known]
 
 
 class DynamicsNoise:
@@ -158,10 +171,8 @@ class DynamicsNoise:
     def __init__(self, imu: ImuNoise, config: NoiseConfig) -> None:
         self._imu = imu
         self._config = config
-        self._gyro = DensityScale()
-        self._accel = DensityScale()
-        self._gyro_walk = DensityScale(_SLOW_FALL_TIME_S)
-        self._accel_walk = DensityScale(_SLOW_FALL_TIME_S)
+        slow = _SLOW_FALL_TIME_S
+        self._scales = DensityScales([RESPONSE_TIME_S, RESPONSE_TIME_S, slow, slow])
         self.vibrates = False
 
     def params(
@@ -175,10 +186,11 @@ class DynamicsNoise:
             change: of the motion since the interval before.
         """
         scale *= self._config.imu_scale
+        factors = self._scales.factors
         imu = replace(
             self._imu,
-            gyro_random_walk=self._imu.gyro_random_walk * self._gyro_walk.factor,
-            accel_random_walk=self._imu.accel_random_walk * self._accel_walk.factor,
+            gyro_random_walk=self._imu.gyro_random_walk * float(factors[_GYRO_WALK]),
+            accel_random_walk=self._imu.accel_random_walk * float(factors[_ACCEL_WALK]),
         )
         if self._config.adaptive.enabled:
             imu = change.added_to(imu)
@@ -188,7 +200,8 @@ class DynamicsNoise:
     @property
     def factors(self) -> tuple[float, float]:
         """Factors on the white noise densities of gyroscope and accelerometer, at least one."""
-        return self._gyro.factor, self._accel.factor
+        factors = self._scales.factors
+        return float(factors[_GYRO]), float(factors[_ACCEL])
 
     def watch_vibration(self, imu: ImuBuffer, stamp_ns: int) -> None:
         """Raise the noise of the accelerometer at once when the IMU begins to vibrate.
@@ -200,9 +213,10 @@ class DynamicsNoise:
         if not self._config.adaptive.enabled:
             return
         vibrated, self.vibrates = self.vibrates, self._is_vibrating(imu, stamp_ns)
-        self._accel.fall_time_s = _SLOW_FALL_TIME_S if self.vibrates else RESPONSE_TIME_S
+        scales = self._scales
+        scales.fall_times_s[_ACCEL] = _SLOW_FALL_TIME_S if self.vibrates else RESPONSE_TIME_S
         if self.vibrates and not vibrated:
-            self._accel.factor = max(self._accel.factor, _VIBRATING_ACCEL)
+            scales.factors[_ACCEL] = max(scales.factors[_ACCEL], _VIBRATING_ACCEL)
 
     def _is_vibrating(self, imu: ImuBuffer, stamp_ns: int) -> bool:
         """Whether the samples of the accelerometer are much noisier than calibrated.
@@ -233,11 +247,11 @@ class DynamicsNoise:
         assert corrected.covariance is not None
         gained = predicted.covariance - corrected.covariance
         before, after = predicted.world_T_body.rotation(), corrected.world_T_body.rotation()
-        rotation = gtsam.Rot3.Logmap(before.between(after))
-        self._gyro.observe(rotation, gained[_ROTATION, _ROTATION], dt_s)
-        velocity = corrected.velocity - predicted.velocity
-        self._accel.observe(velocity, gained[_VELOCITY, _VELOCITY], dt_s)
-        accel_bias = corrected.accel_bias - predicted.accel_bias
-        self._accel_walk.observe(accel_bias, gained[_ACCEL_BIAS, _ACCEL_BIAS], dt_s)
-        gyro_bias = corrected.gyro_bias - predicted.gyro_bias
-        self._gyro_walk.observe(gyro_bias, gained[_GYRO_BIAS, _GYRO_BIAS], dt_s)
+        corrections = (
+            gtsam.Rot3.Logmap(before.between(after)),
+            corrected.velocity - predicted.velocity,
+            corrected.gyro_bias - predicted.gyro_bias,
+            corrected.accel_bias - predicted.accel_bias,
+        )
+        covariances = np.array([gained[rows, rows] for rows in _CORRECTED])
+        self._scales.observe(np.array(corrections), covariances, dt_s)

@@ -26,7 +26,9 @@ from slam_graph.backend.cost.feature_tracks import (
     Observations,
     Outcome,
     Removals,
+    ascending_union,
     is_in,
+    sorted_unique,
 )
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pixel_noise import PixelNoise
@@ -140,7 +142,8 @@ class CostConstruction:
             return self._constructed(window, cost, poses, window.state_features, removals)
         poses = self._selected_poses(window)
         predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
-        in_state = np.intersect1d(window.state_features, window.tracks.ids_waiting(), True)
+        waiting = window.tracks.ids_waiting()
+        in_state = window.state_features[is_in(window.state_features, waiting)]
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
             window, poses, len(in_state), self._dynamic, removals
@@ -150,9 +153,7 @@ class CostConstruction:
         if not self._features.relinearized:
             # a pose that no waiting observation refers to has nothing more to give
             used = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)
-            gone = np.unique(
-                np.concatenate([removals.ids(), window.state_features, cost.ids_of(used)])
-            )
+            gone = ascending_union(removals.ids(), window.state_features, cost.ids_of(used))
             useful = window.tracks.frames(without=gone)
             kept = [i for i in poses.kept if i in useful]
             poses = replace(poses, kept=kept, keyframes=poses.keyframes.intersection(kept))
@@ -221,7 +222,7 @@ class CostConstruction:
         obs = cost.tracks.obs
         limit = threshold(np.array([2]), self.config.gating.confidence)[0]
         fits = cost.squared_errors(obs, cost.tracks.points) < limit
-        self.rejected = np.union1d(self.rejected, obs.ids[obs.feature[~fits]])
+        self.rejected = ascending_union(self.rejected, obs.ids[obs.feature[~fits]])
         self._count_failures(window, obs, fits)
         constructed.removals.add_observations(Outcome.OUTLIER, obs.rows(~fits))
         rejected = int(np.sum(~fits))
@@ -307,7 +308,7 @@ class CostConstruction:
         landmarks, tracks = linear.landmarks, None
         if landmarks is not None and cost.landmarks is not None:
             bad = cost.landmarks.rows(~gate.landmarks)
-            self.rejected = np.union1d(self.rejected, bad.ids[bad.feature])
+            self.rejected = ascending_union(self.rejected, bad.ids[bad.feature])
             removals.add_observations(Outcome.GATED, bad)
             cost.landmarks = cost.landmarks.rows(gate.landmarks)
             landmarks = landmarks.subset(gate.landmarks)
@@ -315,7 +316,7 @@ class CostConstruction:
             assert isinstance(linear.tracks, WhitenedObservations)
             tracks = linear.tracks.subset(gate.tracks[cost.tracks.obs.feature])
             bad_ids = cost.tracks.obs.ids[~gate.tracks]
-            self.rejected = np.union1d(self.rejected, bad_ids)
+            self.rejected = ascending_union(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
             cost.tracks = cost.tracks.subset(gate.tracks)
             for row in np.flatnonzero(cost.tracks.in_state):
@@ -328,11 +329,11 @@ class CostConstruction:
         """The features that stay in the state: those that are tracked, old and new."""
         ids = np.zeros(0, np.int64)
         if cost.landmarks is not None:
-            ids = np.unique(cost.landmarks.ids[cost.landmarks.feature])
+            ids = sorted_unique(cost.landmarks.ids[cost.landmarks.feature])
         if self.policy.keep_lost_features:
             ids = window.state_features[is_in(window.state_features, window.tracks.seen)]
         if cost.tracks is not None:
-            ids = np.union1d(ids, cost.tracks.obs.ids[cost.tracks.in_state])
+            ids = ascending_union(ids, cost.tracks.obs.ids[cost.tracks.in_state])
         return ids
 
     def _absorbed(self, tracks: TrackFeatures, loses_pose: BoolArray) -> BoolArray:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -22,6 +22,9 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     SummedFeatures,
     WhitenedObservations,
+    new_variable_rows,
+    null_space_rows,
+    state_rows,
     sum_features,
     whiten,
 )
@@ -55,6 +58,8 @@ class TrackFeatures:
 
     def subset(self, keep: BoolArray) -> TrackFeatures:
         """The features where `keep` (J,) holds."""
+        if keep.all():
+            return self
         return TrackFeatures(self.obs.subset(keep), self.points[keep], self.in_state[keep])
 
 
@@ -142,17 +147,23 @@ class Cost:
         if tracks is not None:
             keys += self.rig.keys_of(tracks.obs)
             keys += landmark_keys(tracks.obs.ids[tracks.in_state])
-        layout = self.prior.layout.extended(
-            dims_of(k for k in dict.fromkeys(keys) if k not in self.prior.layout)
-        )
+        known = self.prior.layout
+        new = dims_of(k for k in dict.fromkeys(keys) if k not in known)
+        layout = self._layout[1] if self._layout is not None else known
+        if list(layout.dims) != [*known.dims, *new]:
+            layout = known.extended(new)
         self._layout = depends_on, layout
         return layout
 
     def prior_at_estimate(self) -> SquareRootInformation:
         """The prior as a function of an increment of the current estimates."""
-        prior = self.prior.shifted(self.state.offset(self.prior.layout))
-        layout = self.layout()
-        return prior.extended({k: d for k, d in layout.dims.items() if k not in prior.layout})
+        prior, layout = self.prior, self.layout()
+        n, m = prior.layout.size, layout.size
+        Rd = np.zeros((m + 1, m + 1), order="F")
+        Rd[:n, :n] = prior.R
+        Rd[:n, m] = prior.d - prior.R @ self.state.offset(prior.layout)
+        Rd[m, m] = prior.Rd[n, n]
+        return SquareRootInformation(layout, Rd)
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], tracks: BoolArray) -> Cost:
         """The prior and the features of the state, with some of the factors and new features (J,).
@@ -170,16 +181,21 @@ class Cost:
         """Ids, ascending, of some of the new features (J,)."""
         return self.tracks.obs.ids[tracks] if self.tracks is not None else np.zeros(0, np.int64)
 
-    def value(self, linear: Linearization | None = None) -> float:
+    def value(
+        self, linear: Linearization | None = None, predicted: SquareRootInformation | None = None
+    ) -> float:
         """The cost at the current estimates: half the squared residuals, under the robust loss.
 
         Args:
             linear: the linearisation there, if it is known; it has the residuals of observations.
+            predicted: prior and factors of GTSAM there, if they are known.
         """
-        offset = self.state.offset(self.prior.layout)
-        total = 0.5 * float(np.sum((self.prior.R @ offset - self.prior.d) ** 2))
-        total += 0.5 * self.prior.residual
-        total += sum(factor.error(self.state.estimate) for factor in self.factors)
+        if predicted is not None:
+            total = 0.5 * (float(predicted.d @ predicted.d) + predicted.residual)
+        else:
+            d = self.prior.d - self.prior.R @ self.state.offset(self.prior.layout)
+            total = 0.5 * (float(d @ d) + self.prior.residual)
+            total += sum(factor.error(self.state.estimate) for factor in self.factors)
         if linear is not None:
             return total + float(np.sum(self.robust.value(linear.errors)))
         if self.landmarks is not None and len(self.landmarks):
@@ -247,27 +263,29 @@ class Cost:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
         rows = []
         for factor in self.factors:
+            assert isinstance(factor, gtsam.NoiseModelFactor)
             jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first))
             A, _ = jacobian.jacobian()
-            b = gtsam.JacobianFactor(factor.linearize(self.state.estimate)).jacobian()[1]
-            Ab = np.zeros((len(b), layout.size + 1))
+            Ab = np.zeros((len(A), layout.size + 1))
             Ab[:, layout.indices(jacobian.keys())] = A
-            Ab[:, -1] = b
+            Ab[:, -1] = -factor.whitenedError(self.state.estimate)
             rows.append(Ab)
         return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
 
     def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of all observations."""
-        parts = [np.zeros((0, layout.size + 1))]
-        if linear.landmarks is not None and self.landmarks is not None:
-            columns = self._state_columns(self.landmarks, layout)
-            parts.append(_state_rows(linear.landmarks, columns, layout))
-        if linear.tracks is not None and self.tracks is not None:
-            assert isinstance(linear.tracks, SummedFeatures)
+        landmarks, tracks, parts = linear.landmarks, linear.tracks, []
+        if landmarks is not None and self.landmarks is not None:
+            parts.append(state_rows(landmarks, self._state_columns(self.landmarks, layout), layout))
+        if tracks is not None and self.tracks is not None:
+            assert isinstance(tracks, SummedFeatures)
             columns = layout.indices(self.rig.keys_of(self.tracks.obs))
-            parts.append(_null_space_rows(linear.tracks, columns, layout))
-            parts.append(_new_variable_rows(self.tracks, linear.tracks, columns, layout))
-        return np.concatenate(parts)
+            parts.append(null_space_rows(tracks, columns, layout))
+            new = np.flatnonzero(self.tracks.in_state)
+            if len(new):
+                keys = landmark_keys(self.tracks.obs.ids[new])
+                parts.append(new_variable_rows(tracks, new, keys, columns, layout))
+        return np.concatenate(parts) if parts else np.zeros((0, layout.size + 1))
 
     # --- moving --------------------------------------------------------------------------------
 
@@ -363,38 +381,3 @@ class Cost:
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:
     """Whether two tuples hold the very same objects."""
     return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
-
-
-def _state_rows(
-    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
-) -> FloatArray:
-    """The rows of observations of features of the state."""
-    Ab = np.zeros((len(columns), 2, layout.size + 1))
-    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
-    Ab[:, :, -1] = linear.r
-    return Ab.reshape(-1, layout.size + 1)
-
-
-def _null_space_rows(
-    linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
-) -> FloatArray:
-    """What new features say of all else, at most 6 F + C + 1 rows."""
-    Ab = np.zeros((len(linear.rows), layout.size + 1))
-    Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
-    return Ab
-
-
-def _new_variable_rows(
-    tracks: TrackFeatures,
-    linear: SummedFeatures,
-    columns: NDArray[np.intp],
-    layout: Layout,
-) -> FloatArray:
-    """The three rows that determine each feature that stays in the state."""
-    features = np.flatnonzero(tracks.in_state)
-    Ab = np.zeros((len(features), POINT_DIM, layout.size + 1))
-    for row, j in enumerate(features):
-        Ab[row][:, layout.columns[L(int(tracks.obs.ids[j]))]] = linear.R_f[j]
-    Ab[:, :, columns] = linear.T[features]
-    Ab[:, :, -1] = linear.r_1[features]
-    return Ab.reshape(-1, layout.size + 1)

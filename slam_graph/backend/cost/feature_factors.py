@@ -34,16 +34,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
-
-_REGULARISATION = 1e-15
-"""Information that is added to a feature, relative to what its observations say of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +85,8 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
     R_f, T, information = np.empty((J, 3, 3)), np.empty((J, 3, width)), np.empty((width, width))
     parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
     sum_of_features(*parts, obs.frame, obs.starts, R_f, T, information)
+    stacked = T.reshape(-1, width)
+    information -= stacked.T @ stacked
     if not np.all(np.isfinite(information)):
         raise np.linalg.LinAlgError("a feature is not determined by its observations")
     return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
@@ -109,18 +109,6 @@ def information_root(information: FloatArray) -> FloatArray:
     rows[:rank, n] = b
     rows[rank, n] = np.sqrt(max(information[n, n] - b @ b, 0.0))
     return rows
-
-
-def orthonormal_columns(by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q (J, m, 3) with orthonormal columns and R_f (J, 3, 3) of the m rows of each feature."""
-    Q, R_f = by_point, np.broadcast_to(np.eye(3), (len(by_point), 3, 3))
-    for _ in range(2):
-        squares = Q.transpose(0, 2, 1) @ Q
-        trace = np.trace(squares, axis1=1, axis2=2)
-        squares += _REGULARISATION * trace[:, None, None] * np.eye(3)
-        R = np.linalg.cholesky(squares).transpose(0, 2, 1)
-        Q, R_f = Q @ np.linalg.inv(R), R @ R_f
-    return Q, R_f
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,14 +138,11 @@ class WhitenedObservations:
 
     def subset(self, keep: NDArray[np.bool_]) -> WhitenedObservations:
         """The observations where `keep` (N,) holds."""
-        return WhitenedObservations(
-            self.r[keep],
-            self.by_pose[keep],
-            self.by_point[keep],
-            self.by_calibration[keep],
-            self.depths[keep],
-            self.errors[keep],
-        )
+        if keep.all():
+            return self
+        rows = np.flatnonzero(keep)  # faster to take than a mask
+        parts = self.r, self.by_pose, self.by_point, self.by_calibration, self.depths, self.errors
+        return WhitenedObservations(*(part.take(rows, axis=0) for part in parts))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,14 +206,10 @@ def whiten(
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     errors = np.sqrt(np.einsum("ni,ni->n", residuals, residuals)) / sigma_px
     weight = np.sqrt(loss.weights(errors)) / sigma_px
-    return WhitenedObservations(
-        residuals * weight[:, None],
-        by_pose * weight[:, None, None],
-        by_point * weight[:, None, None],
-        by_calibration * weight[:, None, None],
-        depths,
-        errors,
-    )
+    residuals *= weight[:, None]  # all of these are new arrays
+    for derivatives in (by_pose, by_point, by_calibration):
+        derivatives *= weight[:, None, None]
+    return WhitenedObservations(residuals, by_pose, by_point, by_calibration, depths, errors)
 
 
 def reduce_features(obs: Observations, linear: WhitenedObservations) -> ReducedFeatures:
@@ -267,3 +248,38 @@ def eliminate_points(
     A, B = stacked.reshape(J, 2 * M, 3), beside.reshape(J, 2 * M, -1)
     triangularize_features(A, B)
     return np.triu(A[:, :3]), B
+
+
+def state_rows(
+    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """The rows of observations of features of the state."""
+    Ab = np.zeros((len(columns), 2, layout.size + 1))
+    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
+    Ab[:, :, -1] = linear.r
+    return Ab.reshape(-1, layout.size + 1)
+
+
+def null_space_rows(
+    linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
+) -> FloatArray:
+    """What new features say of all else, at most 6 F + C + 1 rows."""
+    Ab = np.zeros((len(linear.rows), layout.size + 1))
+    Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
+    return Ab
+
+
+def new_variable_rows(
+    linear: SummedFeatures,
+    new: IntArray,
+    keys: list[int],
+    columns: NDArray[np.intp],
+    layout: Layout,
+) -> FloatArray:
+    """The three rows that determine each feature (K,) of J that becomes a variable, and its key."""
+    Ab = np.zeros((len(new), POINT_DIM, layout.size + 1))
+    for row, j, key in zip(Ab, new, keys, strict=True):
+        row[:, layout.columns[key]] = linear.R_f[j]
+    Ab[:, :, columns] = linear.T[new]
+    Ab[:, :, -1] = linear.r_1[new]
+    return Ab.reshape(-1, layout.size + 1)

@@ -22,6 +22,7 @@ from slam_graph.backend.cost.feature_tracks import (
     Observations,
     Outcome,
     Removals,
+    ascending_union,
     is_in,
 )
 from slam_graph.backend.cost.pixel_noise import PixelNoise
@@ -94,7 +95,7 @@ class FeatureSelection:
         bound = self.policy.max_state_features
         room = len(window.tracks.seen) if bound is None else bound - in_state
         choice = self._candidates(window, poses, room, dynamic, removals)
-        ids = np.union1d(choice.used, choice.lasting)
+        ids = ascending_union(choice.used, choice.lasting)
         if len(ids) == 0:
             return None
         obs = window.tracks.observations(ids)

@@ -85,7 +85,9 @@ class Observations:
 
     def subset(self, keep: NDArray[np.bool_]) -> Observations:
         """The observations of the features where `keep` (J,) holds."""
-        rows = keep[self.feature]
+        if keep.all():
+            return self
+        rows = np.flatnonzero(keep[self.feature])  # faster to take than a mask
         renumbered = np.cumsum(keep) - 1
         return Observations(
             self.ids[keep],
@@ -93,8 +95,8 @@ class Observations:
             renumbered[self.feature[rows]],
             self.frame[rows],
             self.camera[rows],
-            self.pixels[rows],
-            self.normalized[rows],
+            self.pixels.take(rows, axis=0),
+            self.normalized.take(rows, axis=0),
         )
 
 
@@ -138,22 +140,25 @@ class Removals:
 
     def ids(self) -> IntArray:
         """The features of which no observation is left, ascending."""
-        return np.unique(
-            np.concatenate([np.zeros(0, np.int64), *(ids for _, ids in self._features)])
-        )
+        return ascending_union(*(ids for _, ids in self._features))
 
-    def apply(self, tracks: FeatureTracks) -> None:
-        """Take the observations away: single ones first, then features in the order of adding."""
-        parts = [(outcome, tracks.rows_of(obs)) for outcome, obs in self._observations if len(obs)]
-        parts += [(outcome, tracks.rows_of_features(ids)) for outcome, ids in self._features]
-        tracks.remove_rows(parts)
+    def apply(self, tracks: FeatureTracks, frames: Sequence[int]) -> None:
+        """Take the observations away: single ones first, then features in the order of adding.
+
+        Args:
+            tracks: loses them.
+            frames: those whose poses stay; what is left of all others goes too.
+        """
+        single = [(outcome, tracks.rows_of(obs)) for outcome, obs in self._observations if len(obs)]
+        tracks.take_away(single, self._features, frames)
 
 
 class FeatureTracks:
     """The observations, of the frames whose poses are in the state, that have not been used yet.
 
     Every observation enters the prior at most once: whatever takes it there takes it out of here.
-    Rows are sorted by feature, then frame, then camera.
+    Rows are sorted by feature, then frame, then camera. There are ten times as many of them as
+    features, so what concerns features is found on these first.
 
     Attributes:
         seen: ids (N,) of all features that the last frame saw, used or not, ascending.
@@ -162,14 +167,21 @@ class FeatureTracks:
     """
 
     def __init__(self) -> None:
-        self._ids = np.zeros(0, np.int64)
-        self._frames = np.zeros(0, np.int64)
-        self._cameras = np.zeros(0, np.int64)
-        self._pixels = np.zeros((0, 2))
-        self._normalized = np.zeros((0, 2))
+        self._numbers = np.zeros((3, 0), np.int64)  # feature, frame and camera of each observation
+        self._places = np.zeros((2, 0, 2))  # raw pixels and normalised coordinates
+        self._group()
         self.seen = np.zeros(0, np.int64)
         self.added = 0
         self.outcomes: Counter[Outcome] = Counter()
+
+    def _group(self) -> None:
+        """Find the features, and where the observations of each begin."""
+        self._ids, self._frames, self._cameras = self._numbers
+        begins = np.ones(len(self._ids) + 1, np.bool_)  # the last one is the end
+        np.not_equal(self._ids[1:], self._ids[:-1], out=begins[1:-1])
+        bounds = np.flatnonzero(begins)
+        self._starts, self._counts = bounds[:-1], bounds[1:] - bounds[:-1]
+        self._features = self._ids[self._starts]
 
     def __len__(self) -> int:
         """How many observations wait."""
@@ -178,48 +190,77 @@ class FeatureTracks:
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
         cameras = frame.cameras
-        self.seen = np.unique(np.concatenate([c.ids for c in cameras]))
-        ids = np.concatenate([self._ids, *(c.ids for c in cameras)])
-        count = len(ids) - len(self._ids)
-        self.added += count
-        numbers = [np.full(len(c), number) for number, c in enumerate(cameras)]
-        order = np.argsort(ids, kind="stable")
-        self._ids = ids[order]
-        self._frames = np.concatenate([self._frames, np.full(count, index)])[order]
-        self._cameras = np.concatenate([self._cameras, *numbers])[order]
-        self._pixels = np.concatenate([self._pixels, *(c.pixels for c in cameras)])[order]
-        self._normalized = np.concatenate([self._normalized, *(c.normalized for c in cameras)])[
-            order
-        ]
+        ids = np.concatenate([c.ids for c in cameras])
+        new = np.empty((3, len(ids)), np.int64)
+        new[0], new[1] = ids, index
+        new[2] = np.repeat(np.arange(len(cameras)), [len(c) for c in cameras])
+        pixels = np.concatenate([c.pixels for c in cameras])
+        normalized = np.concatenate([c.normalized for c in cameras])
+        self.seen = sorted_unique(np.sort(ids))
+        self.added += len(ids)
+        order = np.argsort(np.concatenate([self._ids, ids]), kind="stable")
+        self._numbers = np.concatenate([self._numbers, new], axis=1).take(order, axis=1)
+        self._places = np.concatenate([self._places, [pixels, normalized]], axis=1)
+        self._places = self._places.take(order, axis=1)
+        self._group()
 
     def keep_frames(self, frames: Sequence[int]) -> None:
         """Drop the observations of all frames but these, as their poses have left."""
-        self._keep(np.isin(self._frames, frames), Outcome.POSE_LEFT)
+        self.take_away([], [], frames)
 
     def remove(self, outcome: Outcome, ids: IntArray) -> None:
         """Take away all observations of some features (ascending ids)."""
-        self._keep(~self.rows_of_features(ids), outcome)
+        self.take_away([], [(outcome, ids)])
 
-    def remove_rows(self, parts: Sequence[tuple[Outcome, BoolArray]]) -> None:
-        """Take away observations (N,); the first outcome that has an observation counts."""
+    def take_away(
+        self,
+        single: Sequence[tuple[Outcome, BoolArray]],
+        features: Sequence[tuple[Outcome, IntArray]],
+        frames: Sequence[int] | None = None,
+    ) -> None:
+        """Take away observations; the first outcome that has an observation counts.
+
+        Args:
+            single: observations (N,) of this.
+            features: all observations of features (ascending ids).
+            frames: those whose poses stay, if not all do; the observations of the others are taken
+                away last.
+        """
         left = np.ones(len(self), np.bool_)
-        for outcome, rows in parts:
-            gone = rows & left
-            count = int(np.count_nonzero(gone))
-            if count:
-                self.outcomes[outcome] += count
-                left &= ~gone
-        self._select(left)
+        for outcome, rows in single:
+            self._count(outcome, np.count_nonzero(rows & left))
+            left &= ~rows
+        stays, counts = np.ones(len(self._features), np.bool_), self._counts
+        if single and len(self):
+            counts = np.add.reduceat(left, self._starts, dtype=np.int64)
+        for outcome, ids in features:
+            gone = is_in(self._features, ids) & stays
+            self._count(outcome, counts[gone].sum())
+            stays &= ~gone
+        left &= np.repeat(stays, self._counts)
+        if frames is not None:
+            late = left & ~_is_among(self._frames, frames)
+            self._count(Outcome.POSE_LEFT, np.count_nonzero(late))
+            left &= ~late
+        self._select(np.flatnonzero(left))
 
-    def rows_of_features(self, ids: IntArray) -> BoolArray:
-        """Which observations (N,) are of some features (ascending ids)."""
-        return is_in(self._ids, ids)
+    def _count(self, outcome: Outcome, count: int | np.int64) -> None:
+        if count:
+            self.outcomes[outcome] += int(count)
+
+    def _select(self, rows: IntArray) -> None:
+        if len(rows) == len(self):
+            return
+        self._numbers = self._numbers.take(rows, axis=1)
+        self._places = self._places.take(rows, axis=1)
+        self._group()
 
     def rows_of(self, obs: Observations) -> BoolArray:
         """Which observations (N,) are among some."""
-        frames = np.array(obs.frames)[obs.frame]
-        key = self._key(obs.ids[obs.feature], frames, obs.camera)
-        return np.isin(self._key(self._ids, self._frames, self._cameras), key)
+        frames = np.array(obs.frames, np.int64)[obs.frame]
+        mine = self._key(self._ids, self._frames, self._cameras)
+        theirs = self._key(obs.ids[obs.feature], frames, obs.camera)
+        return is_in(mine, np.sort(theirs))
 
     def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
         """A number (N,) for each observation that no other one has."""
@@ -228,26 +269,18 @@ class FeatureTracks:
         count = self._cameras.max(initial=0) + 1
         return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
 
-    def _keep(self, rows: NDArray[np.bool_], outcome: Outcome) -> None:
-        self.remove_rows([(outcome, ~rows)])
-
-    def _select(self, rows: NDArray[np.bool_]) -> None:
-        if rows.all():
-            return
-        self._ids, self._frames, self._cameras = (
-            self._ids[rows],
-            self._frames[rows],
-            self._cameras[rows],
-        )
-        self._pixels, self._normalized = self._pixels[rows], self._normalized[rows]
+    def _rows_of_features(self, ids: IntArray) -> BoolArray:
+        """Which observations (N,) are of some features (ascending ids)."""
+        return np.repeat(is_in(self._features, ids), self._counts)
 
     def frames(self, without: IntArray) -> set[int]:
         """The frames of all waiting observations but those of some features (ascending ids)."""
-        return set(np.unique(self._frames[~is_in(self._ids, without)]).tolist())
+        rows = ~self._rows_of_features(without)
+        return set(_numbered(self._frames[rows])[0].tolist())
 
     def ids_waiting(self) -> IntArray:
         """All features with waiting observations, ascending."""
-        return sorted_unique(self._ids)
+        return self._features
 
     def ids_in(self, index: int) -> IntArray:
         """The features that any camera saw in one frame, ascending."""
@@ -261,51 +294,70 @@ class FeatureTracks:
             after: another.
             turn: (3, 3) rotation from the camera at the first frame to that at the second.
         """
-        i, j = (
-            np.flatnonzero((self._frames == index) & (self._cameras == 0))
-            for index in (before, after)
-        )
-        _, a, b = np.intersect1d(
-            self._ids[i], self._ids[j], assume_unique=True, return_indices=True
-        )
-        rays = (np.insert(self._normalized[rows], 2, 1.0, axis=1) for rows in (i[a], j[b]))
-        x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+        first = self._cameras == 0
+        i, j = (np.flatnonzero((self._frames == index) & first) for index in (before, after))
+        i = i[is_in(self._ids[i], self._ids[j])]
+        j = j[self._ids[j].searchsorted(self._ids[i])]
+        rays = np.ones((2, len(i), 3))
+        rays[:, :, :2] = self._places[1, i], self._places[1, j]
+        x, y = rays / np.linalg.norm(rays, axis=2, keepdims=True)
         sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
         return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
 
     def ids_in_any(self, frames: Sequence[int]) -> IntArray:
         """The features that any camera saw in some frames, ascending."""
-        return sorted_unique(self._ids[np.isin(self._frames, frames)])
+        if len(frames) == 0:
+            return np.zeros(0, np.int64)
+        return sorted_unique(self._ids[_is_among(self._frames, frames)])
 
     def lengths(self) -> tuple[IntArray, IntArray]:
         """All features with waiting observations (J,), and the number of frames that see each."""
-        new_frame = np.ones(len(self._ids), np.bool_)
-        new_frame[1:] = (np.diff(self._ids) != 0) | (np.diff(self._frames) != 0)
-        return np.unique(self._ids[new_frame], return_counts=True)
+        if len(self) == 0:
+            return self._features, np.zeros(0, np.int64)
+        again = self._frames[1:] == self._frames[:-1]  # by the next camera
+        again[self._starts[1:] - 1] = False
+        seen_again = np.concatenate([[False], again])
+        repeated: IntArray = np.add.reduceat(seen_again, self._starts, dtype=np.int64)
+        return self._features, self._counts - repeated
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
         """The waiting observations of some features (ascending ids) in some or all frames."""
-        rows = is_in(self._ids, ids)
+        wanted = self._rows_of_features(ids)
         if frames is not None:
-            rows &= np.isin(self._frames, frames)
-        numbers = self._frames[rows]
-        order = np.unique(numbers)
-        return Observations(
-            ids,
-            tuple(order.tolist()),
-            np.searchsorted(ids, self._ids[rows]),
-            np.searchsorted(order, numbers),
-            self._cameras[rows],
-            self._pixels[rows],
-            self._normalized[rows],
-        )
+            wanted &= _is_among(self._frames, frames)
+        rows = np.flatnonzero(wanted)
+        features, numbers, cameras = self._numbers.take(rows, axis=1)
+        pixels, normalized = self._places.take(rows, axis=1)
+        order, frame = _numbered(numbers)
+        feature = ids.searchsorted(features)
+        return Observations(ids, tuple(order.tolist()), feature, frame, cameras, pixels, normalized)
+
+
+def _numbered(values: IntArray) -> tuple[IntArray, IntArray]:
+    """The distinct values, ascending, and the number (N,) of each among them.
+
+    By a table over their range, which takes less than sorting them as long as that is narrow.
+    """
+    if len(values) == 0:
+        return values, values
+    first = values.min()
+    places = values - first
+    table = np.zeros(places.max() + 1, np.bool_)
+    table[places] = True
+    return np.flatnonzero(table) + first, (np.cumsum(table) - 1)[places]
+
+
+def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
+    """Which frames (N,) are among some, in any order."""
+    return is_in(frames, np.array(sorted(some), np.int64))
 
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
     if len(ascending) == 0:
         return np.zeros(len(values), np.bool_)
-    place = np.minimum(np.searchsorted(ascending, values), len(ascending) - 1)
+    place = ascending.searchsorted(values)
+    np.minimum(place, len(ascending) - 1, out=place)
     return np.asarray(ascending[place] == values)
 
 
@@ -314,3 +366,8 @@ def sorted_unique(values: IntArray) -> IntArray:
     first = np.ones(len(values), np.bool_)
     first[1:] = values[1:] != values[:-1]
     return values[first]
+
+
+def ascending_union(*parts: IntArray) -> IntArray:
+    """The distinct values of some arrays, ascending; NumPy's functions take twice as long."""
+    return sorted_unique(np.sort(np.concatenate([np.zeros(0, np.int64), *parts])))

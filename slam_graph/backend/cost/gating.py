@@ -53,20 +53,23 @@ class Innovations:
         Args:
             distances: (J,) squared Mahalanobis distances.
             dof: (J,) their degrees of freedom.
-            largest: (J,) what the gate lets through.
+            largest: (J,) what the gate lets through, the same where the degrees of freedom are.
             passed: (J,) what it let through.
         """
-        k, q = 0.5 * dof[passed], 0.5 * largest[passed]
+        entered, counts = distances[passed], np.bincount(dof[passed])
+        degrees, limits = np.flatnonzero(counts), np.zeros(len(counts))
+        limits[dof[passed]] = largest[passed]
+        k, q = 0.5 * degrees, 0.5 * limits[degrees]
         # a χ² variable of k degrees of freedom, cut off at q, has the mean k F(k + 2, q) / F(k, q)
-        means = dof[passed] * gammainc(k + 1.0, q) / gammainc(k, q)
+        means = degrees * gammainc(k + 1.0, q) / gammainc(k, q)
         return Innovations(
             len(distances),
-            int(np.sum(~passed)),
-            float(np.sum(distances)),
-            int(np.sum(dof)),
-            float(np.sum(distances[passed])),
-            int(np.sum(dof[passed])),
-            float(np.sum(means)),
+            len(distances) - len(entered),
+            float(distances.sum()),
+            int(dof.sum()),
+            float(entered.sum()),
+            int(degrees @ counts[degrees]),
+            float(means @ counts[degrees]),
         )
 
     @staticmethod

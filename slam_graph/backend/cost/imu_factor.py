@@ -32,33 +32,31 @@ counts."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Transition:
-    """A dynamics factor, linearised: before e + after e' is white noise of 1.
+    """A dynamics factor, linearised: e' = F e + noise.
 
     The errors e and e' of the two states have the tangents of `NavState.covariance`.
 
     Attributes:
-        before, after: (15, 15).
+        matrix: (15, 15) F.
+        noise: (15, 15) root N of the covariance of the noise, N Nᵀ.
     """
 
-    before: FloatArray
-    after: FloatArray
+    matrix: FloatArray
+    noise: FloatArray
 
     @staticmethod
     def of(factor: gtsam.CombinedImuFactor, values: gtsam.Values) -> _Transition:
         """That of a factor at the values of its states."""
         A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
-        before = np.hstack([A[:, :9], A[:, 18:24]])
-        return _Transition(before, np.hstack([A[:, 9:18], A[:, 24:]]))
-
-    def matrix(self) -> FloatArray:
-        """The (15, 15) matrix F of e' = F e + noise."""
-        return np.asarray(-np.linalg.solve(self.after, self.before), dtype=np.float64)
+        # A_before e + A_after e' is white noise of 1
+        right = np.hstack([-A[:, :9], -A[:, 18:24], np.eye(15)])
+        solved = np.linalg.solve(np.hstack([A[:, 9:18], A[:, 24:]]), right)
+        return _Transition(solved[:, :15], solved[:, 15:])
 
     def predicted(self, covariance: FloatArray) -> FloatArray:
         """The covariance (15, 15) of the later state from that of the earlier one."""
-        known = self.before @ np.linalg.cholesky(covariance)
-        root = np.linalg.solve(self.after, np.hstack([known, np.eye(15)]))
-        return np.asarray(root @ root.T, dtype=np.float64)
+        F, N = self.matrix, self.noise
+        return np.asarray(F @ covariance @ F.T + N @ N.T, dtype=np.float64)
 
 
 def imu_factor(
@@ -129,7 +127,7 @@ class Propagation:
         self._predicted = replace(predicted, covariance=transition.predicted(last.covariance))
         if self._counts_vibration():
             dt_s = (window.stamp_ns - last.stamp_ns) * 1e-9
-            self._vibration.predict(transition.matrix(), dt_s, self.noise.vibrates)
+            self._vibration.predict(transition.matrix, dt_s, self.noise.vibrates)
 
     def _counts_vibration(self) -> bool:
         return self.noise.vibrates or not self._vibration.vanishes

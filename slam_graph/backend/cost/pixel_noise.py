@@ -27,12 +27,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
-from slam_graph.backend.cost.feature_factors import orthonormal_columns
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry
+from slam_graph.kernels.feature_sums import block_sums
 
 BLOCK = 8
 """Consecutive observations of a camera that are averaged. Shorter blocks miss what lasts longer."""
@@ -110,12 +110,12 @@ class PixelNoise:
         known = known.subset(_extents_px(known.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX)
         if len(known.obs) == 0:
             return
+        parts = _whitened(cost, known, self.sigma_px)
         try:
-            projected = ProjectedTracks.of(known.obs, *_whitened(cost, known, self.sigma_px))
+            found = block_means(known.obs, *parts, len(self.sigma_px))
         except np.linalg.LinAlgError:  # a point that its observations do not determine
             return
-        for camera in range(len(self.sigma_px)):
-            means = projected.block_means(camera)
+        for camera, means in enumerate(found):
             self._dof[camera] += np.sum(means.dof)
             share = float(means.dof @ means.winsorised())
             self._squares[camera] += share * self.sigma_px[camera] ** 2
@@ -151,66 +151,29 @@ def _whitened(
     return (obs.pixels - views.pixels) / sigma[:, None], by_point / sigma[:, None, None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectedTracks:
-    """Residuals of J tracks off the directions of their points, in M places for observations.
+def block_means(
+    obs: Observations, residuals: FloatArray, by_point: FloatArray, cameras: int
+) -> list[BlockMeans]:
+    """The squared block means of tracks in each camera.
 
-    Attributes:
+    The observations of other cameras only say where the point is.
+
+    Args:
         obs: N observations of J features, sorted by feature and frame.
-        e: (J, M, 2) residuals in standard deviations, off the directions.
-        Q: (J, M, 2, 3) orthonormal directions of the point of each track.
+        residuals: (N, 2) in standard deviations.
+        by_point: (N, 2, 3) derivatives by the position of the feature.
+        cameras: their number.
+
+    Raises:
+        numpy.linalg.LinAlgError: if observations do not determine their point.
     """
-
-    obs: Observations
-    e: FloatArray
-    Q: FloatArray
-
-    @staticmethod
-    def of(obs: Observations, residuals: FloatArray, by_point: FloatArray) -> ProjectedTracks:
-        """Those of tracks.
-
-        Args:
-            obs: N observations of J features, sorted by feature and frame.
-            residuals: (N, 2) in standard deviations.
-            by_point: (N, 2, 3) derivatives by the position of the feature.
-
-        Raises:
-            numpy.linalg.LinAlgError: if observations do not determine their point.
-        """
-        J, M, slots = len(obs.ids), int(obs.counts.max(initial=2)), obs.slots
-        e, H = np.zeros((J, M, 2)), np.zeros((J, M, 2, 3))
-        e[obs.feature, slots], H[obs.feature, slots] = residuals, by_point
-        Q, _ = orthonormal_columns(H.reshape(J, 2 * M, 3))
-        e -= (Q @ (Q.transpose(0, 2, 1) @ e.reshape(J, 2 * M, 1))).reshape(e.shape)
-        return ProjectedTracks(obs, e, Q.reshape(J, M, 2, 3))
-
-    def block_means(self, camera: int) -> BlockMeans:
-        """The squared block means of the tracks.
-
-        Args:
-            camera: whose observations are averaged; those of others only say where the point is.
-        """
-        J, M, _ = self.e.shape
-        B = _averages(self.obs, camera, M)
-        means = B @ self.e
-        BQ = (B @ self.Q.reshape(J, M, 6)).reshape(J, -1, 3)
-        S = -BQ @ BQ.transpose(0, 2, 1)
-        each = np.repeat(np.sum(B**2, axis=2), 2, axis=1)
-        S[:, range(S.shape[1]), range(S.shape[1])] += each
-        trace, square = np.trace(S, axis1=1, axis2=2), np.sum(S**2, axis=(1, 2))
-        some = each.any(axis=1) & (trace > 0.0)
-        squares = np.sum(means**2, axis=(1, 2))[some] / trace[some]
-        return BlockMeans(squares, trace[some] ** 2 / square[some])
-
-
-def _averages(obs: Observations, camera: int, slots: int) -> FloatArray:
-    """Rows (J, K, M) that average over the blocks of one camera; unused ones are zero."""
-    J = len(obs.ids)
-    seen = np.zeros((J, slots), np.bool_)
-    seen[obs.feature, obs.slots] = obs.camera == camera
-    block: IntArray = (np.cumsum(seen, axis=1) - 1) // BLOCK
-    complete = seen & (block < (np.sum(seen, axis=1) // BLOCK)[:, None])
-    averages = np.zeros((J, max(1, slots // BLOCK), slots))
-    feature, slot = np.nonzero(complete)
-    averages[feature, block[feature, slot], slot] = 1.0 / BLOCK
-    return averages
+    sums = np.empty((3, len(obs.ids), cameras))
+    block_sums(residuals, by_point, obs.camera, obs.starts, BLOCK, sums)
+    if not np.all(np.isfinite(sums)):
+        raise np.linalg.LinAlgError("a point is not determined by its observations")
+    means = []
+    for squares, trace, square in sums.transpose(2, 0, 1):
+        some = trace > 0.0
+        dof = trace[some] ** 2 / square[some]
+        means.append(BlockMeans(squares[some] / trace[some], dof))
+    return means

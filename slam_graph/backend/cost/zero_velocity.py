@@ -15,6 +15,7 @@ measured on the tracks, and the limit on the motion is a limit on what the noise
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import gtsam
@@ -23,7 +24,7 @@ from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.backend.cost.feature_tracks import is_in
+from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0
@@ -71,6 +72,7 @@ class StandstillDetector:
         dynamic: ids (N,) of dynamic features, ascending: those that moved while the platform did
             not, or that were reported by `add_dynamic`. A feature stays dynamic while it is tracked
             by the first camera.
+        noise_px: standard deviation of a coordinate of a feature over the window; 0 if not known.
     """
 
     def __init__(
@@ -92,7 +94,8 @@ class StandstillDetector:
         self.since_ns: int | None = None
         self.dynamic = np.zeros(0, np.int64)
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
-        self._noise_px: deque[tuple[int, float]] = deque()
+        self.noise_px = 0.0
+        self._noises_px: deque[tuple[int, float]] = deque()
 
     def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
         """Whether images and IMU agree that nothing has moved over the window.
@@ -124,45 +127,43 @@ class StandstillDetector:
 
     def add_dynamic(self, ids: IntArray) -> None:
         """Add features (N,) that were found to be dynamic in another way."""
-        self.dynamic = np.union1d(self.dynamic, ids)
-
-    @property
-    def noise_px(self) -> float:
-        """Standard deviation of a coordinate of a feature over the window; 0 if not known."""
-        if not self._noise_px:
-            return 0.0
-        return float(median(np.array([sigma for _, sigma in self._noise_px])))
+        self.dynamic = ascending_union(self.dynamic, ids)
 
     def _measure_noise(self, start_ns: int) -> None:
-        """Measure the noise of the tracks by the second differences of the last three frames.
+        """Measure the noise of the tracks over the window."""
+        while self._noises_px and self._noises_px[0][0] < start_ns:
+            self._noises_px.popleft()
+        sigma = self._noise_of_last_frames() if len(self._recent) > 2 else None
+        if sigma is not None:
+            self._noises_px.append((self._recent[-1][0], sigma))
+        noises = np.array([sigma for _, sigma in self._noises_px])
+        self.noise_px = float(median(noises)) if len(noises) else 0.0
+
+    def _noise_of_last_frames(self) -> float | None:
+        """The noise by the second differences of the last three frames, with enough features.
 
         Even motion cancels in them, and their median is that of motion that all features share.
         """
-        while self._noise_px and self._noise_px[0][0] < start_ns:
-            self._noise_px.popleft()
-        if len(self._recent) < 3:
-            return
-        frames = [observations for _, observations in list(self._recent)[-3:]]
+        frames = [self._recent[k][1] for k in (-3, -2, -1)]
         ids = frames[0].ids
         for others in frames[1:]:
             ids = ids[is_in(ids, others.ids)]
         ids = ids[~is_in(ids, self.dynamic)]
         if len(ids) < MIN_FEATURES:
-            return
+            return None
         first, second, third = (frame.pixels[np.searchsorted(frame.ids, ids)] for frame in frames)
         change = third - 2.0 * second + first
         change -= median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
-        sigma = float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * np.sqrt(6.0))
-        self._noise_px.append((self._recent[-1][0], sigma))
+        return float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * math.sqrt(6.0))
 
     def _limit_px(self, motion_px: float, share: float, features: int) -> float:
         """Limit on a quantile of N differences, for a limit on what is motion in them."""
         quantile = _rayleigh(share)
         density = quantile * (1.0 - share)
-        spread = np.sqrt(share * (1.0 - share) / features) / density
-        scale_px = np.sqrt(2.0) * self.noise_px
-        return float(np.hypot(motion_px, (quantile + _SAMPLING_SIGMAS * spread) * scale_px))
+        spread = math.sqrt(share * (1.0 - share) / features) / density
+        scale_px = math.sqrt(2.0) * self.noise_px
+        return math.hypot(motion_px, (quantile + _SAMPLING_SIGMAS * spread) * scale_px)
 
     def _images_are_still(self) -> bool:
         """Whether the last frame shows what the first and the last but one of the window show."""
@@ -181,16 +182,17 @@ class StandstillDetector:
         ids, motion = _common_motion_px(before, now)
         if len(ids) < MIN_FEATURES or self.noise_px > _MAX_NOISE_PX:
             return False
-        lengths = np.linalg.norm(motion, axis=1)
-        middle, least = median(lengths), np.quantile(lengths, _STATIC_SHARE)
+        lengths = np.hypot(motion[:, 0], motion[:, 1])
         motion_px = self._max_disparity_px
-        common = float(np.linalg.norm(median(motion)))
-        # the median of N normal differences has a standard deviation of sqrt(π / 2N) of theirs
-        spread = np.sqrt(np.pi / len(ids)) * self.noise_px
-        if middle < self._limit_px(motion_px, 0.5, len(ids)):
+        if median(lengths) < self._limit_px(motion_px, 0.5, len(ids)):
+            # the median of N normal differences has a standard deviation of sqrt(π / 2N) of theirs
+            spread = math.sqrt(math.pi / len(ids)) * self.noise_px
+            common = float(np.linalg.norm(median(motion)))
             return bool(common < motion_px + _SAMPLING_SIGMAS * spread)
         limit_px = self._limit_px(motion_px / _DYNAMIC_RATIO, _STATIC_SHARE, len(ids))
-        return bool(least < limit_px < motion_px)
+        if np.count_nonzero(lengths < limit_px) < _STATIC_SHARE * (len(ids) - 1):
+            return False  # which spares most frames of a flight the quantile
+        return bool(np.quantile(lengths, _STATIC_SHARE) < limit_px < motion_px)
 
     def _find_dynamic(self) -> None:
         """Add the features that move although the platform stands still."""
@@ -200,7 +202,7 @@ class StandstillDetector:
         for _, before in (self._recent[0], self._recent[len(self._recent) // 2], self._recent[-2]):
             ids, motion = _common_motion_px(before, now)
             disparity_px = np.linalg.norm(motion, axis=1)
-            self.dynamic = np.union1d(self.dynamic, ids[disparity_px > limit_px])
+            self.dynamic = ascending_union(self.dynamic, ids[disparity_px > limit_px])
 
     def _imu_is_still(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
         """Whether rate and specific force are constant but for noise."""
@@ -234,7 +236,7 @@ def _gained_speed(imu: ImuData) -> float:
 
 def _rayleigh(share: float) -> float:
     """A quantile of the Rayleigh distribution of scale 1; its density there is q (1 - share)."""
-    return float(np.sqrt(-2.0 * np.log(1.0 - share)))
+    return math.sqrt(-2.0 * math.log(1.0 - share))
 
 
 def _by_id(observations: FeatureObservations) -> FeatureObservations:

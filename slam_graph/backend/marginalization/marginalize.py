@@ -156,8 +156,7 @@ def _settle_observations(window: Window, constructed: ConstructedCost) -> None:
     if cost.landmarks is not None:
         removals.add_features(Outcome.ABSORBED, cost.landmarks.ids)
     removals.add_features(Outcome.ABSORBED, cost.ids_of(constructed.absorbed))
-    removals.apply(window.tracks)
-    window.tracks.keep_frames([*constructed.poses.kept, window.frame])
+    removals.apply(window.tracks, [*constructed.poses.kept, window.frame])
 
 
 def marginalize(

@@ -73,7 +73,7 @@ def minimize(
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear)
     linear = linear or cost.linearize(summed=True)
-    layout, before = cost.layout(), cost.value(linear)
+    layout, before = cost.layout(), cost.value(linear, predicted)
     posterior, delta = _step(cost, linear, layout, predicted)
     minimum = Minimum(posterior, (before, cost.value()))
     while _another(policy, minimum, delta, again):

@@ -40,6 +40,7 @@ class Layout:
         for key, dim in self.dims.items():
             self.columns[key] = slice(self.size, self.size + dim)
             self.size += dim
+        self._numbers = np.arange(self.size)
 
     def __contains__(self, key: int) -> bool:
         return key in self.dims
@@ -50,7 +51,7 @@ class Layout:
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given."""
-        parts = [np.arange(self.columns[k].start, self.columns[k].stop) for k in keys]
+        parts = [self._numbers[self.columns[k]] for k in keys]
         return np.concatenate(parts) if parts else np.zeros(0, np.intp)
 
 
@@ -198,9 +199,14 @@ class SquareRootInformation:
         """A root (m, k) of the covariance of some variables: columns of R⁻ᵀ, without zero rows."""
         columns = self.layout.indices(keys)
         first = int(columns.min(initial=self.layout.size))
-        right = np.zeros((self.layout.size - first, len(columns)), order="F")
-        right[columns - first, np.arange(len(columns))] = 1.0
-        root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
+        size = self.layout.size - first
+        if 3 * len(columns) > size:  # the inverse of all is cheaper: it leaves zeros out
+            inverse, info = lapack.dtrtri(self.R[first:, first:])
+            root = np.ascontiguousarray(inverse[columns - first]).T
+        else:
+            right = np.zeros((size, len(columns)), order="F")
+            right[columns - first, np.arange(len(columns))] = 1.0
+            root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(root, dtype=np.float64)
