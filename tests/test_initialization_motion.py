@@ -20,13 +20,11 @@ from slam_graph.backend.initialization.dynamic_start import (
     guess_states,
 )
 from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.inertial_motion import Intervals, Motion
 from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.start_diagnosis import Refusal
-from slam_graph.backend.initialization.visual_inertial_alignment import (
-    Motion,
-    align,
-)
+from slam_graph.backend.initialization.visual_inertial_alignment import align
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.frontend_protocol import build_frontend
@@ -34,7 +32,6 @@ from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
 from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
-PARAMS = rig().imu.preintegration_params(9.81)
 TIMES = np.linspace(0.0, 1.5, 11)
 MOTION = BackendConfig(initialization=InitializationConfig(mode="motion"))
 
@@ -136,8 +133,8 @@ def test_gyro_bias_from_images(cameras: int, seed: int) -> None:
     flight, points = Flight(gyro_bias=bias), room(600, rng)
     for noise, tolerance in ((None, 1e-4), (rng, 5e-3)):
         window, imu = window_of(flight, points, cameras, noise)
-        samples = window.imu_between(imu)
-        found = estimate_gyro_bias(window.frames, samples, RigProjection(rig(cameras)), PARAMS)
+        intervals = Intervals(window.imu_between(imu))
+        found = estimate_gyro_bias(window.frames, intervals, RigProjection(rig(cameras)))
         assert found is not None
         np.testing.assert_allclose(found, bias, atol=tolerance)
 
@@ -145,8 +142,8 @@ def test_gyro_bias_from_images(cameras: int, seed: int) -> None:
 def test_gyro_bias_needs_features_in_common() -> None:
     rng = np.random.default_rng(0)
     window, imu = window_of(Flight(), room(6, rng), 1, rng)
-    samples = window.imu_between(imu)
-    assert estimate_gyro_bias(window.frames, samples, RigProjection(rig()), PARAMS) is None
+    intervals = Intervals(window.imu_between(imu))
+    assert estimate_gyro_bias(window.frames, intervals, RigProjection(rig())) is None
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -154,7 +151,7 @@ def test_the_guess_of_all_states(cameras: int) -> None:
     """World upright, origin and heading at the first body."""
     rng, flight = np.random.default_rng(4), Flight(gyro_bias=np.array([0.03, -0.02, 0.05]))
     window, imu = window_of(flight, room(600, rng), cameras, rng)
-    found = guess_states(window, imu, RigProjection(rig(cameras)), PARAMS, NoiseConfig(), rng)
+    found = guess_states(window, imu, RigProjection(rig(cameras)), NoiseConfig(), rng)
     assert isinstance(found, StartGuess)
     guess = found.states
     assert [s.stamp_ns for s in guess] == window.stamps_ns
@@ -175,7 +172,7 @@ def test_a_guess_says_what_it_lacks() -> None:
     rng = np.random.default_rng(0)
     mounted = RigProjection(rig())
     few, imu = window_of(Flight(), room(6, rng), 1, rng)
-    reason = guess_states(few, imu, mounted, PARAMS, NoiseConfig(), rng)
+    reason = guess_states(few, imu, mounted, NoiseConfig(), rng)
     assert isinstance(reason, Refusal)
     assert "features" in reason.needs
 

@@ -4,16 +4,18 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import gtsam
 import numpy as np
 import pytest
 from flight import Flight, features, rig, room
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.initialization.gyroscope_bias import _jacobian, _pairs, _residuals
+from slam_graph.backend.initialization.gyroscope_bias import _pairs, _Planes
+from slam_graph.backend.initialization.inertial_motion import Intervals
 from slam_graph.backend.initialization.start_consensus import constrained_solutions
 from slam_graph.backend.initialization.visual_inertial_alignment import constrained_solution
 from slam_graph.config import load_config
@@ -142,15 +144,50 @@ def test_the_derivative_by_the_gyroscope_bias() -> None:
     points = room(300, rng)
     frames = [features(flight, mounted, points, t_s, rng) for t_s in times_s]
     samples = [flight.imu(a, b) for a, b in pairwise(times_s)]
-    params = mounted.imu.preintegration_params(9.81)
-    pairs = _pairs(frames, samples, RigProjection(mounted), params, np.full(3, 0.02))
+    pairs = _pairs(frames, Intervals(samples), RigProjection(mounted), np.full(3, 0.02))
     assert pairs is not None
-    step = 1e-6
+    step, axes = 1e-4, np.eye(3)
+    weights = rng.uniform(0.5, 1.0, (len(pairs.interval), 1))
 
-    def difference(axis: int) -> FloatArray:
-        change = step * np.eye(3)[axis]
-        return (_residuals(change, pairs) - _residuals(-change, pairs)) / (2.0 * step)
+    def half_squares(change: FloatArray) -> FloatArray:
+        return 0.5 * _Planes(change, pairs).squares
 
-    numerical = np.column_stack([difference(axis) for axis in range(3)])
-    scale = np.abs(numerical).max()
-    np.testing.assert_allclose(_jacobian(np.zeros(3), pairs), numerical, atol=1e-5 * scale)
+    gradients, hessian, _ = _Planes(np.zeros(3), pairs).derivatives(weights)
+    slopes = [(half_squares(step * e) - half_squares(-step * e)) / (2.0 * step) for e in axes]
+    scale = np.abs(slopes).max()
+    np.testing.assert_allclose(gradients, weights * np.column_stack(slopes), atol=1e-5 * scale)
+
+    def total(i: int, j: int) -> float:
+        return float(weights[:, 0] @ half_squares(step * (i * axes[a] + j * axes[b])))
+
+    for a, b in product(range(3), repeat=2):
+        bend = (total(1, 1) - total(1, -1) - total(-1, 1) + total(-1, -1)) / (4.0 * step**2)
+        np.testing.assert_allclose(hessian[a, b], bend, atol=1e-4 * np.abs(hessian).max())
+
+
+def test_the_inertial_motion_is_that_of_the_preintegration() -> None:
+    """To the first order in which GTSAM adds rotation vectors."""
+    flight, times_s = Flight(), np.linspace(0.0, 1.5, 11)
+    samples = [flight.imu(a, b) for a, b in pairwise(times_s)]
+    gyro_bias, intervals = np.array([0.02, -0.05, 0.03]), Intervals(samples)
+    motion = intervals.motion(gyro_bias)
+    R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
+    for k, block in enumerate(samples, 1):
+        bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias)
+        pim = block.preintegrated(bias, rig().imu.preintegration_params(9.81))
+        p, v = p + v * pim.deltaTij() + R @ pim.deltaPij(), v + R @ pim.deltaVij()
+        R = R @ pim.deltaRij().matrix()
+        for found, expected in ((motion.rotations, R), (motion.displacements, p)):
+            np.testing.assert_allclose(found[k], expected, atol=1e-5)
+        np.testing.assert_allclose(motion.velocities[k], v, atol=1e-5)
+    np.testing.assert_allclose(motion.times_s, times_s, atol=1e-9)
+
+
+def test_the_derivative_of_rotations_by_the_gyroscope_bias() -> None:
+    flight, bias = Flight(), np.array([0.02, -0.05, 0.03])
+    intervals = Intervals([flight.imu(0.0, 0.15), flight.imu(0.15, 0.28)])
+    by_bias = intervals.rotations(bias)[1]
+    for axis, step in enumerate(1e-5 * np.eye(3)):
+        turned = [intervals.rotations(bias + sign * step)[0] for sign in (-1, 1)]
+        change = Rotation.from_matrix(turned[0].transpose(0, 2, 1) @ turned[1]).as_rotvec()
+        np.testing.assert_allclose(by_bias[:, :, axis], change / 2e-5, atol=1e-6)

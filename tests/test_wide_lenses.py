@@ -17,7 +17,8 @@ from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
-from slam_graph.backend.initialization.visual_inertial_alignment import Motion, align
+from slam_graph.backend.initialization.inertial_motion import Motion
+from slam_graph.backend.initialization.visual_inertial_alignment import align
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.frontend.epipolar_test import (
     EpipolarTest,

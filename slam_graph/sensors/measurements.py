@@ -62,7 +62,7 @@ class ImuData:
         Args:
             gyro_bias: (3,) rad/s.
         """
-        durations_s, gyro, _ = self._steps()
+        durations_s, gyro, _ = self.steps()
         start_R_end = gtsam.Rot3()
         for turn in (gyro - gyro_bias) * durations_s[:, None]:
             start_R_end = start_R_end * gtsam.Rot3.Expmap(turn)
@@ -78,7 +78,7 @@ class ImuData:
             params: noise of the IMU (`ImuNoise.preintegration_params`).
         """
         pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
-        durations_s, gyro, accel = self._steps()
+        durations_s, gyro, accel = self.steps()
         # GTSAM turns the specific force by the attitude at the start of a step; this is half a
         # step on
         half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
@@ -87,7 +87,7 @@ class ImuData:
             pim.integrateMeasurement(a, w, dt)
         return pim
 
-    def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])

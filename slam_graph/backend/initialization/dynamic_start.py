@@ -19,11 +19,11 @@ from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.first_state import level_rotation
 from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.inertial_motion import Intervals, Motion
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     Alignment,
-    Motion,
     align,
 )
 from slam_graph.geometry import NavState
@@ -89,7 +89,6 @@ def guess_states(
     frames: StartFrames,
     imu: ImuBuffer,
     rig: RigProjection,
-    params: gtsam.PreintegrationCombinedParams,
     config: NoiseConfig,
     rng: np.random.Generator,
 ) -> StartGuess | Refusal:
@@ -99,11 +98,10 @@ def guess_states(
         frames: at least two frames with features in common.
         imu: samples over them.
         rig: mounting of the cameras.
-        params: of the preintegration.
         config: gravity and the noise of the features.
         rng: draws the samples of RANSAC.
     """
-    samples = frames.imu_between(imu)
+    intervals = Intervals(frames.imu_between(imu))
     tracks = frames.tracks()
     ids, lengths = tracks.lengths()
     ids = ids[lengths >= max(3, len(frames.frames) // 3)]
@@ -116,10 +114,10 @@ def guess_states(
         seen: StartFrames, near: FloatArray
     ) -> tuple[FloatArray, Motion, BoolArray] | None:
         """Gyroscope bias by some features, the motion that it gives, and the static features."""
-        gyro_bias = estimate_gyro_bias(seen.frames, samples, rig, params, near)
+        gyro_bias = estimate_gyro_bias(seen.frames, intervals, rig, near)
         if gyro_bias is None:
             return None
-        motion = _integrate(frames, samples, gyro_bias, params)
+        motion = intervals.motion(gyro_bias)
         static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
         return gyro_bias, motion, static
 
@@ -137,28 +135,6 @@ def guess_states(
     if alignment is None:
         return Refusal("motion", "motion that determines gravity and scale")
     return StartGuess(_states(frames, motion, alignment, gyro_bias), ids[static])
-
-
-def _integrate(
-    frames: StartFrames,
-    samples: list[ImuData],
-    gyro_bias: FloatArray,
-    params: gtsam.PreintegrationCombinedParams,
-) -> Motion:
-    """The inertial motion from the first frame to every other."""
-    bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias)
-    R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
-    rotations, displacements, velocities = [R], [p], [v]
-    for block in samples:
-        pim = block.preintegrated(bias, params)
-        p = p + v * pim.deltaTij() + R @ pim.deltaPij()
-        v = v + R @ pim.deltaVij()
-        R = R @ pim.deltaRij().matrix()
-        rotations.append(R)
-        displacements.append(p)
-        velocities.append(v)
-    times_s = (np.array(frames.stamps_ns) - frames.stamps_ns[0]) * 1e-9
-    return Motion(times_s, np.array(rotations), np.array(displacements), np.array(velocities))
 
 
 def _states(

@@ -18,10 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are imported when they are first used
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray, skew
+from slam_graph.arrays import FloatArray, IntArray, median, skew
 from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
@@ -144,53 +143,57 @@ class _Problem:
         rest = moved - np.einsum("dij,kj->dki", C, centred)
         return C, np.median(np.sum(rest**2, axis=2), axis=1)
 
-    def solve(
-        self, offsets: FloatArray, C: FloatArray, free: bool, scale: float | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Least robust cost at each of D offsets.
+    def linearized(
+        self, body: FloatArray, C: FloatArray, free: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        """Whitened residuals (D, K, 3) and their Jacobian (D, K, 3, 3 or 6) at each of D offsets.
 
         Args:
-            offsets: (D,) s.
+            body: (D, K, 3) rotation vectors of the body.
             C: (3, 3) mounting.
             free: whether it is estimated as well.
-            scale: variance of the residuals in units of their information; None to measure it.
-
-        Returns:
-            Cost (D,), unknowns (D, 3 or 6), their information (D, n, n), and the scale (D,).
         """
-        body = self.body_turns(offsets)
         half = Rotation.from_rotvec(-0.5 * body.reshape(-1, 3)).as_matrix()
-        by_bias = -half.reshape(*body.shape, 3) * self._seconds[:, None, None]
+        half = half.reshape(*body.shape, 3)
         seen = C @ self._turns.R @ C.T
-        back = Rotation.from_rotvec(-body.reshape(-1, 3)).as_matrix().reshape(*body.shape, 3)
-        rest = Rotation.from_matrix((back @ seen).reshape(-1, 3, 3)).as_rotvec()
+        rest = Rotation.from_matrix((half @ (half @ seen)).reshape(-1, 3, 3)).as_rotvec()
         r = -rest.reshape(body.shape)
-        J = by_bias
+        J = -half * self._seconds[:, None, None]
         if free:  # C exp(θ) turns the vectors by θ × v
             vectors = Rotation.from_matrix(self._turns.R).as_rotvec()
             by_mounting = np.broadcast_to(C @ skew(vectors), (*body.shape, 3))
             J = np.concatenate([J, by_mounting], axis=-1)
         root = np.linalg.cholesky(C @ self._turns.information @ C.T).swapaxes(-1, -2)
-        r, J = np.einsum("kij,dkj->dki", root, r), root @ J
-        prior = np.diag([_BIAS_SIGMA**-2] * 3 + [0.0] * (J.shape[-1] - 3))
-        return _robust_least_squares(r, J, prior, scale)
+        return (root @ r[..., None])[..., 0], root @ J
 
 
 def _robust_least_squares(
-    r: FloatArray, J: FloatArray, prior: FloatArray, scale: float | None
+    r: FloatArray, J: FloatArray, scale: float | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """D problems r + J x with K residuals of three rows each (see `_Problem.solve`)."""
-    weights = np.ones(r.shape[:2])
+    """Least robust cost of D problems r + J x with K residuals of three rows each.
+
+    Args:
+        r: (D, K, 3).
+        J: (D, K, 3, n), by the gyroscope bias and the mounting, if that is estimated.
+        scale: variance of the residuals in units of their information; None to measure it.
+
+    Returns:
+        Cost (D,), unknowns (D, n), their information (D, n, n), and the scale (D,).
+    """
+    prior = np.diag([_BIAS_SIGMA**-2] * 3 + [0.0] * (J.shape[-1] - 3))
+    D, K, _, n = J.shape
+    J, r = J.reshape(D, 3 * K, n), r.reshape(D, 3 * K)
+    weights = np.ones((D, K))
     for _ in range(_REWEIGHTINGS):
-        weighted = J * weights[..., None, None]
-        H = np.einsum("dkri,dkrj->dij", weighted, J) + prior
-        x = -np.linalg.solve(H, np.einsum("dkri,dkr->di", weighted, r)[..., None])[..., 0]
-        squares = np.sum((r + np.einsum("dkri,di->dkr", J, x)) ** 2, axis=2)
-        measured = np.maximum(np.median(squares, axis=1) / _MEDIAN_CHI2_3, 1e-9)
-        width = _CAUCHY_WIDTH**2 * (measured if scale is None else np.full(len(r), scale))
+        weighted = (J * np.repeat(weights, 3, axis=1)[..., None]).transpose(0, 2, 1)
+        H = weighted @ J + prior
+        x = -np.linalg.solve(H, weighted @ r[..., None])[..., 0]
+        squares = np.sum((r + (J @ x[..., None])[..., 0]).reshape(D, K, 3) ** 2, axis=2)
+        measured = np.maximum(median(squares.T) / _MEDIAN_CHI2_3, 1e-9)
+        width = _CAUCHY_WIDTH**2 * (measured if scale is None else np.full(D, scale))
         weights = 1.0 / (1.0 + squares / (3.0 * width[:, None]))
     cost = 0.5 * np.sum(np.log1p(squares / (3.0 * width[:, None])), axis=1) * 3.0 * width
-    return cost, x, H, measured
+    return cost, np.asarray(x, np.float64), H, np.asarray(measured)
 
 
 def align_gyroscope(
@@ -210,13 +213,14 @@ def align_gyroscope(
     problem = _Problem(turns, imu)
     steps = round(MAX_OFFSET_S / _COARSE_S)
     grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
-    free, C = body_R_camera is None, body_R_camera
+    free, C, body = body_R_camera is None, body_R_camera, problem.body_turns(grid)
     if C is None:
-        mountings, residuals = problem.rotation_by_wahba(problem.body_turns(grid))
+        mountings, residuals = problem.rotation_by_wahba(body)
         C = mountings[np.argmin(residuals)]
     for _ in range(_REWEIGHTINGS if free else 1):
-        scale = float(np.min(problem.solve(grid, C, free, None)[3]))
-        cost, x, H, _ = problem.solve(grid, C, free, scale)
+        r, J = problem.linearized(body, C, free)
+        scale = float(np.min(_robust_least_squares(r, J, None)[3]))
+        cost, x, H, _ = _robust_least_squares(r, J, scale)
         best = int(np.argmin(cost))
         if free:
             C = C @ Rotation.from_rotvec(x[best, 3:]).as_matrix()
@@ -225,7 +229,8 @@ def align_gyroscope(
     apart = np.abs(grid - grid[best]) > _APART_S
     margin = float(np.min(cost[apart]) - cost[best]) / scale
     fine = grid[best] + _FINE_S * np.arange(-5, 6)
-    cost, x, H, _ = problem.solve(fine, C, free, scale)
+    r, J = problem.linearized(problem.body_turns(fine), C, free)
+    cost, x, H, _ = _robust_least_squares(r, J, scale)
     curve = np.polyfit(fine - grid[best], cost, 2)
     if curve[0] <= 0.0:
         return None
@@ -260,7 +265,9 @@ def turns_contradict(
     """
     camera = Rotation.from_matrix(turns.R).as_rotvec()
     stamps_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    integral = scipy.integrate.cumulative_trapezoid(imu.gyro, stamps_s, axis=0, initial=0.0)
+    durations_s, rates, _ = imu.steps()
+    integral = np.zeros_like(imu.gyro)
+    np.cumsum(rates * durations_s[:, None], axis=0, out=integral[1:])
     one, two = (
         (stamps - imu.stamps_ns[0]) * 1e-9 + offset_s
         for stamps in (turns.first_ns, turns.second_ns)

@@ -8,6 +8,9 @@ orthogonal to the translation, so the smallest eigenvalue of Σ n nᵀ vanishes 
 With R integrated from the gyroscope this is a cost in its bias only: no depth, velocity or gravity
 is needed (He, Xu, Ouyang & Li 2023).
 
+The normals are linear in the products of the bearings, n = A(R) (f₁ ⊗ f₂). So the sum over all
+features is formed once, K = Σ (f₁ ⊗ f₂)(f₁ ⊗ f₂)ᵀ, and Σ n nᵀ = A(R) K A(R)ᵀ for every R.
+
 Noise increases that eigenvalue, but hardly for a translation along the optical axis. So the plain
 smallest eigenvalue is biased towards rotations under which the camera seems to move straight ahead.
 The eigenvalue relative to the part that noise adds is not (Kanatani 1996, renormalization).
@@ -15,28 +18,33 @@ The eigenvalue relative to the part that noise adds is not (Kanatani 1996, renor
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
-import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
+from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.initialization.inertial_motion import Intervals
+from slam_graph.backend.solve.damped_steps import Attempt, TenfoldDamping, levenberg_marquardt
+from slam_graph.sensors import FeatureFrame, FeatureObservations
 
 _MIN_COMMON = 8
 """Pairs of frames with fewer common features than this are left out."""
-_STEP_RAD_S = 1e-4
-"""Step of the numerical derivative by the bias."""
 _ROBUST_WIDTH = 0.02
 """Width of the robust loss on the whitened residual of a pair."""
 _ROUNDS, _LINEAR_RAD_S = 2, 1e-3
 """How often the bias is estimated at most; a change below this needs no other linearisation."""
-_CONVERGED = 1e-4
-"""Relative change of the bias or the cost at which the steps end: some hundredths of its noise."""
+_MAX_STEPS, _CONVERGED = 30, 1e-6
+"""Most steps of each time, and the relative change of the cost at which they end: a thousandth of
+the bias's noise."""
+_TINY = 1e-12
+"""Keeps divisions finite."""
+_CROSS = skew(np.eye(3))
+"""(3, 3, 3) the matrices [e_a]ₓ of the cross products with the axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,20 +52,15 @@ class _Pairs:
     """Pairs of frames with their common features.
 
     Attributes:
-        pair: (N,) which pair each feature belongs to, ascending.
-        starts: (P,) first feature of each pair.
         interval: (P,) which two frames each pair is of.
-        first, second: (N, 3) bearings in the orientation of the body.
+        moments: (P, 9, 9) Σ (f₁ ⊗ f₂)(f₁ ⊗ f₂)ᵀ over the bearings f in the orientation of the body.
         R: (P, 3, 3) rotation from the second body to the first.
         by_bias: (P, 3, 3) its derivative by the bias.
         whitening: (P, 3, 3) makes the noise of Σ n nᵀ the same in all directions.
     """
 
-    pair: NDArray[np.intp]
-    starts: NDArray[np.intp]
     interval: NDArray[np.intp]
-    first: FloatArray
-    second: FloatArray
+    moments: FloatArray
     R: FloatArray
     by_bias: FloatArray
     whitening: FloatArray
@@ -65,158 +68,173 @@ class _Pairs:
 
 def estimate_gyro_bias(
     frames: list[FeatureFrame],
-    imu: list[ImuData],
+    intervals: Intervals,
     rig: RigProjection,
-    params: gtsam.PreintegrationCombinedParams,
     near: FloatArray | None = None,
 ) -> FloatArray | None:
     """The constant gyroscope bias (3,) rad/s over some frames, None without enough features.
 
     Args:
         frames: in the order of time.
-        imu: samples between each frame and the next.
+        intervals: IMU samples between each frame and the next.
         rig: mounting of the cameras.
-        params: of the preintegration.
         near: (3,) a bias to begin with; zero if not given.
     """
     bias = np.zeros(3) if near is None else near
-    pairs = _pairs(frames, imu, rig, params, bias)
+    pairs = _pairs(frames, intervals, rig, bias)
     if pairs is None:
         return None
     for _ in range(_ROUNDS):  # the rotation is linearised in the bias: once more at the solution
-        result = scipy.optimize.least_squares(
-            _residuals,
-            np.zeros(3),
-            _jacobian,
-            args=(pairs,),
-            loss="huber",
-            f_scale=_ROBUST_WIDTH,
-            xtol=_CONVERGED,
-            ftol=_CONVERGED,
-        )
-        bias = bias + result.x
-        if np.linalg.norm(result.x) < _LINEAR_RAD_S:
+        problem = _BiasProblem(pairs)
+        damping = TenfoldDamping(1e-3, 1e6)
+        levenberg_marquardt(problem, _MAX_STEPS, _converged, damping)
+        bias = bias + problem.change
+        if np.linalg.norm(problem.change) < _LINEAR_RAD_S:
             break
-        rotations = np.array([_rotation(samples, bias, params) for samples in imu])
-        pairs = replace(pairs, R=rotations[pairs.interval])
+        rotations, by_bias = intervals.rotations(bias)
+        pairs = replace(pairs, R=rotations[pairs.interval], by_bias=by_bias[pairs.interval])
     return bias
 
 
-def _residuals(change: FloatArray, pairs: _Pairs) -> FloatArray:
-    """Distance (P,) of each pair's normals from the plane that fits them best."""
-    return np.asarray(_Planes(change, pairs).distances)
+def _converged(attempt: Attempt) -> bool:
+    """Whether a step is the last: little is gained, or was to be gained where it was refused."""
+    gain = attempt.before - attempt.after if attempt.accepted else attempt.predicted
+    return gain < _CONVERGED * attempt.before
 
 
-def _jacobian(change: FloatArray, pairs: _Pairs) -> FloatArray:
-    """Derivative (P, 3) of the distances; exact at zero, where their rotations are linearised.
+class _BiasProblem:
+    """The robust cost of all pairs as `levenberg_marquardt` takes it (see `DampedProblem`).
 
-    The plane is the best one, so that its own change does not count. For a normal a of it in the
-    original space, the change of a · (f₁ × R f₂) by a turn θ of the second body is
-    θ · (R f₂ × (a × f₁)).
+    Attributes:
+        change: (3,) of the bias.
     """
-    planes = _Planes(change, pairs)
-    a, first, turned = planes.normals[pairs.pair], pairs.first, planes.turned
-    along = np.sum(first * turned, axis=1)[:, None] * a
-    along -= np.sum(turned * a, axis=1)[:, None] * first
-    offsets = np.sum(a * planes.crossed, axis=1)[:, None]
-    by_turn = np.add.reduceat(offsets * along, pairs.starts)
-    by_change = planes.R @ pairs.by_bias
-    slopes = np.einsum("pi,pij->pj", by_turn, by_change)
-    return np.asarray(slopes / np.maximum(planes.distances, 1e-12)[:, None])
+
+    def __init__(self, pairs: _Pairs) -> None:
+        self.change = np.zeros(3)
+        self._pairs, self._loss = pairs, RobustLoss("huber", _ROBUST_WIDTH)
+        self._planes = _Planes(self.change, pairs)
+
+    def value(self) -> float:
+        """The sum of the loss over the pairs."""
+        return float(np.sum(self._loss.value(self._planes.distances)))
+
+    def linearize(self) -> None:
+        """Gradient and Hessian with the weights of the loss."""
+        weights = self._loss.weights(self._planes.distances)[:, None]
+        gradients, self._hessian, self._scale = self._planes.derivatives(weights)
+        self._gradient = gradients.sum(axis=0)
+
+    def solve(self, damping: float) -> float:
+        """A damped Newton step; the decrease that it promises."""
+        damped = self._hessian + damping * np.diag(self._scale)
+        try:
+            root = np.linalg.cholesky(damped)
+        except np.linalg.LinAlgError:
+            return math.inf  # not convex here
+        self._step = -np.linalg.solve(damped, self._gradient)
+        return 0.5 * float(np.sum((root.T @ self._step) ** 2))
+
+    def apply(self) -> None:
+        """Move the bias."""
+        self._before = self.change, self._planes
+        self.change = self.change + self._step
+        self._planes = _Planes(self.change, self._pairs)
+
+    def undo(self) -> None:
+        """Move it back."""
+        self.change, self._planes = self._before
 
 
 class _Planes:
-    """The plane of best fit to the normals of each pair.
+    """The plane of best fit to the normals of each pair, at a change of the bias.
 
     Attributes:
-        R: (P, 3, 3) rotations from the second body to the first.
-        turned: (N, 3) second bearings in the orientation of the first body.
-        crossed: (N, 3) normals of the epipolar planes.
-        distances: (P,) root of the sum of their squared distances from the plane.
-        normals: (P, 3) what a normal is multiplied by for its distance.
+        squares: (P,) λ₀, the sum of the squared distances of the normals from the plane.
+        distances: (P,) its root.
     """
 
     def __init__(self, change: FloatArray, pairs: _Pairs) -> None:
-        self.R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
-        f = pairs.first
-        self.turned = g = np.einsum("nij,nj->ni", self.R[pairs.pair], pairs.second)
-        self.crossed = np.empty_like(f)
-        for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-            self.crossed[:, axis] = f[:, i] * g[:, j] - f[:, j] * g[:, i]
-        outer = self.crossed[:, :, None] * self.crossed[:, None, :]
-        scatter = np.add.reduceat(outer, pairs.starts)
-        white = pairs.whitening @ scatter @ pairs.whitening.transpose(0, 2, 1)
-        values, vectors = np.linalg.eigh(white)
-        self.distances = np.sqrt(np.maximum(values[:, 0], 0.0))
-        self.normals = np.einsum("pij,pi->pj", pairs.whitening, vectors[:, :, 0])
+        R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
+        # n = Σ f₁ₐ [eₐ]ₓ R f₂
+        of_products = (_CROSS @ R[:, None]).transpose(0, 2, 1, 3).reshape(-1, 3, 9)
+        white = pairs.whitening @ of_products
+        self._values, vectors = np.linalg.eigh(white @ pairs.moments @ white.transpose(0, 2, 1))
+        self._pairs, self._along = pairs, vectors.transpose(0, 2, 1) @ white
+        self.squares = np.maximum(self._values[:, 0], 0.0)
+        self.distances = np.sqrt(self.squares)
+
+    def derivatives(self, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of half the squared distances by the bias; exact at no change.
+
+        With y, y₁ and y₂ the products (9,) that the normals' coordinates along the eigenvectors are
+        linear in, λ₀ = yᵀ K y. A turn θ of the second body changes their rows by y × θ, and turns
+        the plane, whose own change counts in the second order.
+
+        Args:
+            weights: (P, 1) of the pairs.
+
+        Returns:
+            Gradients (P, 3), the Hessian (3, 3), and the scales (3,) of its damping.
+        """
+        K, J, y = self._pairs.moments, self._pairs.by_bias, self._along
+        by_turn = skew(y.reshape(-1, 3)).reshape(-1, 3, 9, 3)
+        Ky = y @ K
+        moved = by_turn.transpose(0, 1, 3, 2) @ Ky[:, 0, None, :, None]
+        moved = moved[..., 0] + Ky @ by_turn[:, 0]  # (P, 3, 3): of y·Ky, y₁·Ky and y₂·Ky
+        first = by_turn[:, 0].transpose(0, 2, 1) @ K @ by_turn[:, 0]
+        outer = Ky[:, 0].reshape(-1, 3, 3).transpose(0, 2, 1) @ y[:, 0].reshape(-1, 3, 3)
+        second = 0.5 * (outer + outer.transpose(0, 2, 1)) - self.squares[:, None, None] * np.eye(3)
+        gaps = np.maximum(self._values[:, 1:] - self._values[:, :1], _TINY)[:, :, None]
+        second -= moved[:, 1:].transpose(0, 2, 1) @ (moved[:, 1:] / gaps)
+        across = J.transpose(0, 2, 1) * weights[:, :, None]
+        gradients = (across @ (0.5 * moved[:, 0, :, None]))[..., 0]
+        convex = np.sum(across @ first @ J, axis=0)
+        return gradients, convex + np.sum(across @ second @ J, axis=0), np.diag(convex)
 
 
 def _pairs(
-    frames: list[FeatureFrame],
-    imu: list[ImuData],
-    rig: RigProjection,
-    params: gtsam.PreintegrationCombinedParams,
-    bias: FloatArray,
+    frames: list[FeatureFrame], intervals: Intervals, rig: RigProjection, bias: FloatArray
 ) -> _Pairs | None:
-    first, second, rotations, derivatives, intervals = [], [], [], [], []
+    rotations, derivatives = intervals.rotations(bias)
     turns = [rig.row_turns(k, frame) for k, frame in enumerate(frames)]
-    for k, samples in enumerate(imu):
+    which, moments, noise = [], [], []
+    for k, R in enumerate(rotations):
         before, after = frames[k], frames[k + 1]
-        R, by_bias = _rotation_by_bias(samples, bias, params)
         for camera, (one, two) in enumerate(zip(before.cameras, after.cameras, strict=True)):
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
             if len(i) >= _MIN_COMMON:
                 mounting = rig.body_R_camera[camera]
-                first.append(_bearings(one, i, mounting, turns[k][camera]))
-                second.append(_bearings(two, j, mounting, turns[k + 1][camera]))
-                rotations.append(R)
-                derivatives.append(by_bias)
-                intervals.append(k)
-    if not first:
+                first = _bearings(one, i, mounting, turns[k][camera])
+                second = _bearings(two, j, mounting, turns[k + 1][camera])
+                products = (first[:, :, None] * second[:, None, :]).reshape(-1, 9)
+                moments.append(products.T @ products)
+                noise.append(_noise(first, second @ R.T))
+                which.append(k)
+    if not which:
         return None
-    counts = np.array([len(bearings) for bearings in first])
+    interval = np.array(which)
     return _Pairs(
-        np.repeat(np.arange(len(counts)), counts),
-        np.cumsum(counts) - counts,
-        np.array(intervals),
-        np.concatenate(first),
-        np.concatenate(second),
-        np.array(rotations),
-        np.array(derivatives),
-        np.array([_whitening(*pair) for pair in zip(first, second, rotations, strict=True)]),
+        interval,
+        np.array(moments),
+        rotations[interval],
+        derivatives[interval],
+        np.asarray(np.linalg.inv(np.linalg.cholesky(np.array(noise))), np.float64),
     )
 
 
-def _whitening(first: FloatArray, second: FloatArray, R: FloatArray) -> FloatArray:
-    """The matrix (3, 3) that whitens the noise of the normals of a pair, on average.
+def _noise(first: FloatArray, turned: FloatArray) -> FloatArray:
+    """The covariance (3, 3) of the noise of the normals of a pair, on average, in σ².
 
     Noise σ perpendicular to the bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ) to Σ n nᵀ, the
     normals being n = f₁ × R f₂.
 
     Args:
         first: (N, 3) bearings.
-        second: (N, 3) those of the same features in the second frame.
-        R: (3, 3) rotation from the second body to the first.
+        turned: (N, 3) R f₂, those of the same features in the second frame.
     """
-    turned = second @ R.T
-    noise = 2.0 * np.eye(3) - (first.T @ first + turned.T @ turned) / len(first)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)))
-
-
-def _rotation_by_bias(
-    samples: ImuData, bias: FloatArray, params: gtsam.PreintegrationCombinedParams
-) -> tuple[FloatArray, FloatArray]:
-    """The rotation (3, 3) over some samples and its derivative (3, 3) by the gyroscope bias."""
-    R = _rotation(samples, bias, params)
-    moved = np.array([_rotation(samples, bias + step, params) for step in _STEP_RAD_S * np.eye(3)])
-    return R, Rotation.from_matrix(R.T @ moved).as_rotvec().T / _STEP_RAD_S
-
-
-def _rotation(
-    samples: ImuData, gyro_bias: FloatArray, params: gtsam.PreintegrationCombinedParams
-) -> FloatArray:
-    bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias)
-    return np.asarray(samples.preintegrated(bias, params).deltaRij().matrix())
+    return np.asarray(
+        2.0 * np.eye(3) - (first.T @ first + turned.T @ turned) / len(first), np.float64
+    )
 
 
 def _bearings(

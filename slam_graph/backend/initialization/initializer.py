@@ -139,7 +139,6 @@ class Initializer:
             frames,
             context.imu,
             context.projection.moving(turning),
-            context.propagation.noise.params(),
             context.config.noise,
             self._rng,
         )

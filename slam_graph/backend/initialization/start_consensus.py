@@ -20,10 +20,11 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.cost.feature_factors import eliminate_points
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.initialization.inertial_motion import Motion
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     MIN_DEPTH_M,
-    Motion,
     alignment_equations,
+    secular_multipliers,
 )
 
 _SAMPLES = 100
@@ -35,8 +36,6 @@ _REFINED = 5
 """How many of the best samples are refined by their inliers."""
 _REFINEMENTS = 3
 """How often a sample is refined by its inliers."""
-_NEWTON_STEPS = 12
-"""Steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 _RIDGE = 1e-13
 """Keeps the equations of a sample solvable that does not determine the velocity."""
 
@@ -99,10 +98,8 @@ def _extended(x: FloatArray) -> FloatArray:
 def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
     """Velocity and gravity (S, 6) of least squares under |g| = gravity, for many problems at once.
 
-    The velocity is eliminated; for gravity it is a secular equation in the Lagrange multiplier. Its
-    solution is found by Newton's method on the inverse length of g, which is nearly linear in the
-    multiplier, from the left without safeguards (Moré & Sorensen 1983). Normal equations are good
-    enough for samples; `constrained_solution` is for the final one.
+    The velocity is eliminated; for gravity it is a secular equation in the Lagrange multiplier.
+    Normal equations are good enough for samples; `constrained_solution` is for the final one.
 
     Args:
         M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.
@@ -115,14 +112,7 @@ def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
         rest = M[:, 3:, 3:] - M[:, 3:, :3] @ by_g
         values, vectors = np.linalg.eigh(np.nan_to_num(rest[:, :3, :3]))
         projected = np.einsum("sji,sj->si", vectors, rest[:, :3, 3])
-        multiplier = -values[:, :1] + 1e-12 * np.maximum(values[:, 2:], 1e-12)
-        for _ in range(_NEWTON_STEPS):
-            g = projected / (values + multiplier)
-            square = np.sum(g**2, axis=1, keepdims=True)
-            slope = np.sum(g**2 / (values + multiplier), axis=1, keepdims=True)
-            step = (np.sqrt(square) / gravity - 1.0) * square / slope
-            multiplier = multiplier + np.where(step > 0.0, step, 0.0)
-        g = projected / (values + multiplier)
+        g = projected / (values + secular_multipliers(values, projected, gravity))
         g *= gravity / np.linalg.norm(g, axis=1, keepdims=True)
         g = np.einsum("sij,sj->si", vectors, g)
         v = by_g[:, :, 3] - np.einsum("sij,sj->si", by_g[:, :, :3], g)

@@ -17,35 +17,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_factors import eliminate_points
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.initialization.inertial_motion import Motion
 from slam_graph.backend.solve.square_root import triangularize
 
 _REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """The inertial motion of the body relative to its first frame, up to velocity and gravity.
-
-    Attributes:
-        times_s: (K,) since the first frame.
-        rotations: (K, 3, 3) first_R_body.
-        displacements: (K, 3) α, the double integral of the rotated specific force.
-        velocities: (K, 3) its single integral.
-    """
-
-    times_s: FloatArray
-    rotations: FloatArray
-    displacements: FloatArray
-    velocities: FloatArray
+_NEWTON_STEPS = 12
+"""Steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,13 +145,7 @@ def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignm
     of_v, of_g, right = R[:3, :3], R[3:6, 3:6], R[3:6, 6]
     values, vectors = np.linalg.eigh(of_g.T @ of_g)
     projected = vectors.T @ (of_g.T @ right)
-
-    def excess(multiplier: float) -> float:
-        return float(np.sum((projected / (values + multiplier)) ** 2) - gravity**2)
-
-    low = -values[0] + 1e-12 * max(values[-1], 1e-12)
-    high = np.linalg.norm(projected) / gravity + values[-1]
-    multiplier = scipy.optimize.brentq(excess, low, high) if excess(low) > 0 else low
+    multiplier = secular_multipliers(values[None], projected[None], gravity)[0]
     g = vectors @ (projected / (values + multiplier))
     length = np.linalg.norm(g)
     if length == 0.0:
@@ -174,3 +153,26 @@ def constrained_solution(A: FloatArray, b: FloatArray, gravity: float) -> Alignm
     g *= gravity / length
     v = np.linalg.solve(of_v, R[:3, 6] - R[:3, 3:6] @ g)
     return Alignment(v, g)
+
+
+def secular_multipliers(values: FloatArray, projected: FloatArray, gravity: float) -> FloatArray:
+    """Lagrange multipliers (S, 1) of the length of gravity, for many problems at once.
+
+    They are the roots of ‖projected / (values + multiplier)‖ = gravity. Newton's method on the
+    inverse length, which is nearly linear in the multiplier, finds them from the left without
+    safeguards (Moré & Sorensen 1983).
+
+    Args:
+        values: (S, 3) eigenvalues of the information about gravity, ascending.
+        projected: (S, 3) right-hand sides in the basis of its eigenvectors.
+        gravity: its magnitude, m/s².
+    """
+    multiplier = -values[:, :1] + 1e-12 * np.maximum(values[:, 2:], 1e-12)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            g = projected / (values + multiplier)
+            square = np.sum(g**2, axis=1, keepdims=True)
+            slope = np.sum(g**2 / (values + multiplier), axis=1, keepdims=True)
+            step = (np.sqrt(square) / gravity - 1.0) * square / slope
+            multiplier = multiplier + np.where(step > 0.0, step, 0.0)
+    return np.asarray(multiplier)

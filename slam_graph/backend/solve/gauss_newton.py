@@ -111,9 +111,14 @@ def _step(
     return posterior.shifted(delta), delta
 
 
-def linearized(cost: Cost) -> SquareRootInformation:
-    """A cost as a Gaussian over an increment of the current estimates."""
-    return _system(cost, cost.linearize(summed=True), cost.layout())
+def linearized(cost: Cost, linear: Linearization | None = None) -> SquareRootInformation:
+    """A cost as a Gaussian over an increment of the current estimates.
+
+    Args:
+        cost: of some estimates.
+        linear: its linearisation there, summed up, where it is known already.
+    """
+    return _system(cost, linear or cost.linearize(summed=True), cost.layout())
 
 
 def _system(
