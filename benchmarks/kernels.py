@@ -9,7 +9,7 @@ features' positions being eliminated). Each way begins with its linearisation:
 - `rows`: null-space rows of each feature by Householder's reflections, then QR of all rows;
 - `sum`: the sum of the Schur complements, then Cholesky; both in NumPy and compiled;
 - `gtsam_cholesky` and `gtsam_qr`: `linearize` with factors that exist, then elimination of the
-  features (`eliminatePartialMultifrontal`) and of the poses.
+  features (`eliminatePartialSequential`) and of the poses.
 
 Times are CPU times, the least of a few rounds in which all ways take turns, over GTSAM's with
 Cholesky. All ways must agree to 1e-9 of the largest information. `elimination` looks at windows of
@@ -233,7 +233,7 @@ def root_by_gtsam(problem: Problem, *eliminate: Any) -> Any:
     """The triangle by GTSAM, as the conditionals of the poses; by Cholesky if not said."""
     linear = problem.graph.linearize(problem.values)
     features = [L(j) for j in problem.obs.ids.tolist()]
-    rest = linear.eliminatePartialMultifrontal(features, *eliminate)[1]
+    rest = linear.eliminatePartialSequential(features, *eliminate)[1]
     return rest.eliminateSequential(pose_order(problem), *eliminate)
 
 

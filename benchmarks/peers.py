@@ -26,7 +26,7 @@ import numpy as np
 from benchmarks.metric import Metric, info
 from benchmarks.peer_clip import CAUSAL_FILE, COSTS_FILE, FINAL_FILE
 from benchmarks.running import Errors, Run
-from benchmarks.speed import ONE_THREAD, RECORDING, UNIT, parts, undisturbed
+from benchmarks.speed import ONE_THREAD, RECORDING, UNIT, parts, worker
 from benchmarks.suite import CORE, Benchmark, Outcome
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.geometry.trajectory import Trajectory
@@ -86,7 +86,7 @@ def measure(data: Path) -> Outcome:
 
 def own(recording: Path, name: str, truth: Trajectory) -> list[Metric]:
     """Cost of the causal part; errors of the causal estimate, and of the one after adjustment."""
-    timed = undisturbed("interleaved", recording, name)
+    timed = worker("benchmarks.speed_worker", "interleaved", str(recording), name)
     cost = next(m for m in parts(timed) if m.key == "cost_mean")
     done = Run(recording, name, 2, final_ba=True)
     figures = [info("cost", cost.value, UNIT), *errors("causal", truth, done.result.trajectory)]
