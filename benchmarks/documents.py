@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
+from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
 from slam_graph.errors import DataError
 
@@ -32,6 +33,10 @@ class Figures:
                 f"{benchmark_of(key)} --update-baseline`"
             )
         return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+    def has(self, key: str) -> bool:
+        """Whether the baseline has a figure."""
+        return value_of(self.baseline, key) is not None
 
     def all(self, keys: Sequence[str], digits: int, separator: str = " / ") -> str:
         """Several figures in one cell."""
@@ -119,6 +124,63 @@ PARTS = {
 }
 
 
+def peers(figures: Figures) -> Iterator[str]:
+    """Ours beside other systems in one run; what was not measured is left out."""
+    yield "| | sensors | cost [flows] | causal: ATE [m] / orientation [deg] / covered [s] | final |"
+    yield "|---|---|---:|---:|---:|"
+    both = "two cameras, IMU"
+    sensors = {**dict.fromkeys(CORE, both), "orbslam3": both, "cuvslam": "two cameras"}
+    for name, used in sensors.items():
+        key = f"peers.{name}"
+        if not figures.has(f"{key}.cost"):
+            continue
+        cells = [
+            " / ".join(figures(f"{key}.{kind}.{part}", digits) for part, digits in ERRORS)
+            if figures.has(f"{key}.{kind}.ate")
+            else ""
+            for kind in ("causal", "final")
+        ]
+        yield line(OTHERS.get(name, f"`{name}`"), used, figures(f"{key}.cost", 1), *cells)
+
+
+OTHERS = {"orbslam3": "ORB-SLAM3", "cuvslam": "cuVSLAM, CPU"}
+ERRORS = (("ate", 4), ("orientation", 2), ("coverage", 1))
+
+
+def kernels(figures: Figures) -> Iterator[str]:
+    """Ways to reduce features to the poses, as multiples of GTSAM's Cholesky."""
+    yield "| | " + " | ".join(f"{j} features × {i} poses" for j, i in SIZES.values()) + " |"
+    yield "|---|" + "---:|" * len(SIZES)
+    for way, label in WAYS.items():
+        yield line(label, *(figures(f"kernels.{size}.{way}", 2) for size in SIZES))
+
+
+WAYS = {
+    "gtsam_cholesky": "GTSAM, Cholesky, ms CPU",
+    "gtsam_linearize": "its linearisation",
+    "gtsam_build": "making its factors, not included",
+    "gtsam_qr": "GTSAM, QR",
+    "rows_numpy": "null-space rows and QR, NumPy",
+    "rows_compiled": "the same, rows compiled",
+    "sum_numpy": "sum of Schur complements, NumPy",
+    "sum_compiled": "the same, compiled: **the engine's**",
+    "linearize": "its linearisation",
+}
+
+
+def growth(figures: Figures) -> Iterator[str]:
+    """Cost of a frame minute by minute; algorithms that were not measured yet are left out."""
+    yield "| | " + " | ".join(f"min {part}" for part in MINUTES) + " | 8 to 10 over 3 to 5 |"
+    yield "|---|" + "---:|" * (len(MINUTES) + 1)
+    for name in CORE:
+        if figures.has(f"growth.{name}.growth"):
+            cells = [figures(f"growth.{name}.cost_{part}", 2) for part in MINUTES]
+            yield line(f"`{name}`", *cells, figures(f"growth.{name}.growth", 2))
+
+
+MINUTES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10)
+
+
 def monte_carlo(figures: Figures) -> Iterator[str]:
     """NEES with and without first-estimates Jacobians."""
     yield "| | NEES pose | orientation | position | without: pose | orientation | position |"
@@ -178,5 +240,8 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "held_out": held_out,
     "performance": performance,
     "performance_parts": performance_parts,
+    "peers": peers,
+    "kernels": kernels,
+    "growth": growth,
 }
 """By the name in the marker of a document."""

@@ -10,8 +10,8 @@ from time import thread_time
 import cv2
 import numpy as np
 
+from benchmarks.clocks import Watch, time_flow
 from benchmarks.metric import QUANTISED_TOLERANCE, TIMING_TOLERANCE, Metric, info
-from benchmarks.speed_worker import Watch, time_flow
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.experiment.track_quality import TrackQuality, TrackSummary

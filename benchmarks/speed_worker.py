@@ -8,7 +8,6 @@ python -m benchmarks.speed_worker MODE RECORDING ALGORITHM [CAMERAS [SECONDS]]
 from __future__ import annotations
 
 import json
-import os
 import resource
 import sys
 import tempfile
@@ -17,11 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from benchmarks.clocks import Image, Watch, hold_to_one_core, time_flow
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.formats.euroc import EurocSequence
@@ -30,11 +27,6 @@ from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
 from slam_graph.pipeline.stage import EstimatedFrame
 
-REFERENCE_POINTS = 200
-REFERENCE_WINDOW = (21, 21)
-REFERENCE_LEVELS = 3
-
-Image = NDArray[np.uint8]
 Table = dict[str, Any]
 
 
@@ -80,30 +72,6 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
         "wall_s": result.ending.wall_s,
         "cpu_s": cpu_s,
     }
-
-
-class Watch:
-    """Times the same thing again and again.
-
-    Attributes:
-        wall: milliseconds of each time.
-        cpu: milliseconds that this thread was computing in it; others cannot lengthen these.
-    """
-
-    def __init__(self) -> None:
-        self.wall: list[float] = []
-        self.cpu: list[float] = []
-        self.start()
-
-    def start(self) -> None:
-        """Begin."""
-        self._since = time.perf_counter(), time.thread_time()
-
-    def stop(self) -> None:
-        """Note the time since the beginning."""
-        wall_s, cpu_s = time.perf_counter() - self._since[0], time.thread_time() - self._since[1]
-        self.wall.append(1e3 * wall_s)
-        self.cpu.append(1e3 * cpu_s)
 
 
 class DecodedInTurn(EurocSequence):
@@ -156,22 +124,6 @@ class Reference(NullViewer, NullProgress):
         self.frames.start()
 
 
-def time_flow(before: Image, after: Image, watch: Watch) -> None:
-    """Time the flow of exactly 200 corners, with OpenCV's other defaults."""
-    corners = cv2.goodFeaturesToTrack(before, REFERENCE_POINTS, 1e-3, 10).reshape(-1, 2)
-    points = np.resize(corners, (REFERENCE_POINTS, 2)).astype(np.float32)
-    watch.start()
-    cv2.calcOpticalFlowPyrLK(
-        before,
-        after,
-        points,
-        np.empty_like(points),
-        winSize=REFERENCE_WINDOW,
-        maxLevel=REFERENCE_LEVELS,
-    )
-    watch.stop()
-
-
 def peak_memory_mb() -> float:
     """High-water mark of resident memory of this program.
 
@@ -184,16 +136,6 @@ def peak_memory_mb() -> float:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-
-
-def hold_to_one_core() -> None:
-    """Keep all threads of this process, and those it will start, on one core."""
-    cv2.setNumThreads(1)
-    if not hasattr(os, "sched_setaffinity"):
-        return
-    core = {max(os.sched_getaffinity(0))}
-    for thread in os.listdir("/proc/self/task"):
-        os.sched_setaffinity(int(thread), core)
 
 
 MODES: dict[str, Callable[[Path, RunConfig], Table]] = {

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""One long simulated stereo flight in a process of its own; prints what its frames cost as JSON.
+
+python -m benchmarks.growth_worker ALGORITHM DURATION_S
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from benchmarks.clocks import Watch, hold_to_one_core, time_flow
+from slam_graph.config import load_config
+from slam_graph.pipeline.observers import NullProgress, NullViewer
+from slam_graph.pipeline.run_recording import run
+from slam_graph.pipeline.stage import EstimatedFrame
+from slam_graph.simulation.simulation_config import (
+    FlightConfig,
+    LandmarkConfig,
+    SimulationConfig,
+    TrackConfig,
+)
+from slam_graph.simulation.simulator import simulate
+
+SIMULATION = SimulationConfig(
+    trajectory="figure8",
+    cameras=2,
+    rate_hz=10.0,
+    flight=FlightConfig(hover_s=0.0),
+    landmarks=LandmarkConfig(density=10.0),
+    tracks=TrackConfig(features=40),
+)
+"""Tracks and IMU samples are simulated while they are read; their cost does not depend on time."""
+
+FLOW_EVERY = 10
+"""So many frames share one time of the reference."""
+
+IMAGE_SIZE = (480, 752)
+
+
+class Clock(NullViewer, NullProgress):
+    """Times frames, and now and then between them a Lucas-Kanade flow of an image that is noise.
+
+    Attributes:
+        flows: time of the reference, for each `FLOW_EVERY` frames.
+        frames: time of each frame: simulation, back end, and the notes that are kept of it.
+    """
+
+    def __init__(self) -> None:
+        self.flows = Watch()
+        self.frames = Watch()
+        noise = np.random.default_rng(0).integers(0, 255, IMAGE_SIZE, np.uint8)
+        self._before, self._after = noise, np.ascontiguousarray(np.roll(noise, 2, axis=1))
+
+    def open(self, rig: object, truth: object) -> None:
+        """The first frame begins."""
+        self.frames.start()
+
+    def show(self, frame: EstimatedFrame, estimator: object) -> None:
+        """A frame is done; then the next one begins."""
+        self.frames.stop()
+        if len(self.frames.cpu) % FLOW_EVERY == 0:
+            time_flow(self._before, self._after, self.flows)
+        self.frames.start()
+
+
+def main(algorithm: str, duration_s: str) -> None:
+    """Run, and print the CPU milliseconds of frames and of the reference."""
+    hold_to_one_core()
+    config = load_config(
+        overrides=["final_ba.enabled=false", "overlap=false"],
+        algorithm=algorithm,
+        cameras=SIMULATION.cameras,
+    )
+    sequence = simulate(SIMULATION.model_copy(update={"duration_s": float(duration_s)}))
+    clock = Clock()
+    with threadpool_limits(limits=1):
+        run(sequence, config, viewer=clock, progress=clock).check()
+    print(json.dumps({"frame": clock.frames.cpu, "reference": clock.flows.cpu}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
