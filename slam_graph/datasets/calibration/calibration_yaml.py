@@ -14,6 +14,7 @@ import yaml
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
+from slam_graph.settings import YamlTextError, parse_node
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
@@ -129,12 +130,9 @@ def parse_yaml(text: str, path: str | Path) -> YamlValue:
     if text.startswith("%YAML"):
         text = "#" + text
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise DataError(f"{path}:{line}: not valid YAML ({error.problem})") from None
-    except yaml.YAMLError:
-        raise DataError(f"{path}: not valid YAML") from None
+        node = parse_node(text)
+    except YamlTextError as fault:
+        raise DataError(f"{fault.where(path)}: not valid YAML ({fault.reason})") from None
     if not isinstance(node, yaml.MappingNode):
         raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
     return YamlValue(Path(path), node)
