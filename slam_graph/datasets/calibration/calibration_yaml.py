@@ -38,7 +38,7 @@ class YamlValue:
     def where(self) -> str:
         """File, line and key, for messages."""
         return f"{self.path}:{self.node.start_mark.line + 1}" + (
-            f": {self.key}" if self.key else ""
+            f": {self.key[:60]}" if self.key else ""
         )
 
     def items(self) -> Iterator[tuple[str, YamlValue]]:
@@ -71,9 +71,9 @@ class YamlValue:
         try:
             value = float(self.text())
         except ValueError:
-            raise DataError(f"{self.where}: '{self.text()}' is not a number") from None
+            raise DataError(f"{self.where}: '{self.text()[:60]}' is not a number") from None
         if not np.isfinite(value):
-            raise DataError(f"{self.where}: '{self.text()}' is not a finite number")
+            raise DataError(f"{self.where}: '{self.text()[:60]}' is not a finite number")
         return value
 
     def elements(self) -> list[YamlValue]:

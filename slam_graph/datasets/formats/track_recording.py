@@ -224,7 +224,7 @@ class TrackRecordingSequence(RecordedSequence):
         version = meta.require("version")
         if version.text() != str(FORMAT_VERSION):
             raise DataError(
-                f"{version.where}: recording of version {version.text()}, this program reads "
+                f"{version.where}: recording of version {version.text()[:20]}, this program reads "
                 f"version {FORMAT_VERSION}; record it again"
             )
         recorded = read_kalibr(path / CALIBRATION)

@@ -121,7 +121,7 @@ def _reason(message: str, line: str) -> str:
     if cell is None:
         return f"cannot read the row '{line.strip()[:80]}'"
     kind = "an integer" if cell[2].startswith("int") else "a number"
-    return f"'{cell[1]}' in column {cell[3]} is not {kind}"
+    return f"'{cell[1][:60]}' in column {cell[3]} is not {kind}"
 
 
 def _loadtxt(
