@@ -6,20 +6,26 @@ import bz2
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from recordings import write_euroc
 from recordings_ros import bag_writer, write_bag
+from typer.testing import CliRunner
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
+from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
+from slam_graph.pose_graph.graph import InformationRepair
+from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.results.result_files import ResultFolder, folder_name
 from slam_graph.settings.bounded_yaml import YamlTextError, parse_value
 from slam_graph.simulation.simulator import simulate
@@ -200,6 +206,46 @@ def read_all(path: Path) -> None:
     sequence.initial_state()
     for _ in sequence.packets():
         pass
+
+
+# --- pose graphs ----------------------------------------------------------------------------------
+
+INDEFINITE = "10 0 0 0 20 0 10 0 0 0 0 10 0 0 0 5 0 0 5 0 5"
+"""Upper triangle of an information of x, y, z and angles; x and the angle of y belong together."""
+
+
+def write_indefinite(path: Path) -> Path:
+    pose = "0.1 0 0 0 0 0 1"
+    edges = "".join(f"EDGE_SE3:QUAT {k} {k + 1} {pose} {INDEFINITE}\n" for k in range(3))
+    path.write_text(f"{edges}EDGE_SE3:QUAT 0 3 {pose} 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n")
+    return path
+
+
+def test_indefinite_information_is_refused_with_a_count(tmp_path: Path) -> None:
+    path = write_indefinite(tmp_path / "graph.g2o")
+    with pytest.raises(DataError, match=r"graph\.g2o:\d: .*nor are those of 2 other edges"):
+        read_pose_graph(path)
+
+
+def test_indefinite_information_is_repaired_and_counted(tmp_path: Path) -> None:
+    path = write_indefinite(tmp_path / "graph.g2o")
+    made = {}
+    for repair in get_args(InformationRepair):
+        diagnostics = Diagnostics()
+        graph = read_pose_graph(path, diagnostics, repair=repair)
+        assert diagnostics.counts["pose_graph_information_repaired"] == 3
+        assert np.linalg.eigvalsh(graph.information)[:, 0].min() > 0
+        np.testing.assert_array_equal(graph.information[3], np.eye(6))
+        made[repair] = graph.information[0]
+    np.testing.assert_allclose(made["isotropic"], np.diag([10.0] * 3 + [5.0] * 3))
+    values = np.linalg.eigvalsh(made["nearest"])
+    np.testing.assert_allclose(values[0], 1e-6 * values[-1], rtol=1e-6)
+    both = ["--information", "quaternion", "--information", "nearest", "--output", str(tmp_path)]
+    assert CliRunner().invoke(app, ["optimize", str(path), *both]).exit_code == 0
+    clash = CliRunner().invoke(app, ["optimize", str(path), *both, "--information", "isotropic"])
+    assert isinstance(clash.exception, ConfigError)
+    with pytest.raises(ConfigError, match="unknown repair"):
+        read_pose_graph(path, repair="any")  # type: ignore[arg-type]
 
 
 # --- bags and compressed files --------------------------------------------------------------------
