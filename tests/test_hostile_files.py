@@ -77,6 +77,13 @@ def test_an_override_is_bounded_like_a_file() -> None:
             load_config(overrides=[text])
 
 
+@pytest.mark.parametrize("value", [".inf", ".nan", "1e400"])
+def test_settings_are_finite(value: str) -> None:
+    for key in ("duration_s", "start_s", "backend.noise.pixel_sigma", "seed"):
+        with pytest.raises(ConfigError, match=key):
+            load_config(overrides=[f"{key}={value}"])
+
+
 def test_aliases_are_read_within_the_bounds() -> None:
     value, _ = parse_value("a: &x {p: [1, 2]}\nb: *x\nc: {<<: *x, q: 3}\nd: &y 5\ne: *y\n")
     both = {"p": [1, 2]}

@@ -163,12 +163,12 @@ def _load(path: Path, required: tuple[str, ...], shapes: dict[str, _Shape]) -> d
         raise DataError(f"{path}: no array '{missing[0]}' in this file; {_AGAIN}")
     count = arrays["stamps_ns"].size if "stamps_ns" in arrays else 0
     for name, array in arrays.items():
-        kind = "i" if name.startswith("stamp") else "f"
+        dtype = np.dtype("i8" if name.startswith("stamp") else "f8")
         shape = tuple(count if size == "N" else size for size in shapes[name])
-        if array.shape != shape or array.dtype != np.dtype(f"{kind}8"):
+        if array.shape != shape or array.dtype != dtype:
             raise DataError(
                 f"{path}: '{name}' has shape {array.shape} and type {array.dtype}, expected "
-                f"{shape} and {np.dtype(f'{kind}8')}; {_AGAIN}"
+                f"{shape} and {dtype}; {_AGAIN}"
             )
         if not np.isfinite(array).all():
             raise DataError(f"{path}: '{name}' is not finite; {_AGAIN}")
