@@ -9,6 +9,8 @@ import pytest
 from pose_graphs import laps, turns
 from scipy.optimize import approx_fprime
 
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
 from slam_graph.pose_graph import certificate
 from slam_graph.pose_graph.certificate import certify
 from slam_graph.pose_graph.graph import PoseGraph, Poses
@@ -34,6 +36,37 @@ def test_the_optima_of_sesync_are_found_and_certified(data_dir: Path, name: str)
     assert found.certified
     assert found.objective == pytest.approx(SESYNC_OPTIMA[name], rel=1e-6)
     assert found.bound <= found.objective * (1 + 1e-9)
+
+
+@pytest.mark.data
+def test_a_flat_valley_is_followed_to_its_end(data_dir: Path) -> None:
+    """The Hessian of ais2klinik has entries that differ by many orders of magnitude."""
+    graph = read_pose_graph(data_dir / "posegraphs" / "ais2klinik.g2o")
+    found = certify(graph, optimize_pose_graph(graph).poses)
+    assert found.converged
+    assert found.certified
+    assert found.objective == pytest.approx(188.5018, abs=1e-3)
+
+
+@pytest.mark.data
+def test_the_optimum_of_a_repaired_graph_is_that_of_sesync(data_dir: Path) -> None:
+    path, diagnostics = data_dir / "posegraphs" / "cubicle.g2o", Diagnostics()
+    with pytest.raises(DataError, match="nor are those of 5020 other edges"):
+        read_pose_graph(path)
+    graph = read_pose_graph(path, diagnostics, repair="isotropic")
+    assert diagnostics.counts["pose_graph_information_repaired"] == 5021
+    found = certify(graph, optimize_pose_graph(graph).poses)
+    assert found.certified
+    assert found.objective == pytest.approx(717.126, abs=1e-3)
+
+
+def test_steps_that_do_not_converge_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, truth = laps(2, 0.1)
+    assert certify(graph, truth).converged
+    monkeypatch.setattr(certificate, "_MAX_ATTEMPTS", 1)
+    found = certify(graph, truth)
+    assert not found.converged
+    assert found.newton_steps == 1
 
 
 @pytest.mark.data

@@ -21,6 +21,8 @@ from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, B
 from slam_graph.errors import DataError
 
 _BZIP2_MAGIC = b"BZh"
+_MAX_UNPACKED, _MIN_UNPACKED = 50, 2**20
+"""A file may unpack to so many times its size and bytes more; texts of numbers do to 5 times."""
 _HEADER = 3
 _OBSERVATION = 4
 """Numbers of the header and of an observation."""
@@ -98,13 +100,32 @@ def _text(path: Path) -> str:
     try:
         content = path.read_bytes()
         if content.startswith(_BZIP2_MAGIC):
-            content = bz2.decompress(content)
+            content = _unpacked(content)
     except OSError as error:
         reason = error.strerror or "damaged bzip2 data"
         raise DataError(f"{path}: cannot be read ({reason})") from None
-    except ValueError:
-        raise DataError(f"{path}: cannot be read (bzip2 data cut short)") from None
+    except ValueError as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
     return content.decode("ascii", errors="replace")
+
+
+def _unpacked(content: bytes) -> bytes:
+    """Unpack bzip2 data of one or more streams.
+
+    Raises:
+        OSError, ValueError: if it is damaged, cut short, or unpacks to far more than numbers do.
+    """
+    most, found, size = _MAX_UNPACKED * len(content) + _MIN_UNPACKED, [], 0
+    while content.startswith(_BZIP2_MAGIC):
+        unpacker = bz2.BZ2Decompressor()
+        found.append(unpacker.decompress(content, max(most - size, 0) + 1))
+        size += len(found[-1])
+        if size > most:
+            raise ValueError(f"it unpacks to more than {_MAX_UNPACKED} times its size")
+        if not unpacker.eof:
+            raise ValueError("bzip2 data cut short")
+        content = unpacker.unused_data
+    return b"".join(found)
 
 
 def _numbers(path: Path, text: str) -> FloatArray:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from zipfile import is_zipfile
@@ -32,6 +33,15 @@ _Intrinsics = Literal["per_camera", "shared", "fixed"]
 _Robust = Literal["none", "gnc", "huber", "cauchy", "geman_mcclure", "dcs", "truncated"]
 
 
+class _Information(StrEnum):
+    """The values of `--information`; Typer takes no list of literals."""
+
+    ANGLE = "angle"
+    QUATERNION = "quaternion"
+    NEAREST = "nearest"
+    ISOTROPIC = "isotropic"
+
+
 def optimize(
     file: Annotated[
         Path,
@@ -56,11 +66,12 @@ def optimize(
         typer.Option("--intrinsics", help="Which intrinsics bundle adjustment estimates."),
     ] = None,
     information: Annotated[
-        Literal["angle", "quaternion"] | None,
+        list[_Information] | None,
         typer.Option(
             "--information",
             help="Which rotation error the information of 3D edges is for: GTSAM's (angle, the "
-            "default) or g2o's (quaternion).",
+            "default) or g2o's (quaternion); and what stands in for matrices that are not positive "
+            "definite: the nearest that is, or what is isotropic in them. Repeatable.",
         ),
     ] = None,
     certify: Annotated[
@@ -108,16 +119,36 @@ def optimize(
         _refuse({"--intrinsics": intrinsics}, "bundle adjustment", file)
         graph_policy = read_policy(PoseGraphPolicy, config, set_ or [], {**loss, **of_graphs})
         wanted = Wanted(certify, covariances)
-        meaning = information or "angle"
+        meaning, repair = _meaning_and_repair(information or [])
         optimize_pose_graph_file(
-            file, meaning, graph_policy, wanted, save, output, as_json, watching
+            file, meaning, repair, graph_policy, wanted, save, output, as_json, watching
         )
         return
     flags = {"--certify": certify or None, "--covariances": covariances or None}
-    others = {"--method": method, "--init": initialization, "--information": information}
+    others = {"--method": method, "--init": initialization, "--information": information or None}
     _refuse({**others, **flags}, "pose graphs", file)
     bundle_policy = read_policy(BalPolicy, config, set_ or [], {**loss, **of_bundles})
     optimize_bal(file, bundle_policy, save, output, as_json, watching)
+
+
+def _meaning_and_repair(
+    given: list[_Information],
+) -> tuple[Literal["angle", "quaternion"], Literal["nearest", "isotropic"] | None]:
+    """What information matrices mean, and how they are repaired.
+
+    Raises:
+        ConfigError: if two of a kind are given.
+    """
+    kinds = _Information
+    if {kinds.ANGLE, kinds.QUATERNION} <= set(given) or {kinds.NEAREST, kinds.ISOTROPIC} <= set(
+        given
+    ):
+        raise ConfigError(f"--information: {' and '.join(given)} exclude each other")
+    meaning: Literal["angle", "quaternion"] = "quaternion" if kinds.QUATERNION in given else "angle"
+    repair: Literal["nearest", "isotropic"] | None = None
+    if kinds.NEAREST in given or kinds.ISOTROPIC in given:
+        repair = "nearest" if kinds.NEAREST in given else "isotropic"
+    return meaning, repair
 
 
 def _seen_format(file: Path) -> _Format:

@@ -18,7 +18,7 @@ from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy
+    from slam_graph.pose_graph import InformationRepair, PoseGraph, PoseGraphPolicy
     from slam_graph.results import PoseGraphResult
 
 
@@ -38,6 +38,7 @@ class Wanted:
 def optimize_pose_graph_file(
     file: Path,
     information: Literal["angle", "quaternion"],
+    repair: InformationRepair | None,
     policy: PoseGraphPolicy,
     wanted: Wanted,
     save: Path | None,
@@ -54,7 +55,7 @@ def optimize_pose_graph_file(
     seconds: dict[str, float] = {}
     with collected_log() as log:
         with timed(seconds, "read"):
-            graph = read_pose_graph(file, diagnostics, information)
+            graph = read_pose_graph(file, diagnostics, information, repair)
         result = _solve(graph, policy, diagnostics, seconds, wanted)
         folder, files = write_result(result, graph.name, output, log)
         if save is not None:
@@ -121,6 +122,9 @@ def _overview(metrics: dict[str, Any]) -> Iterator[tuple[str, str]]:
             f"{verdict}: SE-Sync's objective is {certificate['objective']:.8g} and cannot be below "
             f"{certificate['bound']:.8g}",
         )
+        if not certificate["converged"]:
+            steps = certificate["newton_steps"]
+            yield "", f"Newton's method stopped after {steps} steps, before it had converged"
         yield (
             "",
             f"at {certificate['moved_m']:.3g} m, {certificate['moved_deg']:.3g} deg from the "

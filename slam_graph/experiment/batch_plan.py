@@ -22,6 +22,7 @@ from slam_graph.datasets import DATASETS
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.settings_hash import settings_hash
+from slam_graph.results import folder_name
 from slam_graph.settings import ConfigTree, Settings
 
 logger = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ class Entry(Settings):
 
     data: str
     """Path, relative to the list."""
-    name: str | None = Field(default=None, pattern=r"^\w[\w.-]*$")
+    name: str | None = Field(default=None, pattern=r"^\w[\w.-]*$", max_length=100)
     """Name of the folder of results; that of the recording if it is left out."""
     format: str | None = None
     calibration: str | None = None
@@ -301,7 +302,7 @@ def _name(place: tuple[str, ...], endings: Mapping[tuple[str, ...], int]) -> str
     depths = range(1, len(place) + 1)
     depth = next((depth for depth in depths if endings[place[-depth:]] == 1), len(place))
     parts = [part.strip("/") for part in place[-depth:]]
-    return re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording"
+    return folder_name(re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording")
 
 
 def _state(paths: Iterable[str]) -> str:

@@ -45,9 +45,10 @@ _GAP_PER_EDGE = 1e-9
 _ROUNDING = 1e-12
 """A step that is predicted to lower F by no more than this part of it has reached the minimum."""
 
-_MAX_ATTEMPTS = 100
-_FIRST_DAMPING, _MAX_DAMPING = 1e-6, 1e6
-"""Relative to the mean of the diagonal of the Hessian."""
+_MAX_ATTEMPTS = 300
+_FIRST_DAMPING, _MAX_DAMPING = 1e-12, 1e6
+"""Relative to the mean of the diagonal of the Hessian, whose entries differ by many orders of
+magnitude: damping that is strong beside the smallest makes the way along a flat valley endless."""
 
 _GENERATORS = {
     2: np.array([[[0.0, -1.0], [1.0, 0.0]]]),
@@ -74,6 +75,7 @@ class Certificate(Displayed):
         poses: the local minimum of F that Newton's method reaches from the estimate.
         moved_m, moved_deg: root-mean-square distance of `poses` from the estimate.
         newton_steps: number of Newton steps.
+        converged: whether they reached that minimum; if not, `poses` are where they stopped.
     """
 
     certified: bool
@@ -84,6 +86,7 @@ class Certificate(Displayed):
     moved_m: float
     moved_deg: float
     newton_steps: int
+    converged: bool = True
 
     def __repr__(self) -> str:
         found = "certified" if self.certified else "not certified"
@@ -97,7 +100,7 @@ class Certificate(Displayed):
             "smallest eigenvalue": f"{self.smallest_eigenvalue:.3g}",
             "poses": len(self.poses),
             "moved": f"{self.moved_m:.3g} m, {self.moved_deg:.3g}° RMS",
-            "Newton steps": self.newton_steps,
+            "Newton steps": f"{self.newton_steps}{'' if self.converged else ', not converged'}",
         }
 
     @property
@@ -117,7 +120,7 @@ def certify(graph: PoseGraph, estimate: Poses) -> Certificate:
         EstimationError: if the smallest eigenvalue cannot be found.
     """
     B = whitened_rows(graph)
-    poses, steps = _refine(graph, B, estimate)
+    poses, steps, converged = _refine(graph, B, estimate)
     S, trace = _dual(B, poses)
     smallest = _smallest_eigenvalue(S, graph)
     objective = chordal_cost(graph, poses)
@@ -135,11 +138,15 @@ def certify(graph: PoseGraph, estimate: Poses) -> Certificate:
             np.degrees(np.sqrt(np.mean(Rotation.from_matrix(moved.rotations).magnitude() ** 2)))
         ),
         newton_steps=steps,
+        converged=converged,
     )
 
 
-def _refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
-    """The local minimum of SE-Sync's objective next to given poses, and the number of steps.
+def _refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int, bool]:
+    """The local minimum of SE-Sync's objective next to given poses.
+
+    Returns:
+        The poses, the number of steps, and whether they converged.
 
     Newton's method with the exact Riemannian Hessian, which is S in the tangents; damped where it
     is not positive definite or a step does not lower F.
@@ -153,7 +160,7 @@ def _refine(graph: PoseGraph, B: csr_matrix, poses: Poses) -> tuple[Poses, int]:
         _FIRST_DAMPING, _MAX_DAMPING, relief=0.01, negligible=10.0 * _FIRST_DAMPING
     )
     steps = levenberg_marquardt(problem, _MAX_ATTEMPTS, converged, damping)
-    return problem.poses, steps.accepted
+    return problem.poses, steps.accepted, steps.converged
 
 
 class _Chordal:

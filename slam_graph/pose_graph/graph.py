@@ -28,6 +28,10 @@ from slam_graph.geometry import Trajectory
 
 RotationInformation = Literal["angle", "quaternion"]
 
+InformationRepair = Literal["nearest", "isotropic"]
+"""What stands in for an information matrix that is not positive definite: the nearest one that is,
+or the isotropic information of its blocks of translation and rotation, as SE-Sync takes it."""
+
 _MAX_STAMP_S = 9_000_000_000
 """Larger ids, taken as seconds, do not fit into nanoseconds."""
 

@@ -30,7 +30,8 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.pose_graph.graph import PoseGraph, Poses, RotationInformation
+from slam_graph.pose_graph.graph import InformationRepair, PoseGraph, Poses, RotationInformation
+from slam_graph.pose_graph.information_repair import positive_definite
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +104,7 @@ def read_pose_graph(
     path: Path | str,
     diagnostics: Diagnostics | None = None,
     rotation_information: RotationInformation = "angle",
+    repair: InformationRepair | None = None,
 ) -> PoseGraph:
     """Read a pose graph.
 
@@ -111,6 +113,8 @@ def read_pose_graph(
         diagnostics: counts repairs.
         rotation_information: whether the information of 3D rotations belongs to the angle (GTSAM)
             or to the vector part of the quaternion (g2o).
+        repair: what stands in for information matrices that are not positive definite; without it
+            they are refused.
 
     Faults that do not change the problem are repaired and counted in `diagnostics`, and so are
     lines of unknown kinds, which are skipped.
@@ -119,11 +123,15 @@ def read_pose_graph(
         DataError: naming file and line, if the file cannot be read, holds no edges, is cut short,
             has an edge to a missing vertex, numbers that are not finite, or an information matrix
             that is not positive definite.
-        ConfigError: if `rotation_information` is unknown.
+        ConfigError: if `rotation_information` or `repair` is unknown.
     """
     if rotation_information not in get_args(RotationInformation):
         hint = closest(str(rotation_information), get_args(RotationInformation))
         raise ConfigError(f"unknown rotation_information '{rotation_information}'; {hint}")
+    if repair is not None and repair not in get_args(InformationRepair):
+        raise ConfigError(
+            f"unknown repair '{repair}'; {closest(str(repair), get_args(InformationRepair))}"
+        )
     path, diagnostics = Path(path), diagnostics or Diagnostics()
     blocks = [_parse(rows, tag) for tag, rows in _by_kind(path, diagnostics).items()]
     vertices = [block for block in blocks if block.ids.shape[1] == 1]
@@ -139,6 +147,7 @@ def read_pose_graph(
         kept = _first_of_each_id(vertex_rows, vertex_ids[:, 0], diagnostics)
         keys, estimates = vertex_ids[kept, 0], poses.select(kept)
     edges = _rows_of_keys(keys, ids, rows)
+    information = positive_definite(information, rows, repair, diagnostics)
     graph = PoseGraph(
         keys, estimates, edges, measured, information, rotation_information, path.stem
     )
@@ -275,9 +284,8 @@ def _checked(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGrap
     """The graph without edges from a pose to itself; unconnected components are counted.
 
     Raises:
-        DataError: if an information matrix is not positive definite, or no edge is left.
+        DataError: if no edge is left.
     """
-    _check_information(graph.information, rows)
     loops = graph.edges[:, 0] == graph.edges[:, 1]
     for row in np.flatnonzero(loops).tolist():
         diagnostics.warn("pose_graph_edge_to_itself", f"{rows.where(row)}: left out")
@@ -292,19 +300,6 @@ def _checked(graph: PoseGraph, rows: Rows, diagnostics: Diagnostics) -> PoseGrap
             f"pose {key} is fixed",
         )
     return graph
-
-
-def _check_information(information: FloatArray, rows: Rows) -> None:
-    """Check that all information matrices are positive definite."""
-    try:
-        np.linalg.cholesky(information)
-    except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(information)[:, 0]
-        edge = int(np.argmin(smallest))
-        raise DataError(
-            f"{rows.where(edge)}: the information matrix is not positive definite "
-            f"(smallest eigenvalue {smallest[edge]:.3g})"
-        ) from None
 
 
 def g2o_lines(graph: PoseGraph, poses: Poses) -> Iterator[str]:

@@ -8,9 +8,11 @@ import csv
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,26 @@ def refuse_to_replace(path: Path, force: bool) -> None:
         raise DataError(f"{path}: exists already; choose another name, or replace it by --force")
 
 
+_MAX_NAME_BYTES = 100
+"""Longest name of a folder that is made of a name in a file; systems of files allow 255."""
+
+
+def folder_name(name: str) -> str:
+    """A name of a recording or problem as that of one folder: names are never paths.
+
+    Separators and control characters are replaced, and so is what cannot be written as UTF-8; a
+    name that is too long is cut and gets a hash, so that two of them stay apart.
+    """
+    plain = re.sub(r"[\x00-\x1f\x7f/\\\ud800-\udfff]+", "_", name).strip()
+    if not plain.strip("."):  # the folder itself, and the one around it
+        plain = "_" * len(plain) or "unnamed"
+    if len(plain.encode()) > _MAX_NAME_BYTES:
+        digest = sha256(plain.encode()).hexdigest()[:8]
+        start = plain.encode()[: _MAX_NAME_BYTES - 9].decode(errors="ignore")
+        plain = f"{start}-{digest}"
+    return plain
+
+
 def write_text(path: Path, lines: Iterable[str]) -> None:
     """Write lines (with their line ends) as a whole file."""
     with appearing(path) as partial, partial.open("w", encoding="utf-8") as file:
@@ -84,13 +106,13 @@ class ResultFolder:
 
         Args:
             root: of all results.
-            dataset: name of what was worked on.
+            dataset: name of what was worked on; of any characters, see `folder_name`.
             now: the time; that of the clock if not given.
 
         Raises:
             DataError: if the folder cannot be made, or `latest` is not a link.
         """
-        made = ResultFolder(_new_folder(root, dataset, now))
+        made = ResultFolder(_new_folder(root, folder_name(dataset), now))
         try:
             yield made
             _link_latest(made.folder)

@@ -37,7 +37,7 @@ class Settings(Displayed, BaseModel):
             the key and says what to do instead, such as "is now frontend.max_features".
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     moved: ClassVar[Mapping[str, str]] = {}
 

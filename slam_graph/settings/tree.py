@@ -18,9 +18,15 @@ from pydantic import BaseModel, ValidationError
 
 from slam_graph.errors import ConfigError, closest
 from slam_graph.settings.base import Settings
+from slam_graph.settings.bounded_yaml import YamlTextError, parse_value
 
 KeyPath = tuple[str | int, ...]
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
+
+_MAX_KEYS = 32
+"""Most keys of an override: tables are nested five deep, and merging them is recursive."""
+_MAX_SHOWN = 200
+"""Most characters of a wrong value in a message."""
 
 
 @dataclass
@@ -43,15 +49,14 @@ class ConfigTree:
             ConfigError: if it is missing, not YAML, not a table, or has a key twice.
         """
         try:
-            loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
-            node = loader.get_single_node()
-            values = loader.construct_document(node) if node is not None else {}
+            values, node = parse_value(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise ConfigError(f"{path}: cannot read configuration: {error.strerror}") from error
         except UnicodeDecodeError as error:
             raise ConfigError(f"{path}: configuration is not UTF-8 text") from error
-        except yaml.YAMLError as error:
-            raise ConfigError(_yaml_fault(path, error)) from error
+        except YamlTextError as error:
+            raise ConfigError(f"{error.where(path)}: not YAML: {error.reason}") from error
+        values = {} if node is None else values
         if not isinstance(values, dict):
             raise ConfigError(
                 f"{path}:1: expected a table of settings, got {type(values).__name__}"
@@ -71,11 +76,11 @@ class ConfigTree:
         name, separator, value_text = text.partition("=")
         keys = name.strip().split(".")
         where = f"--set {text}"
-        if not separator or not all(keys):
+        if not separator or not all(keys) or len(keys) > _MAX_KEYS:
             raise ConfigError(f"{where}: expected key=value, e.g. backend.noise.pixel_sigma=1.5")
         try:
-            value = yaml.safe_load(value_text)
-        except yaml.YAMLError as error:
+            value, _ = parse_value(value_text)
+        except YamlTextError as error:
             raise ConfigError(f"{where}: the value is not YAML; put it in quotes") from error
         return _branch(keys, value, where)
 
@@ -199,6 +204,7 @@ def _describe(model: type[BaseModel], tree: ConfigTree, fault: Mapping[str, Any]
     message = str(fault["msg"]).removeprefix("Value error, ")
     message = f"{message[:1].lower()}{message[1:]}"
     got = repr(fault["input"])
+    got = got if len(got) <= _MAX_SHOWN else f"{got[:_MAX_SHOWN]}…"
     # A whole table says nothing; and what the message says already is not said again.
     if not isinstance(fault["input"], dict | BaseModel) and got not in message:
         message = f"{message}, got {got}"
@@ -248,10 +254,3 @@ def _record_lines(node: yaml.Node, file: Path, path: KeyPath, where: dict[KeyPat
         for index, item in enumerate(node.value):
             where[(*path, index)] = f"{file}:{item.start_mark.line + 1}"
             _record_lines(item, file, (*path, index), where)
-
-
-def _yaml_fault(path: Path, error: yaml.YAMLError) -> str:
-    """One line about a syntax error."""
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f"{path}:{error.problem_mark.line + 1}: not YAML: {error.problem}"
-    return f"{path}: not YAML: {' '.join(str(error).split())}"

@@ -14,6 +14,7 @@ import yaml
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
+from slam_graph.settings import YamlTextError, parse_node
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
@@ -37,7 +38,7 @@ class YamlValue:
     def where(self) -> str:
         """File, line and key, for messages."""
         return f"{self.path}:{self.node.start_mark.line + 1}" + (
-            f": {self.key}" if self.key else ""
+            f": {self.key[:60]}" if self.key else ""
         )
 
     def items(self) -> Iterator[tuple[str, YamlValue]]:
@@ -70,9 +71,9 @@ class YamlValue:
         try:
             value = float(self.text())
         except ValueError:
-            raise DataError(f"{self.where}: '{self.text()}' is not a number") from None
+            raise DataError(f"{self.where}: '{self.text()[:60]}' is not a number") from None
         if not np.isfinite(value):
-            raise DataError(f"{self.where}: '{self.text()}' is not a finite number")
+            raise DataError(f"{self.where}: '{self.text()[:60]}' is not a finite number")
         return value
 
     def elements(self) -> list[YamlValue]:
@@ -129,12 +130,9 @@ def parse_yaml(text: str, path: str | Path) -> YamlValue:
     if text.startswith("%YAML"):
         text = "#" + text
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise DataError(f"{path}:{line}: not valid YAML ({error.problem})") from None
-    except yaml.YAMLError:
-        raise DataError(f"{path}: not valid YAML") from None
+        node = parse_node(text)
+    except YamlTextError as fault:
+        raise DataError(f"{fault.where(path)}: not valid YAML ({fault.reason})") from None
     if not isinstance(node, yaml.MappingNode):
         raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
     return YamlValue(Path(path), node)

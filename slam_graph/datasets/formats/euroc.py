@@ -31,9 +31,9 @@ from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig, re
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.groundtruth import find_groundtruth
 from slam_graph.datasets.sequence import ReaderOptions
-from slam_graph.datasets.streams.csv_rows import read_rows
+from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
 from slam_graph.datasets.streams.image_sequence import STEREO_TOLERANCE_S, ImageSequence
-from slam_graph.datasets.streams.images import FileImages
+from slam_graph.datasets.streams.images import FileImages, file_within
 from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
@@ -98,14 +98,14 @@ def _list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
             raise DataError(f"{index}: missing, but there are images beside it")
         return FileImages(folder.name, np.zeros(0, np.int64), [])
     listed = [
-        _parse_image_row(line, partial(rows.where, k))
+        _parse_image_row(line, partial(rows.where, k), folder / "data")
         for rows in read_rows(index)
         for k, line in enumerate(rows.lines)
     ]
     if not listed:
         raise DataError(f"{index}: no images listed in this file")
     stamps = np.array([stamp for stamp, _ in listed], np.int64)
-    paths = [folder / "data" / name for _, name in listed]
+    paths = [path for _, path in listed]
     return ordered_images(folder.name, stamps, paths, index, diagnostics)
 
 
@@ -134,15 +134,16 @@ def ordered_images(
     return FileImages(name, stamps_ns[kept], [paths[k] for k in kept])
 
 
-def _parse_image_row(line: str, where: Callable[[], str]) -> tuple[int, str]:
+def _parse_image_row(line: str, where: Callable[[], str], folder: Path) -> tuple[int, Path]:
+    """Stamp and file of an image in a folder."""
     stamp, _, name = line.partition(",")
     try:
         parsed = int(stamp)
     except ValueError:
         parsed = -1
-    if parsed < 0 or not name.strip():
+    if not 0 <= parsed < LARGEST_STAMP_NS or not name.strip():
         raise DataError(f"{where()}: cannot read '{line.strip()[:100]}' as stamp [ns], file name")
-    return parsed, name.strip()
+    return parsed, file_within(folder, name.strip(), where())
 
 
 class EurocSequence(ImageSequence):

@@ -99,7 +99,7 @@ class EurocWriter:
     def __enter__(self) -> Self:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = Path(mkdtemp(prefix=f".{self._path.name}.", dir=self._path.parent))
+            self._folder = Path(mkdtemp(prefix=f".{self._path.name[:40]}.", dir=self._path.parent))
         except OSError as error:
             raise DataError(f"{self._path}: cannot be written ({error.strerror})") from None
         mav0 = self._folder / "mav0"

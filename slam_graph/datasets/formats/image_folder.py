@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,13 +23,15 @@ from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import (
+    LARGEST_STAMP_NS,
     STAMP_TEXT,
     Rows,
+    nanoseconds,
     read_rows,
     stamp_from_seconds,
 )
 from slam_graph.datasets.streams.image_sequence import ImageSequence
-from slam_graph.datasets.streams.images import FileImages
+from slam_graph.datasets.streams.images import FileImages, file_within
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
@@ -155,9 +156,11 @@ def stamps_from_names(paths: Sequence[Path]) -> IntArray | None:
     for path in paths:
         try:
             seconds = _in_seconds(path.stem)
-            stamps.append(int(Decimal(path.stem).scaleb(9)) if seconds else int(path.stem))
-        except (ValueError, OverflowError, InvalidOperation):
+            stamps.append(nanoseconds(path.stem) if seconds else int(path.stem))
+        except (ValueError, ArithmeticError):
             return None
+    if any(abs(stamp) >= LARGEST_STAMP_NS for stamp in stamps):
+        return None
     together = np.array(stamps, np.int64)
     if len(together) > 1 and float(np.median(np.abs(np.diff(together)))) < _SHORTEST_PERIOD_NS:
         return None
@@ -189,9 +192,12 @@ def _stamp(text: str, rows: Rows, index: int, seconds: bool) -> int:
     if seconds:
         return stamp_from_seconds(text, rows, index)
     try:
-        return int(text)
+        stamp_ns = int(text)
     except ValueError:
+        stamp_ns = LARGEST_STAMP_NS
+    if abs(stamp_ns) >= LARGEST_STAMP_NS:
         raise DataError(f"{rows.where(index)}: '{text[:80]}' is not a time") from None
+    return stamp_ns
 
 
 def _rate(text: str) -> float:
@@ -291,7 +297,7 @@ def _times(folder: Path, there: list[Path], files: LooseFiles) -> tuple[IntArray
 
 def _named(folder: Path, table: Path, name: str) -> Path:
     """The file that a table names: in the folder of images, or as seen from the table."""
-    image = folder / name
+    image = file_within(folder, name, str(table))
     return image if image.is_file() else table.parent / name
 
 

@@ -62,7 +62,7 @@ class TrackRecorder:
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._folder = Path(mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
+        self._folder = Path(mkdtemp(prefix=f".{self.path.name[:40]}.", dir=self.path.parent))
         self._files = ExitStack()
         self._frames = self._open(layout.FRAMES)
         self._features = self._open(layout.FEATURES)

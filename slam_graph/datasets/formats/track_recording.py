@@ -29,12 +29,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
+from zipfile import ZipFile
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets.calibration.calibration_yaml import YamlValue, pose_from_matrix, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
     FrameStream,
@@ -42,6 +44,7 @@ from slam_graph.datasets.sequence import (
     RecordedSequence,
     SequenceInfo,
 )
+from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
@@ -59,6 +62,25 @@ IMU_RECORD = np.dtype([("stamp", "<i8"), ("gyro", "<f8", (3,)), ("accel", "<f8",
 FEATURE_RECORD = np.dtype([("id", "<i8"), ("pixel", "<f8", (2,)), ("normalized", "<f8", (2,))])
 
 
+_Shape = tuple[int | Literal["N"], ...]
+
+_TRAJECTORY_SHAPES: dict[str, _Shape] = {
+    "stamps_ns": ("N",),
+    "quaternions": ("N", 4),
+    **dict.fromkeys(("positions", "velocities", "gyro_biases", "accel_biases"), ("N", 3)),
+}
+_STATE_SHAPES: dict[str, _Shape] = {
+    "stamp_ns": (),
+    "world_T_body": (4, 4),
+    "covariance": (15, 15),
+    **dict.fromkeys(("velocity", "gyro_bias", "accel_bias"), (3,)),
+}
+_UNIT_TOLERANCE = 1e-3
+"""Largest error of the length of a quaternion: those of ground truth are rounded."""
+_MAX_CAMERAS = 64
+_AGAIN = "record it again"
+
+
 def frame_record(cameras: int) -> np.dtype[np.void]:
     """Type of a row of ``frames.bin`` for a number of cameras."""
     return np.dtype([("stamp", "<i8"), ("counts", "<i8", (cameras,))])
@@ -71,7 +93,12 @@ def save_trajectory(path: Path, trajectory: Trajectory) -> None:
 
 def load_trajectory(path: Path) -> Trajectory:
     """Read what `save_trajectory` wrote."""
-    arrays = _load(path, ("stamps_ns", "positions", "quaternions"))
+    arrays = _load(path, ("stamps_ns", "positions", "quaternions"), _TRAJECTORY_SHAPES)
+    stamps, lengths = arrays["stamps_ns"], np.linalg.norm(arrays["quaternions"], axis=1)
+    if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
+        raise DataError(
+            f"{path}: the times do not increase, or a quaternion is not of unit length; {_AGAIN}"
+        )
     return Trajectory(
         stamps_ns=arrays["stamps_ns"],
         positions=arrays["positions"],
@@ -90,15 +117,26 @@ def save_state(path: Path, state: NavState) -> None:
 
 def load_state(path: Path) -> NavState:
     """Read what `save_state` wrote."""
-    arrays = _load(path, ("stamp_ns", "world_T_body", "velocity", "gyro_bias", "accel_bias"))
+    required = ("stamp_ns", "world_T_body", "velocity", "gyro_bias", "accel_bias")
+    arrays = _load(path, required, _STATE_SHAPES)
+    pose_from_matrix(arrays["world_T_body"], f"{path}: world_T_body")
+    covariance = arrays.get("covariance")
+    if covariance is not None and not _is_covariance(covariance):
+        raise DataError(f"{path}: 'covariance' is not a covariance; {_AGAIN}")
     return NavState(
         stamp_ns=int(arrays["stamp_ns"]),
-        world_T_body=gtsam.Pose3(arrays["world_T_body"]),
+        world_T_body=gtsam.Pose3(arrays["world_T_body"]),  # as it was, to the last bit
         velocity=arrays["velocity"],
         gyro_bias=arrays["gyro_bias"],
         accel_bias=arrays["accel_bias"],
-        covariance=arrays.get("covariance"),
+        covariance=covariance,
     )
+
+
+def _is_covariance(matrix: FloatArray) -> bool:
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
+    return symmetric and bool(eigenvalues[0] >= -1e-9 * eigenvalues[-1])
 
 
 def _save(path: Path, fields: dict[str, Any]) -> None:
@@ -106,15 +144,34 @@ def _save(path: Path, fields: dict[str, Any]) -> None:
     np.savez(path, **arrays)
 
 
-def _load(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
+def _load(path: Path, required: tuple[str, ...], shapes: dict[str, _Shape]) -> dict[str, Any]:
+    """The arrays of a file, of the shapes and types that they must have, and finite."""
     try:
+        with ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > path.stat().st_size:  # the recorder does not compress
+            raise DataError(f"{path}: its arrays are larger than the file; {_AGAIN}")
         with path.open("rb") as data, np.load(data, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files if name in shapes}
+    except DataError:
+        raise
     except Exception as error:  # a damaged zip fails in many ways
-        raise DataError(f"{path}: cannot be read ({error}); record it again") from None
+        what = " ".join(str(error).split())[:150] or type(error).__name__
+        raise DataError(f"{path}: cannot be read ({what}); {_AGAIN}") from None
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise DataError(f"{path}: no array '{missing[0]}' in this file; record it again")
+        raise DataError(f"{path}: no array '{missing[0]}' in this file; {_AGAIN}")
+    count = arrays["stamps_ns"].size if "stamps_ns" in arrays else 0
+    for name, array in arrays.items():
+        dtype = np.dtype("i8" if name.startswith("stamp") else "f8")
+        shape = tuple(count if size == "N" else size for size in shapes[name])
+        if array.shape != shape or array.dtype != dtype:
+            raise DataError(
+                f"{path}: '{name}' has shape {array.shape} and type {array.dtype}, expected "
+                f"{shape} and {dtype}; {_AGAIN}"
+            )
+        if not np.isfinite(array).all():
+            raise DataError(f"{path}: '{name}' is not finite; {_AGAIN}")
     return arrays
 
 
@@ -129,6 +186,14 @@ SAMPLES_PER_BLOCK = 4096
 
 def _where(name: str, first: int, index: int) -> str:
     return f"{name}: sample {first + index}"
+
+
+def _whole(value: YamlValue, least: int = 0, most: int = 2**53) -> int:
+    """A whole number of ``meta.yaml`` within bounds."""
+    number = value.number()
+    if number != int(number) or not least <= number <= most:
+        raise DataError(f"{value.where}: expected a whole number from {least} to {most}")
+    return int(number)
 
 
 def is_recording(path: Path) -> bool:
@@ -159,7 +224,7 @@ class TrackRecordingSequence(RecordedSequence):
         version = meta.require("version")
         if version.text() != str(FORMAT_VERSION):
             raise DataError(
-                f"{version.where}: recording of version {version.text()}, this program reads "
+                f"{version.where}: recording of version {version.text()[:20]}, this program reads "
                 f"version {FORMAT_VERSION}; record it again"
             )
         recorded = read_kalibr(path / CALIBRATION)
@@ -170,17 +235,18 @@ class TrackRecordingSequence(RecordedSequence):
         own = partial(load_trajectory, truth) if truth.is_file() else None
         super().__init__(path.resolve().name, rig, options, own)
         counts = {
-            name: int(meta.require(name).number()) for name in ("frames", "imu_samples", "features")
+            name: _whole(meta.require(name)) for name in ("frames", "imu_samples", "features")
         }
         self._samples = counts["imu_samples"]
-        self._cameras = int(meta.require("cameras").number())
+        self._cameras = _whole(meta.require("cameras"), 1, _MAX_CAMERAS)
         if len(rig.cameras) > self._cameras:
             raise DataError(f"{path}: has {self._cameras} cameras, fewer than the calibration")
         width = meta.get("descriptor_bytes")
-        self._descriptor_bytes = 0 if width is None else int(width.number())
+        self._descriptor_bytes = 0 if width is None else _whole(width)
         self._record = frame_record(self._cameras)
         self._check_sizes(counts)
         self._index = np.fromfile(path / FRAMES, self._record)
+        self._check_index(counts["features"])
         self._check_descriptors()
 
     def measure(self) -> SequenceInfo:
@@ -238,6 +304,8 @@ class TrackRecordingSequence(RecordedSequence):
             normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
+        if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
+            raise DataError(f"{self.path / FEATURES}: a feature is not finite; {_AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _open_descriptors(self, files: ExitStack, first: int) -> BinaryIO | None:
@@ -247,6 +315,18 @@ class TrackRecordingSequence(RecordedSequence):
         file = files.enter_context((self.path / DESCRIPTORS).open("rb"))
         file.seek(first * self._descriptor_bytes)
         return file
+
+    def _check_index(self, features: int) -> None:
+        """Refuse counts that are not those of the features, and times out of order."""
+        counts, stamps = self._index["counts"], self._index["stamp"]
+        # each is checked before the sum, which cannot overflow then
+        if np.any((counts < 0) | (counts > features)) or int(counts.sum()) != features:
+            raise DataError(
+                f"{self.path / FRAMES}: the numbers of features do not add up to the {features} of "
+                f"{META}; {_AGAIN}"
+            )
+        if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(stamps) >= LARGEST_STAMP_NS):
+            raise DataError(f"{self.path / FRAMES}: the times do not increase; {_AGAIN}")
 
     def _check_descriptors(self) -> None:
         if self._descriptor_bytes:

@@ -31,7 +31,7 @@ from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows, stamp_from_seconds
 from slam_graph.datasets.streams.image_sequence import ImageSequence
-from slam_graph.datasets.streams.images import FileImages, Image
+from slam_graph.datasets.streams.images import FileImages, Image, file_within
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import Camera, Rig, RigCamera
@@ -145,7 +145,7 @@ def _list_images(path: Path, diagnostics: Diagnostics) -> FileImages:
             if not name:
                 raise DataError(f"{rows.where(k)}: expected time [s] and file name")
             stamps.append(stamp_from_seconds(stamp, rows, k))
-            files.append(path / name.strip())
+            files.append(file_within(path, name.strip(), rows.where(k)))
     if not stamps:
         raise DataError(f"{path / 'rgb.txt'}: no images listed in this file")
     return ordered_images("rgb", np.array(stamps, np.int64), files, path / "rgb.txt", diagnostics)

@@ -27,7 +27,7 @@ METADATA = "metadata.yaml"
 _HEADER_BYTES = 12
 """Length of the beginning of a message that ends with its stamp."""
 
-_REINDEX = (
+REINDEX = (
     "if its recording was cut short, rebuild its index first (rosbag reindex, ros2 bag reindex)"
 )
 
@@ -129,7 +129,7 @@ class Bag:
             seconds, nanoseconds = struct.unpack_from(f"{order}iI", message.raw, 4)
         else:  # a sequence number, and the stamp
             seconds, nanoseconds = struct.unpack_from("<II", message.raw, 4)
-        return int(seconds) * 10**9 + int(nanoseconds)
+        return int(seconds) * 10**9 + int(nanoseconds)  # at most 2106
 
     def _decoder(self, types: Typestore, raw: bytes, msgtype: str) -> Callable[[], Any]:
         """A function that decodes a message, even after the bag is closed."""
@@ -148,6 +148,9 @@ class Bag:
             return
         from rosbags.highlevel import AnyReader  # not on import: most runs read no bag
 
+        from slam_graph.datasets.rosbag.bounded_unpacking import bound_unpacking
+
+        bound_unpacking()
         with self._translated():
             reader = AnyReader([self.path], default_typestore=_usual_types())
             reader.open()
@@ -166,7 +169,7 @@ class Bag:
         except Exception as error:  # its parsers raise anything from struct.error to KeyError
             what = " ".join(str(error).split()) or type(error).__name__
             raise DataError(
-                f"{self.path}: this bag cannot be read ({what[:150]}); {_REINDEX}"
+                f"{self.path}: this bag cannot be read ({what[:150]}); {REINDEX}"
             ) from None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
-from slam_graph.datasets.rosbag.bag import Bag, Message
+from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
 from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions, SequenceInfo
@@ -124,7 +124,8 @@ class RosBagSequence(GroupedSequence):
     def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
         stamps = self.groups.stamps_ns
-        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), self._index.imu_samples)
+        ends = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0)
+        return self.holding(len(stamps), *ends, self._index.imu_samples)
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
@@ -199,6 +200,8 @@ class RosBagSequence(GroupedSequence):
         """Refuse images of another size than calibrated, or of an encoding that is not known."""
         with closing(self._bag.messages([topic])) as messages:
             images = [self._image(message) for message in islice(messages, LOOKED_AT)]
+        if not images:
+            raise DataError(f"{self.path}: no image on '{topic}' can be read; {REINDEX}")
         faults = [image for image in images if isinstance(image, Fault)]
         if len(faults) == len(images) and "unknown encoding" in faults[0].message:
             raise DataError(faults[0].message)
@@ -266,6 +269,13 @@ class RosBagSequence(GroupedSequence):
     def _where(self, message: Message) -> str:
         return f"{self.path}: {message.topic} recorded at {message.received_ns}"
 
+    def _pose(self, message: Message) -> list[float]:
+        """Position and quaternion; NaN where the message is damaged."""
+        try:
+            return pose_of(message.decode(), self._bag.topics[message.topic])
+        except DataError:
+            return [np.nan] * 7
+
     def _read_poses(self) -> Trajectory:
         """The ground truth that was named."""
         topic = self._truth_topic
@@ -274,7 +284,7 @@ class RosBagSequence(GroupedSequence):
         values: list[list[float]] = []
         for message in self._until_damage([topic]):
             stamp_ns = self._stamp_ns(message)
-            pose = pose_of(message.decode(), self._bag.topics[topic])
+            pose = self._pose(message)
             if not np.all(np.isfinite(pose)) or np.linalg.norm(pose[3:]) < 0.5:
                 self.diagnostics.warn("groundtruth_not_finite", f"{self._where(message)}: dropped")
             elif stamps and stamp_ns <= stamps[-1]:

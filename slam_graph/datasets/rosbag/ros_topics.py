@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
-from slam_graph.datasets.rosbag.bag import Bag
+from slam_graph.datasets.rosbag.bag import REINDEX, Bag
 from slam_graph.datasets.rosbag.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -143,11 +144,11 @@ def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
 
 def _first(bag: Bag, topic: str) -> Any:
     """The first message of a topic, which has one."""
-    messages = bag.messages([topic])
-    try:
-        return next(messages).decode()
-    finally:
-        messages.close()
+    with closing(bag.messages([topic])) as messages:
+        message = next(messages, None)
+    if message is None:
+        raise DataError(f"{bag.path}: no message on '{topic}' can be read; {REINDEX}")
+    return message.decode()
 
 
 def _info(bag: Bag, topic: str) -> Any:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,9 @@ _ROWS_PER_BLOCK = 1024
 
 STAMP_TEXT = "S40"
 """Type of a column of stamps in seconds, kept as text until it is turned into nanoseconds."""
+
+LARGEST_STAMP_NS = 2**62
+"""Times from here on, the year 2116, are faults of a file; so differences of times fit, too."""
 
 _DIGITS = frozenset("0123456789")
 
@@ -118,7 +121,7 @@ def _reason(message: str, line: str) -> str:
     if cell is None:
         return f"cannot read the row '{line.strip()[:80]}'"
     kind = "an integer" if cell[2].startswith("int") else "a number"
-    return f"'{cell[1]}' in column {cell[3]} is not {kind}"
+    return f"'{cell[1][:60]}' in column {cell[3]} is not {kind}"
 
 
 def _loadtxt(
@@ -146,11 +149,23 @@ def stamp_from_seconds(text: bytes | str, rows: Rows, index: int) -> int:
     Raises:
         DataError: if the text is not a number.
     """
-    text = text.decode() if isinstance(text, bytes) else text
+    text = text.decode(errors="replace") if isinstance(text, bytes) else text
     try:
-        return int(Decimal(text).scaleb(9).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError):
-        raise DataError(f"{rows.where(index)}: '{text}' is not a time in seconds") from None
+        return nanoseconds(text)
+    except (ValueError, ArithmeticError):
+        raise DataError(f"{rows.where(index)}: '{text[:80]}' is not a time in seconds") from None
+
+
+def nanoseconds(text: str) -> int:
+    """Nanoseconds of a time in seconds, rounded; `1e9999999` is not even multiplied out.
+
+    Raises:
+        ValueError, ArithmeticError: if the text is not a time.
+    """
+    seconds = Decimal(text)
+    if not abs(seconds) < LARGEST_STAMP_NS // 10**9:  # NaN is an ArithmeticError
+        raise ValueError(text)
+    return int((seconds * 10**9).to_integral_value())
 
 
 def stamps_from_seconds(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int64]:

@@ -17,8 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
+from slam_graph.errors import DataError
 
 T = TypeVar("T")
+
+_LONGEST_NAME = 250
+"""Most characters of the name of an image, with its folders."""
 
 Image = NDArray[np.uint8]
 """(height, width), grey."""
@@ -58,6 +62,8 @@ class FileImages:
         """One image as 8 bit grey."""
         path = self.paths[index]
         try:
+            if path.exists() and not path.is_file():  # a device or a pipe need not end
+                return Fault("image_unreadable", f"{path}: not a file")
             data = path.read_bytes()
         except OSError as error:
             return Fault("image_unreadable", f"{path}: {error.strerror}")
@@ -72,6 +78,25 @@ class FileImages:
     def where(self, index: int) -> str:
         """The file."""
         return str(self.paths[index])
+
+
+def file_within(folder: Path, name: str, where: str) -> Path:
+    """The file that a table of a recording names, which must lie in the folder of the recording.
+
+    Args:
+        folder: that names are relative to.
+        name: as the table has it; it may begin with the names of folders.
+        where: file and line, for the message.
+
+    Raises:
+        DataError: if the name leads out of the folder, or cannot be one.
+    """
+    path = Path(name)
+    if "\0" in name or path.is_absolute() or ".." in path.parts or len(name) > _LONGEST_NAME:
+        raise DataError(
+            f"{where}: '{name[:100]}' is not a file in {folder}; a recording may name its own only"
+        )
+    return folder / path
 
 
 def decode_grey(data: bytes, where: str) -> Image | Fault:

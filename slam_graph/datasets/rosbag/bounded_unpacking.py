@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Chunks of bags are unpacked up to a bound: 10 kB of bzip2 can hold gigabytes of zeros."""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import lz4.frame
+from rosbags.rosbag1 import reader as ros1
+from rosbags.rosbag2 import storage_mcap as mcap
+
+_RATIO = 50
+_LEAST = 2**26
+"""A chunk may unpack to so many times its size, and so many bytes more. Chunks have 1 to 10 MB."""
+
+
+@cache
+def bound_unpacking() -> None:
+    """Let `rosbags` unpack chunks by functions that know a bound; it has none itself."""
+    ros1.decompressors["bz2"] = partial(_unpacked, bz2.BZ2Decompressor)
+    ros1.decompressors["lz4"] = partial(_unpacked, lz4.frame.LZ4FrameDecompressor)
+    mcap.DECOMPRESSORS["lz4"] = _of_size(lz4.frame.LZ4FrameDecompressor)
+    mcap.DECOMPRESSORS["zstd"] = _of_size(mcap.zstd.ZstdDecompressor)  # type: ignore[attr-defined]
+
+
+def _of_size(unpacker: Callable[[], Any]) -> Callable[[bytes, int], bytes]:
+    """As MCAP's reader calls it: with the size that the file promises, which is checked later."""
+    return lambda data, _: _unpacked(unpacker, data)
+
+
+def _unpacked(unpacker: Callable[[], Any], data: bytes) -> bytes:
+    """Unpack the data of a chunk.
+
+    Raises:
+        ValueError: if it is cut short, or unpacks to more than the bound.
+    """
+    most = _RATIO * len(data) + _LEAST
+    parts, size = [], 0
+    while data:  # a chunk may be several streams
+        stream = unpacker()
+        part = bytes(stream.decompress(data, max_length=most - size + 1))
+        parts.append(part)
+        size += len(part)
+        if size > most:
+            raise ValueError(f"a chunk of {len(data)} bytes unpacks to more than {most} bytes")
+        if not stream.eof:
+            raise ValueError("a chunk is cut short")
+        data = stream.unused_data or b""
+    return b"".join(parts)

@@ -1,0 +1,223 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Small valid files, damaged in many ways: each gives one line of ours, or is read.
+
+`SLAM_GRAPH_MUTATIONS=20000` makes a campaign of it, with new mutations each time.
+"""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from map_flights import World
+from pose_graphs import laps
+from recordings import CAMERA_YAML, write_euroc
+from recordings_ros import write_bag
+
+from slam_graph.bundle_adjustment.bal_file import read_bal
+from slam_graph.config import load_config
+from slam_graph.datasets import open_dataset
+from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
+from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.errors import SlamGraphError
+from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
+from slam_graph.results.map_output import load_map, save_map
+from slam_graph.simulation.simulator import simulate
+
+CAMPAIGN = int(os.environ.get("SLAM_GRAPH_MUTATIONS", "0"))
+
+NUMBERS = (
+    b"nan inf -inf 1e308 -1e308 1e-320 1e30 1e9999999 0 -0.0 -1 0.5 1_0 0x10 007 "
+    b"9223372036854775807 -9223372036854775808 9223372036854775808 4294967296 65536 255"
+)
+PIECES = [
+    *NUMBERS.split(),
+    *(b"\0", b"\xff", b"\xc3\x28", b"\n", b",", b" ", b":", b"- ", b"&a ", b"*a", b"[", b"}", b"#"),
+    *(b"!!int ", b"2001-13-41", b"..", b"/", "é".encode(), b"1" * 5000, b"\xff" * 8),
+]
+
+
+@st.composite
+def edits(draw: st.DrawFn) -> list[tuple[str, float, float, bytes]]:
+    """What is done to a file: a kind, two places as parts of its length, and some bytes."""
+    kinds = st.sampled_from(["flip", "cut", "number", "insert", "double", "swap", "remove"])
+    part = st.floats(0.0, 1.0, exclude_max=True)
+    edit = st.tuples(kinds, part, part, st.sampled_from(PIECES))
+    return draw(st.lists(edit, min_size=1, max_size=4))
+
+
+def damaged(content: bytes, changes: list[tuple[str, float, float, bytes]]) -> bytes:
+    """The content after some changes."""
+    for kind, first, second, piece in changes:
+        at = int(first * len(content))
+        if kind == "flip":
+            flipped = bytes([content[at] ^ (1 << int(second * 8))]) if content else b""
+            content = content[:at] + flipped + content[at + 1 :]
+        elif kind == "cut":
+            content = content[:at]
+        elif kind == "insert":
+            content = content[:at] + piece + content[at:]
+        elif kind == "number":
+            begin, end = token(content, at)
+            content = content[:begin] + piece + content[end:]
+        else:
+            lines = content.splitlines(keepends=True) or [b""]
+            one, other = int(first * len(lines)), int(second * len(lines))
+            if kind == "double":
+                lines.insert(other, lines[one])
+            elif kind == "swap":
+                lines[one], lines[other] = lines[other], lines[one]
+            else:
+                del lines[one]
+            content = b"".join(lines)
+    return content
+
+
+def token(content: bytes, at: int) -> tuple[int, int]:
+    """Where the word at a place begins and ends."""
+    begin = end = at
+    while begin > 0 and content[begin - 1] not in b" ,\n\t:[]":
+        begin -= 1
+    while end < len(content) and content[end] not in b" ,\n\t:[]":
+        end += 1
+    return begin, end
+
+
+def tried(
+    file: Path, read: Callable[[], object], examples: int = 200, content: bytes | None = None
+) -> None:
+    """Damage a file in many ways, and read it each time."""
+    whole = file.read_bytes() if content is None else content
+    read()  # it is valid
+
+    @settings(
+        max_examples=CAMPAIGN or examples,
+        derandomize=not CAMPAIGN,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(edits())
+    def one(changes: list[tuple[str, float, float, bytes]]) -> None:
+        file.write_bytes(damaged(whole, changes))
+        said = ""
+        try:
+            read()
+        except SlamGraphError as error:
+            said = str(error)
+        assert "\n" not in said
+        assert len(said) < 2000
+
+    try:
+        one()
+    finally:
+        file.write_bytes(whole)
+
+
+def read_all(path: Path) -> None:
+    """Everything that a run reads of a recording."""
+    sequence = open_dataset(path)
+    sequence.info()
+    sequence.groundtruth()
+    sequence.initial_state()
+    for _ in sequence.packets():
+        pass
+
+
+@pytest.mark.parametrize(
+    "name", ["cam0/data.csv", "cam0/sensor.yaml", "imu0/data.csv", "imu0/sensor.yaml"]
+)
+def test_euroc(tmp_path: Path, name: str) -> None:
+    root = write_euroc(tmp_path / "flight", frames=3, imu_lead=4)
+    tried(root / "mav0" / name, lambda: read_all(root), 50)
+
+
+def test_sensor_yaml(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.yaml"
+    path.write_text(CAMERA_YAML.format(y=0.1))
+    tried(path, lambda: read_body_T_sensor(path))
+
+
+def test_kalibr(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    write_kalibr(simulate(duration_s=1.0).rig, path)
+    tried(path, lambda: read_kalibr(path))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_g2o(tmp_path: Path, dimension: int) -> None:
+    path = tmp_path / "graph.g2o"
+    graph, truth = laps(dimension, 0.01, poses=12, lap=5)
+    path.write_text("".join(g2o_lines(graph, truth)))
+    tried(path, lambda: read_pose_graph(path), 100)
+
+
+def test_toro(tmp_path: Path) -> None:
+    path = tmp_path / "graph.graph"
+    path.write_text(
+        "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0.1\nVERTEX2 2 2 0 0.2\n"
+        "EDGE2 0 1 1 0 0.1 100 0 100 400 0 0\nEDGE2 1 2 1 0 0.1 100 0 100 400 0 0\n"
+        "EDGE2 0 2 2 0 0.2 100 0 100 400 0 0\n"
+    )
+    tried(path, lambda: read_pose_graph(path))
+
+
+def test_bal(tmp_path: Path) -> None:
+    path = tmp_path / "problem.txt"
+    path.write_text(
+        "2 2 4\n0 0 10 20\n0 1 -10 20\n1 0 12 20\n1 1 -12 20\n"
+        "0 0 0 0 0 0 500 0 0\n0 0 0 1 0 0 500 0 0\n0 0 -10\n1 1 -10\n"
+    )
+    tried(path, lambda: read_bal(path))
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_trajectories(tmp_path: Path, separator: str) -> None:
+    path = tmp_path / "truth.txt"
+    unit = "" if separator == " " else "000000000"
+    rows = ([f"{1403636580 + k}{unit}", k, 0.5, -1e-3, 0, 0, 0, 1] for k in range(8))
+    path.write_text("".join(separator.join(map(str, row)) + "\n" for row in rows))
+    tried(path, lambda: read_groundtruth(path), 100)
+
+
+@pytest.fixture(scope="module")
+def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tracks") / "flight"
+    simulate(duration_s=0.6, rate_hz=5.0).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["meta.yaml", "frames.bin", "features.bin", "imu.bin", "groundtruth.npz", "initial_state.npz"],
+)
+def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
+    folder = shutil.copytree(tracks, tmp_path / "flight")
+    tried(folder / name, lambda: read_all(folder), 40)
+
+
+def test_maps(tmp_path: Path) -> None:
+    path = tmp_path / "a.slam"
+    save_map(World().map(), path)
+    tried(path, lambda: load_map(path))
+
+
+def test_configurations(tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text(
+        "algorithm: msckf\nseed: 1\nstart_s: 0.5\nduration_s: null\ncameras: stereo\n"
+        "backend:\n  noise: {pixel_sigma: 1.5, gravity: 9.81}\nfrontend:\n  max_features: 100\n"
+    )
+    tried(path, lambda: load_config(path))
+
+
+@pytest.mark.parametrize(("kind", "examples"), [("ros1", 60), ("mcap_file", 60), ("sqlite", 30)])
+def test_bags(tmp_path: Path, kind: str, examples: int) -> None:
+    path = write_bag(tmp_path, kind, frames=2)
+    file = path if path.is_file() else next(path.glob("*.db3"))
+    tried(file, lambda: read_all(path), examples)

@@ -1,0 +1,314 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of strangers: names in them are never paths, and what is wrong is one line of ours."""
+
+import bz2
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from recordings import write_euroc
+from recordings_ros import bag_writer, write_bag
+from typer.testing import CliRunner
+
+from slam_graph.bundle_adjustment.bal_file import read_bal
+from slam_graph.cli.main import app
+from slam_graph.config import load_config
+from slam_graph.datasets import open_dataset
+from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.formats import track_recording as layout
+from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets.rosbag import bounded_unpacking
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import ConfigError, DataError, SlamGraphError
+from slam_graph.pose_graph.graph import InformationRepair
+from slam_graph.pose_graph.graph_files import read_pose_graph
+from slam_graph.results.result_files import ResultFolder, folder_name
+from slam_graph.settings.bounded_yaml import YamlTextError, parse_value
+from slam_graph.simulation.simulator import simulate
+
+LAYERS = "a: &l0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"k{k}: &l{k} [{', '.join([f'*l{k - 1}'] * 10)}]\n" for k in range(1, 10)
+)
+"""Ten lines that stand for 10¹⁰ values."""
+
+BAD_YAML = {
+    "date": ("a: 1\nseed: 2001-13-41\n", ":2: .*'2001-13-41' is not of type timestamp"),
+    "integer": ("seed: !!int abc\n", ":1: .*'abc' is not of type int"),
+    "bool": ("seed: !!bool maybe\n", ":1: .*'maybe' is not of type bool"),
+    "digits": (f"seed: {'7' * 5000}\n", ":1: .*is not of type int"),
+    "hex": (f"seed: 0x{'f' * 9000}\n", ":1: .*is not of type int"),
+    "deep": ("a: " + "[" * 3000 + "]" * 3000, ":1: .*nested deeper than 64 levels"),
+    "recursive": ("a: &x [1, *x]\n", ":1: .*'x' contains itself"),
+    "bomb": (LAYERS, ":4: .*aliases repeat more than 10000 values"),
+    "merge bomb": ("a: &a {x: 1}\n" + "b: {<<: [" + "*a," * 11000 + "]}", ":2: .*aliases repeat"),
+    "unknown alias": ("a: *b\n", ":1: .*undefined alias"),
+    "tag": ("a: !!python/object/apply:os.system [ls]\n", ":1: .*could not determine"),
+    "key": ("? [1, 2]\n: 3\n", ":1: .*unhashable key"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_YAML)
+def test_a_configuration_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    text, expected = BAD_YAML[name]
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=rf"my\.yaml{expected}") as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("name", ["deep", "recursive", "bomb"])
+def test_a_calibration_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    text, expected = BAD_YAML[name]
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    with pytest.raises(DataError, match=rf"my\.yaml{expected.split(' ')[0]}"):
+        read_yaml(path)
+
+
+def test_an_override_is_bounded_like_a_file() -> None:
+    for text in ("seed=2001-13-41", "seed=" + "[" * 500, ".".join("a" * 3000) + "=1"):
+        with pytest.raises(ConfigError):
+            load_config(overrides=[text])
+
+
+@pytest.mark.parametrize("value", [".inf", ".nan", "1e400"])
+def test_settings_are_finite(value: str) -> None:
+    for key in ("duration_s", "start_s", "backend.noise.pixel_sigma", "seed"):
+        with pytest.raises(ConfigError, match=key):
+            load_config(overrides=[f"{key}={value}"])
+
+
+def test_aliases_are_read_within_the_bounds() -> None:
+    value, _ = parse_value("a: &x {p: [1, 2]}\nb: *x\nc: {<<: *x, q: 3}\nd: &y 5\ne: *y\n")
+    both = {"p": [1, 2]}
+    assert value == {"a": both, "b": both, "c": both | {"q": 3}, "d": 5, "e": 5}
+    with pytest.raises(YamlTextError, match="duplicate anchor 'x'"):
+        parse_value("a: &x 5\nb: &x [*x]\n")
+
+
+def test_the_name_of_an_algorithm_is_the_name_of_a_file(tmp_path: Path) -> None:
+    for name in ("../../x", "/etc/x", "a/b", "", "..", "a" * 200):
+        with pytest.raises(ConfigError, match="name"):
+            load_config(overrides={"algorithm.name": name})
+
+
+@pytest.mark.parametrize(
+    "name", ["../../x", "/x/y", "..", ".", "", "a\0b", "a\nb", "é" * 400, "\ud800", "..\\x"]
+)
+def test_results_stay_in_their_folder(tmp_path: Path, name: str) -> None:
+    root = tmp_path / "results"
+    with ResultFolder.of_run(root, name) as made:
+        made.text("a.txt", ["a\n"])
+    assert made.folder.resolve().parent.parent == root.resolve()
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
+
+
+def test_names_of_folders_differ_where_names_do() -> None:
+    assert folder_name("MH_01_easy + é") == "MH_01_easy + é"
+    assert folder_name("x" * 300 + "1") != folder_name("x" * 300 + "2")
+
+
+@pytest.mark.parametrize("name", ["../../imu0/data.csv", "/dev/zero", "a\0.png", "x" * 300])
+def test_images_outside_of_a_recording_are_refused(tmp_path: Path, name: str) -> None:
+    mav0 = write_euroc(tmp_path / "flight", frames=3) / "mav0"
+    index = mav0 / "cam0" / "data.csv"
+    lines = index.read_text().splitlines()
+    lines[2] = f"{lines[2].split(',')[0]},{name}"
+    index.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match=r"data\.csv:3: .* is not a file in"):
+        open_dataset(mav0.parent)
+
+
+@pytest.mark.parametrize("stamp", ["1e30", "1e9999999", "-1e400", "nan", "inf"])
+def test_stamps_that_are_no_times_are_refused(tmp_path: Path, stamp: str) -> None:
+    path = tmp_path / "truth.txt"
+    path.write_text(f"1.5 0 0 0 0 0 0 1\n{stamp} 0 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"truth\.txt:2: .* is not a time in seconds"):
+        read_groundtruth(path)
+
+
+# --- recordings of tracks -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tracks") / "flight"
+    simulate(duration_s=1.0, rate_hz=4.0).save(path)
+    return path
+
+
+def edit_counts(folder: Path, change: Callable[[np.ndarray], None]) -> None:
+    rows = np.fromfile(folder / layout.FRAMES, layout.frame_record(2))
+    change(rows)
+    rows.tofile(folder / layout.FRAMES)
+
+
+def set_meta(folder: Path, key: str, value: str) -> None:
+    file = folder / layout.META
+    lines = [line for line in file.read_text().splitlines() if not line.startswith(f"{key}:")]
+    file.write_text("\n".join([*lines, f"{key}: {value}"]) + "\n")
+
+
+def set_array(folder: Path, file: str, name: str, value: object) -> None:
+    with np.load(folder / file) as content:
+        arrays = dict(content)
+    np.savez(folder / file, **arrays | {name: np.asarray(value)})
+
+
+FAULTS: dict[str, Callable[[Path], None]] = {
+    "more features": lambda f: edit_counts(f, lambda rows: rows["counts"].__iadd__(1)),
+    "10^12 features": lambda f: edit_counts(f, lambda rows: rows["counts"].fill(10**12)),
+    "largest counts": lambda f: edit_counts(f, lambda rows: rows["counts"].fill(2**63 - 1)),
+    "negative counts": lambda f: edit_counts(f, lambda rows: rows["counts"].fill(-5)),
+    "times": lambda f: edit_counts(f, lambda rows: rows["stamp"].fill(7)),
+    "10^12 cameras": lambda f: set_meta(f, "cameras", "1000000000000"),
+    "no cameras": lambda f: set_meta(f, "cameras", "0"),
+    "10^300 frames": lambda f: set_meta(f, "frames", "1e300"),
+    "half a frame": lambda f: set_meta(f, "frames", "0.5"),
+    "deep": lambda f: set_meta(f, "name", "[" * 3000),
+    "positions": lambda f: set_array(f, layout.GROUNDTRUTH, "positions", np.zeros((2, 2))),
+    "text": lambda f: set_array(f, layout.GROUNDTRUTH, "stamps_ns", ["a", "b"]),
+    "no rotation": lambda f: set_array(f, layout.INITIAL_STATE, "world_T_body", np.ones((4, 4))),
+    "velocity": lambda f: set_array(f, layout.INITIAL_STATE, "velocity", [np.nan, 0.0, 0.0]),
+    "covariance": lambda f: set_array(f, layout.INITIAL_STATE, "covariance", -np.eye(15)),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_recording_that_does_not_add_up_is_refused(
+    tracks: Path, tmp_path: Path, fault: str
+) -> None:
+    folder = shutil.copytree(tracks, tmp_path / "flight")
+    FAULTS[fault](folder)
+    with pytest.raises(DataError, match="flight"):
+        read_all(folder)
+
+
+def test_arrays_that_unpack_to_more_than_their_file_are_refused(
+    tracks: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(tracks, tmp_path / "flight")
+    np.savez_compressed(folder / layout.GROUNDTRUTH, stamps_ns=np.zeros(10**6, np.int64))
+    with pytest.raises(DataError, match="larger than the file"):
+        read_all(folder)
+
+
+def test_a_name_in_a_recording_names_nothing(tracks: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(tracks, tmp_path / "flight")
+    for name in ("../../x", "/x", '"a\\0b"'):
+        set_meta(folder, "name", name)
+        assert open_dataset(folder).info().name == "flight"
+
+
+def read_all(path: Path) -> None:
+    sequence = open_dataset(path)
+    sequence.info()
+    sequence.groundtruth()
+    sequence.initial_state()
+    for _ in sequence.packets():
+        pass
+
+
+# --- pose graphs ----------------------------------------------------------------------------------
+
+INDEFINITE = "10 0 0 0 20 0 10 0 0 0 0 10 0 0 0 5 0 0 5 0 5"
+"""Upper triangle of an information of x, y, z and angles; x and the angle of y belong together."""
+
+
+def write_indefinite(path: Path) -> Path:
+    pose = "0.1 0 0 0 0 0 1"
+    edges = "".join(f"EDGE_SE3:QUAT {k} {k + 1} {pose} {INDEFINITE}\n" for k in range(3))
+    path.write_text(f"{edges}EDGE_SE3:QUAT 0 3 {pose} 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n")
+    return path
+
+
+def test_indefinite_information_is_refused_with_a_count(tmp_path: Path) -> None:
+    path = write_indefinite(tmp_path / "graph.g2o")
+    with pytest.raises(DataError, match=r"graph\.g2o:\d: .*nor are those of 2 other edges"):
+        read_pose_graph(path)
+
+
+def test_indefinite_information_is_repaired_and_counted(tmp_path: Path) -> None:
+    path = write_indefinite(tmp_path / "graph.g2o")
+    made = {}
+    for repair in get_args(InformationRepair):
+        diagnostics = Diagnostics()
+        graph = read_pose_graph(path, diagnostics, repair=repair)
+        assert diagnostics.counts["pose_graph_information_repaired"] == 3
+        assert np.linalg.eigvalsh(graph.information)[:, 0].min() > 0
+        np.testing.assert_array_equal(graph.information[3], np.eye(6))
+        made[repair] = graph.information[0]
+    np.testing.assert_allclose(made["isotropic"], np.diag([10.0] * 3 + [5.0] * 3))
+    values = np.linalg.eigvalsh(made["nearest"])
+    np.testing.assert_allclose(values[0], 1e-6 * values[-1], rtol=1e-6)
+    both = ["--information", "quaternion", "--information", "nearest", "--output", str(tmp_path)]
+    assert CliRunner().invoke(app, ["optimize", str(path), *both]).exit_code == 0
+    clash = CliRunner().invoke(app, ["optimize", str(path), *both, "--information", "isotropic"])
+    assert isinstance(clash.exception, ConfigError)
+    with pytest.raises(ConfigError, match="unknown repair"):
+        read_pose_graph(path, repair="any")  # type: ignore[arg-type]
+
+
+# --- bags and compressed files --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_bag_without_images_is_refused(tmp_path: Path, kind: str) -> None:
+    """The index names a topic of images, but all messages are cut off."""
+    path = write_bag(tmp_path, kind, frames=2)
+    file = path if path.is_file() else next(path.glob("*.mcap"))
+    content = file.read_bytes()
+    for size in (len(content) // 3, len(content) // 2, len(content) - 40):
+        file.write_bytes(content[:size])
+        with pytest.raises(SlamGraphError):
+            read_all(path)
+
+
+def test_chunks_of_bags_unpack_within_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded_unpacking, "_LEAST", 10**6)
+    bounded_unpacking.bound_unpacking()
+    zeros = bytes(10**5)
+    unpack = bounded_unpacking.ros1.decompressors["bz2"]
+    assert unpack(bz2.compress(zeros) + bz2.compress(b"1")) == zeros + b"1"
+    with pytest.raises(ValueError, match="unpacks to more than"):
+        unpack(bz2.compress(bytes(10**7)))
+    with pytest.raises(ValueError, match="cut short"):
+        unpack(bz2.compress(zeros)[:-4])
+
+
+@pytest.mark.parametrize("name", ["bz2", "lz4"])
+def test_a_compressed_bag_is_read(tmp_path: Path, name: str) -> None:
+    from rosbags.rosbag1 import Writer
+
+    path = tmp_path / "flight.bag"
+    with pytest.MonkeyPatch.context() as patch:
+        opened = Writer.__init__
+
+        def compressed(self: Writer, path: Path) -> None:
+            opened(self, path)
+            self.set_compression(Writer.CompressionFormat[name.upper()])
+
+        patch.setattr(Writer, "__init__", compressed)
+        write_bag(tmp_path, "ros1", frames=3)
+    assert name.encode() in path.read_bytes()
+    assert open_dataset(path).info().frames == 3
+
+
+def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
+    path = tmp_path / "problem.txt.bz2"
+    path.write_bytes(bz2.compress(b"1 1 1\n" + b" " * 10**7))
+    with pytest.raises(DataError, match="unpacks to more than 50 times"):
+        read_bal(path)
+
+
+def test_an_empty_bag_is_refused(tmp_path: Path) -> None:
+    with bag_writer(tmp_path / "empty.bag", "ros1"):
+        pass
+    with pytest.raises(DataError):
+        read_all(tmp_path / "empty.bag")
