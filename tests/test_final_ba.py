@@ -226,7 +226,7 @@ def test_files_and_metrics_hold_it_and_the_causal_estimate_is_as_without(
     assert demo.final_ba is not None
     first = int(np.searchsorted(demo.final_ba.trajectory.stamps_ns, demo.trajectory.stamps_ns[0]))
     moved = demo.final_ba.trajectory.positions[first] - demo.trajectory.positions[0]
-    assert np.linalg.norm(moved) < 1e-6
+    assert np.linalg.norm(moved) < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,13 @@ def test_triangulation(weighted: bool) -> None:
             turns.as_matrix(), positions, normalized, weights, starts, points, depth_error, parallax
         )
         found.append((points, depth_error, np.cos(parallax)))
+    errors = []
+    for points, _, _ in found:
+        seen = turns.inv().apply(np.repeat(points, counts, axis=0) - positions)
+        r = (seen[:, :2] / seen[:, 2:] - normalized)[: starts[4]]
+        r = np.einsum("nij,nj->ni", weights[: starts[4]], r) if weighted else r
+        errors.append(np.add.reduceat(np.sum(r**2, axis=1), starts[:4]))
+    assert same(*errors)
     # whether the last of the steps, which have converged, lowers the error is decided by rounding
     assert all(same(a, b, 1e-8) for a, b in zip(*found, strict=True))
     np.testing.assert_allclose(found[0][0][:4], truth[starts[:4]], atol=0.5)

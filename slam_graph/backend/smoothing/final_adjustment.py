@@ -142,7 +142,9 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
         adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
-        states = adjusted.states[begin:]
+        found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
+        held = found[int(segment.keyframes[anchor])]
+        states = _aligned(found, held, start[anchor])[begin:]
         if link is not None:
             states = in_gauge_of(link, states)
         solved.append(replace(adjusted, states=[]))
