@@ -11,8 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
-from slam_graph.datasets import RecordedSequence, dataset_from_arrays, inject
-from slam_graph.datasets.faults import FAULTS, Fault
+from slam_graph.datasets import RecordedSequence, dataset_from_arrays
+from slam_graph.datasets.faults.fault import FAULTS, Fault
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData
 from slam_graph.simulation import simulate

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from slam_graph.config import load_config
-from slam_graph.datasets import inject, open_dataset
+from slam_graph.datasets import open_dataset
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.streams.imu_outliers import without_outliers
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.evaluation import ape

@@ -18,7 +18,7 @@ from slam_graph.cli.watching import Watching, keep_serving
 
 if TYPE_CHECKING:
     from slam_graph.diagnostics import Diagnostics
-    from slam_graph.pose_graph import InformationRepair, PoseGraph, PoseGraphPolicy
+    from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy
     from slam_graph.results import PoseGraphResult
 
 
@@ -38,7 +38,7 @@ class Wanted:
 def optimize_pose_graph_file(
     file: Path,
     information: Literal["angle", "quaternion"],
-    repair: InformationRepair | None,
+    repair: Literal["nearest", "isotropic"] | None,
     policy: PoseGraphPolicy,
     wanted: Wanted,
     save: Path | None,

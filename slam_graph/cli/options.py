@@ -234,17 +234,17 @@ def open_recording(
     Faults are put into it as far as `--inject` asks for them.
     """
     with loading(f"opening {data}"):
-        from slam_graph.datasets import inject, open_dataset
+        from slam_graph.datasets import open_dataset
 
-        recording = open_dataset(
+        return open_dataset(
             data,
             format=format_,
             cameras=cameras,
             calibration=calibration,
             groundtruth=groundtruth,
             sources=sources_from(sources),
+            faults=faults or (),
         )
-        return inject(recording, faults or ())
 
 
 def run_settings(

@@ -22,7 +22,6 @@ __all__ = [
     "TrackRecorder",
     "check_sequence",
     "dataset_from_arrays",
-    "inject",
     "kalibr_text",
     "open_dataset",
     "pose_from_matrix",
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     )
     from slam_graph.datasets.data_checks import check_sequence
     from slam_graph.datasets.dataset_registry import DATASETS, Format, open_dataset
-    from slam_graph.datasets.faults import inject
     from slam_graph.datasets.formats.euroc import EurocSequence
     from slam_graph.datasets.formats.euroc_writer import EurocWriter
     from slam_graph.datasets.formats.track_recorder import TrackRecorder
@@ -56,7 +54,6 @@ else:
             "calibration.kalibr_calibration": ("kalibr_text", "read_kalibr", "rig_from_kalibr"),
             "data_checks": ("check_sequence",),
             "dataset_registry": ("DATASETS", "Format", "open_dataset"),
-            "faults": ("inject",),
             "formats.euroc": ("EurocSequence",),
             "formats.euroc_writer": ("EurocWriter",),
             "formats.track_recorder": ("TrackRecorder",),

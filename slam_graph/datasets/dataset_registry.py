@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,6 +108,7 @@ def open_dataset(
     groundtruth: str | Path | None = None,
     diagnostics: Diagnostics | None = None,
     sources: Mapping[str, str] | None = None,
+    faults: Sequence[str] = (),
 ) -> RecordedSequence:
     """Open a recording.
 
@@ -120,10 +121,11 @@ def open_dataset(
         diagnostics: where faults are counted.
         sources: where each sensor is, in formats that leave it open: topics of a ROS bag or files
             beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``.
+        faults: to put into it on purpose, such as ``imu_missing:at_s=6,duration_s=1``.
 
     Raises:
         DataError: if the path is not there, of no known format, or cannot be read.
-        ConfigError: if there is no format with the name, or its plugin cannot be loaded.
+        ConfigError: if a format or a fault is not known, or the plugin of a format does not load.
     """
     path = Path(path)
     if str(path) == DEMO and not path.exists():
@@ -142,7 +144,12 @@ def open_dataset(
         sources or {},
         diagnostics if diagnostics is not None else Diagnostics(),
     )
-    return chosen.open(path, options)
+    recording = chosen.open(path, options)
+    if not faults:
+        return recording
+    from slam_graph.datasets.faults.injection import inject  # few want any
+
+    return inject(recording, faults)
 
 
 def _guess(path: Path) -> str:

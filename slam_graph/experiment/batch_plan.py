@@ -22,7 +22,7 @@ from slam_graph.datasets import DATASETS
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.settings_hash import settings_hash
-from slam_graph.results import folder_name
+from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
 
 logger = logging.getLogger(__name__)
@@ -302,7 +302,9 @@ def _name(place: tuple[str, ...], endings: Mapping[tuple[str, ...], int]) -> str
     depths = range(1, len(place) + 1)
     depth = next((depth for depth in depths if endings[place[-depth:]] == 1), len(place))
     parts = [part.strip("/") for part in place[-depth:]]
-    return folder_name(re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording")
+    return ResultFolder.name_of(
+        re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording"
+    )
 
 
 def _state(paths: Iterable[str]) -> str:

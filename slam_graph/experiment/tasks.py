@@ -25,7 +25,7 @@ from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.frontend import build_frontend
 from slam_graph.pipeline import run
-from slam_graph.results import folder_name
+from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
 from slam_graph.simulation import SimulationConfig, simulate
 from slam_graph.version import __version__
@@ -134,7 +134,7 @@ def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) 
 
 def _plain(name: str) -> str:
     """The name with characters that file names should not have replaced."""
-    return folder_name(re.sub(r"[^\w.-]+", "_", name))
+    return ResultFolder.name_of(re.sub(r"[^\w.-]+", "_", name))
 
 
 class RecordTask(Settings):

@@ -15,7 +15,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "Certificate",
-    "InformationRepair",
     "PoseGraph",
     "PoseGraphPolicy",
     "PoseGraphSolution",
@@ -27,7 +26,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from slam_graph.pose_graph.certificate import Certificate, certify
-    from slam_graph.pose_graph.graph import InformationRepair, PoseGraph, Poses
+    from slam_graph.pose_graph.graph import PoseGraph, Poses
     from slam_graph.pose_graph.graph_files import read_pose_graph
     from slam_graph.pose_graph.optimize import optimize_pose_graph
     from slam_graph.pose_graph.pose_graph_policy import PoseGraphPolicy
@@ -38,11 +37,9 @@ else:
         {
             "certificate": (
                 "Certificate",
-                "InformationRepair",
                 "certify",
             ),
             "graph": (
-                "InformationRepair",
                 "PoseGraph",
                 "Poses",
             ),

@@ -17,7 +17,6 @@ __all__ = [
     "SavedRun",
     "export_map",
     "find_map",
-    "folder_name",
     "load_map",
     "load_result",
     "refuse_to_replace",
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from slam_graph.results.localization_result import LocalizationLog
     from slam_graph.results.map_output import export_map, find_map, load_map, save_map
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
-    from slam_graph.results.result_files import ResultFolder, folder_name, refuse_to_replace
+    from slam_graph.results.result_files import ResultFolder, refuse_to_replace
     from slam_graph.results.run_logs import RunLogs
     from slam_graph.results.run_result import RunInput, RunResult
     from slam_graph.results.saved_run import SavedRun, load_result
@@ -49,7 +48,6 @@ else:
             ),
             "result_files": (
                 "ResultFolder",
-                "folder_name",
                 "refuse_to_replace",
             ),
             "run_logs": ("RunLogs",),

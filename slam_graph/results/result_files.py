@@ -98,6 +98,11 @@ class ResultFolder:
         self.files: list[Path] = []
 
     @staticmethod
+    def name_of(name: str) -> str:
+        """A name of a recording or problem as that of one folder (`folder_name`)."""
+        return folder_name(name)
+
+    @staticmethod
     @contextmanager
     def of_run(root: Path, dataset: str, now: datetime | None = None) -> Iterator[ResultFolder]:
         """A new folder `root/dataset/<UTC time>`, to which `latest` beside it links at the end.

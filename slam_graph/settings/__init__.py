@@ -9,21 +9,17 @@ from slam_graph.lazy import lazy_exports
 __all__ = [
     "ConfigTree",
     "Settings",
-    "YamlTextError",
     "expert",
-    "parse_node",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.settings.base import Settings, expert
-    from slam_graph.settings.bounded_yaml import YamlTextError, parse_node
     from slam_graph.settings.tree import ConfigTree
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
             "base": ("Settings", "expert"),
-            "bounded_yaml": ("YamlTextError", "parse_node"),
             "tree": ("ConfigTree",),
         },
     )

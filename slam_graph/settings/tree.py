@@ -16,9 +16,9 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from slam_graph.errors import ConfigError, closest
+from slam_graph.errors import ConfigError, SlamGraphError, closest
 from slam_graph.settings.base import Settings
-from slam_graph.settings.bounded_yaml import YamlTextError, parse_value
+from slam_graph.settings.bounded_yaml import YamlTextError, parse_node, parse_value
 
 KeyPath = tuple[str | int, ...]
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
@@ -65,6 +65,20 @@ class ConfigTree:
         if node is not None:
             _record_lines(node, path, (), where)
         return ConfigTree(values, where)
+
+    @staticmethod
+    def nodes(text: str, path: str | Path, error: type[SlamGraphError]) -> yaml.Node | None:
+        """The nodes of the text of any YAML file, which know their lines; None without a value.
+
+        Args:
+            text: its content.
+            path: of the file, for messages.
+            error: what to raise if it is not YAML, or nested or repeated beyond all bounds.
+        """
+        try:
+            return parse_node(text)
+        except YamlTextError as fault:
+            raise error(f"{fault.where(path)}: not valid YAML ({fault.reason})") from None
 
     @staticmethod
     def override(text: str) -> ConfigTree:

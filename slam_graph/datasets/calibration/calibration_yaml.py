@@ -14,7 +14,7 @@ import yaml
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.settings import YamlTextError, parse_node
+from slam_graph.settings import ConfigTree
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
@@ -129,10 +129,7 @@ def parse_yaml(text: str, path: str | Path) -> YamlValue:
     """
     if text.startswith("%YAML"):
         text = "#" + text
-    try:
-        node = parse_node(text)
-    except YamlTextError as fault:
-        raise DataError(f"{fault.where(path)}: not valid YAML ({fault.reason})") from None
+    node = ConfigTree.nodes(text, path, DataError)
     if not isinstance(node, yaml.MappingNode):
         raise DataError(f"{path}: expected a mapping of keys to values, the file has none")
     return YamlValue(Path(path), node)

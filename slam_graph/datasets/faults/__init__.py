@@ -5,8 +5,3 @@
 `fault.py` has the base class, `frame_faults.py`, `imu_faults.py` and `clock_faults.py` the faults,
 `injection.py` the recording that has them.
 """
-
-from slam_graph.datasets.faults.fault import FAULTS, Fault
-from slam_graph.datasets.faults.injection import FaultySequence, fault_from, inject
-
-__all__ = ["FAULTS", "Fault", "FaultySequence", "fault_from", "inject"]

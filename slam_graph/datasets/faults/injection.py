@@ -31,7 +31,7 @@ from slam_graph.settings import ConfigTree
 def inject(recording: RecordedSequence, faults: Iterable[str | Fault]) -> RecordedSequence:
     """A recording with faults in it.
 
-        sg.run(inject(open_dataset("demo"), ["imu_missing:at_s=8,duration_s=1"]))
+        sg.run(inject(sg.simulate(), ["imu_missing:at_s=8,duration_s=1"]))
 
     Args:
         recording: as it was read.

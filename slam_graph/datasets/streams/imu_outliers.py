@@ -101,7 +101,7 @@ class _Judge:
             values: (N, 6) angular rates in rad/s and specific forces in m/s².
         """
         size = np.abs(values)
-        yield "imu_out_of_range", np.asarray(np.any(size > _RANGE, axis=1))
+        yield "imu_out_of_range", _single(np.asarray(np.any(size > _RANGE, axis=1)))
         at_the_end = _in_runs(size[1:] == size[:-1], _AT_THE_END) & (size > _LARGE)
         yield "imu_saturated", np.asarray(np.any(at_the_end, axis=1))
         yield "imu_stuck", self._stuck(values)
@@ -124,6 +124,12 @@ class _Judge:
 def _values(data: ImuData, row: int) -> str:
     gyro, accel = (", ".join(f"{v:.3g}" for v in x[row]) for x in (data.gyro, data.accel))
     return f"gyroscope {gyro} rad/s, accelerometer {accel} m/s²"
+
+
+def _single(found: BoolArray) -> BoolArray:
+    """What was found, without runs as long as those of a wrong unit, which is not to be hidden."""
+    both = found[1:] & found[:-1]
+    return found & ~_in_runs(both[:, None], _STUCK)[:, 0]
 
 
 def _in_runs(same: BoolArray, count: int) -> BoolArray:
