@@ -7,8 +7,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
+from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
 from slam_graph.errors import DataError
@@ -209,6 +211,25 @@ def real_imu(figures: Figures) -> Iterator[str]:
         yield line(f"`{name}`", *cells)
 
 
+def mono_real_imu(figures: Figures) -> Iterator[str]:
+    """Errors, NEES and scale with one camera on flights with their real IMU, over seeds."""
+    yield "| | `msckf` | `swf` | `okvis` | smoothed | scale |"
+    yield "|---|---|---|---|---:|---:|"
+    for path in FLIGHTS:
+        flight = path.split("/")[-1]
+        cells = []
+        for name in CORE:
+            run = f"mono_real_imu.{flight}.{name}"
+            nees = [f"{run}.nees_{part}" for part in ("position", "orientation")]
+            errors = f"{figures(f'{run}.ate', 3)} ({figures(f'{run}.ate_worst', 3)})"
+            cells.append(f"{errors} / {figures.all(nees, 1, ', ')}")
+        best = f"mono_real_imu.{flight}.{CORE[0]}"
+        scale = f"{100 * float(figures(f'{best}.scale_error', 5)):.2f} %"
+        label = "_".join(flight.split("_")[:2])  # without how difficult it is
+        held = ", held out" if flight_is_held_out(Path(path)) else ""
+        yield line(f"{label}{held}", *cells, figures(f"{best}.smoothed", 4), scale)
+
+
 def held_out(figures: Figures) -> Iterator[str]:
     """What no parameter was chosen on."""
     yield "| | V2_02, 30 s | MH_04, 30 s | ten simulated flights of 15 s |"
@@ -237,6 +258,7 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "results": results,
     "monte_carlo": monte_carlo,
     "real_imu": real_imu,
+    "mono_real_imu": mono_real_imu,
     "held_out": held_out,
     "performance": performance,
     "performance_parts": performance_parts,
