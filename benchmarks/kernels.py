@@ -225,6 +225,8 @@ def root_of_sum(problem: Problem, add_up: Sum) -> FloatArray:
     information = np.empty((size + 1, size + 1))
     parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration
     add_up(*parts, obs.frame, obs.starts, R_f, T, information)
+    stacked = T.reshape(-1, size + 1)
+    information -= stacked.T @ stacked
     whole = information[:size, :size] + np.eye(size) / PRIOR_SIGMA**2
     return np.asarray(cholesky(whole, check_finite=False))
 

@@ -252,7 +252,7 @@ class AlgorithmConfig(Settings):
     """One row of the table."""
 
     # files of results have this name, so it must not lead out of their folder
-    name: str = Field(pattern=r"^[\w+-][\w.+ -]*$", max_length=60)
+    name: str = Field(pattern=r"^[\w+-][\w.+ -]*$", max_length=120)
     """Name of the algorithm."""
     engine: Literal["square_root", "fixed_lag_isam2", "fixed_lag_batch", "isam2"] = "square_root"
     """What solves the problem: this package's own loop under the three policies, or one of GTSAM's
