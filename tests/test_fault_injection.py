@@ -159,12 +159,24 @@ def test_faults_strike_in_their_order(tracks: RecordedSequence) -> None:
         ("imu_missing:at=3", "did you mean 'at_s'"),
         ("imu_missing:at_s", "NAME:setting=value"),
         ("imu_late:by_s=x", "by_s"),
+        ("imu_late:by_s=1e300", "by_s"),
+        ("imu_missing:at_s=2001-13-41", "at_s"),
+        ("imu_missing:at_s=" + "[" * 3000, "at_s"),
+        ("imu_missing:seed=" + "9" * 5000, "seed"),
     ],
 )
 def test_wrong_texts_are_named(tracks: RecordedSequence, text: str, message: str) -> None:
     """In one line that says what there is."""
     with pytest.raises(ConfigError, match=message):
         inject(tracks, [text])
+
+
+def test_a_fault_of_a_camera_that_is_not_there_is_refused(tracks: RecordedSequence) -> None:
+    """Rather than ignored."""
+    with pytest.raises(DataError, match="the recording has 2"):
+        inject(tracks, ["camera_lost:camera=2"])
+    lost = inject(tracks, [f"camera_lost:at_s={AT_S},camera=null"])
+    assert any(not any(len(seen) for seen in frame.cameras) for frame in lost.frames())
 
 
 def test_a_run_on_a_faulty_recording(tmp_path: object) -> None:

@@ -47,6 +47,7 @@ BAD_YAML = {
     "merge bomb": ("a: &a {x: 1}\n" + "b: {<<: [" + "*a," * 11000 + "]}", ":2: .*aliases repeat"),
     "unknown alias": ("a: *b\n", ":1: .*undefined alias"),
     "tag": ("a: !!python/object/apply:os.system [ls]\n", ":1: .*could not determine"),
+    "escape": ('seed: "\\UFFFFFFFF"\n', ": .*"),
     "key": ("? [1, 2]\n: 3\n", ":1: .*unhashable key"),
 }
 

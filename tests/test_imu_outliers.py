@@ -77,6 +77,15 @@ def test_a_platform_that_stands_in_a_simulation_without_noise_is_not_stuck() -> 
     assert not said.counts
 
 
+def test_values_that_a_driver_repeats_are_kept(flown: ImuData) -> None:
+    """Those of a sensor of 100 Hz at 1 kHz."""
+    table = np.repeat(values(flown)[:400], 10, axis=0)
+    imu = ImuData(np.arange(len(table)) * 1_000_000, table[:, :3], table[:, 3:])
+    left, said = cleaned(imu)
+    assert len(left) == len(imu)
+    assert not said.counts
+
+
 def test_a_block_of_shaking_is_no_spike(flown: ImuData) -> None:
     """A shock that lasts for several samples is measured, not made up."""
     table = values(flown)

@@ -140,7 +140,7 @@ class FrontendConfig(Settings):
     """Grey levels by which FAST's circle must differ; halved once in cells without corners."""
 
     window_px: int = expert(17, ge=3)
-    """Side of the window that Lucas-Kanade tracks; OpenCV is fastest at 8n or 8n + 1."""
+    """Side of the window that Lucas-Kanade tracks; 17 is tracked by a kernel, others by OpenCV."""
 
     pyramid_levels: int = expert(3, ge=0, le=8)
     """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""

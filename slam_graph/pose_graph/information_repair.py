@@ -52,9 +52,10 @@ def positive_definite(
     made = (_nearest if repair == "nearest" else _isotropic)(information[bad])
     left = _not_positive_definite(made)
     if len(left):
+        many = f"; nor can those of {len(left) - 1} other edges" if len(left) > 1 else ""
         raise DataError(
             f"{rows.where(int(bad[left[0]]))}: the information matrix cannot be repaired by "
-            f"'{repair}', as there is none in it; nor can those of {len(left) - 1} other edges"
+            f"'{repair}', as there is none in it{many}"
         )
     for edge in bad.tolist():
         diagnostics.warn(

@@ -75,7 +75,10 @@ def _read(text: str) -> tuple[yaml.Node | None, _BoundedLoader | None]:
         return loader.get_single_node(), loader
     except yaml.YAMLError as error:
         raise _fault(error) from None
-    except ValueError as error:  # an escape that is no character, a version that is no number
+    except (
+        ValueError,
+        OverflowError,
+    ) as error:  # an escape that is no character, a version that is no number
         raise YamlTextError(None, " ".join(str(error).split())) from None
 
 

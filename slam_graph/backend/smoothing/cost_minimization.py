@@ -47,12 +47,13 @@ def minimized(
 
     Returns:
         The minimum, the cost there, and the factor by which the last step was taken; None if
-        another one was tried in vain afterwards.
+        another one was tried in vain afterwards, or if it was damped more than the first.
 
     Raises:
         EstimationError: if the cost is not finite.
     """
     value, damping = cost.value(estimates), _FIRST_DAMPING
+    damped = damping
     factor: Factor | None = None
     known: EliminatedStates | None = None
     before = math.inf
@@ -63,7 +64,7 @@ def minimized(
             try:
                 if factor is None:
                     known = None  # it is large
-                    factor = linear.factor(damping)
+                    factor, damped = linear.factor(damping), damping
                 moved = estimates.moved(factor.step(linear))
                 after = cost.value(moved)
             except (np.linalg.LinAlgError, RuntimeError):
@@ -74,7 +75,7 @@ def minimized(
             damping *= 10.0 if fresh else 1.0
         if factor is None or not after <= value:
             break
-        known = factor.states
+        known = factor.states if damped <= _FIRST_DAMPING else None
         decrease, estimates, value = value - after, moved, after
         count_step()
         if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):

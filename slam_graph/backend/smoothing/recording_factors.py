@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The factors of the cost over a recording, in GTSAM, with averaged observations.
+"""Priors, IMU and standstill factors over a recording, in GTSAM, and averaged observations.
 
 Averages the observations of the frames between keyframes into those of the keyframes. The IMU
 predicts the motion from a keyframe to the neighbouring frames to a fraction of a pixel. So the
@@ -11,7 +11,7 @@ The variance of a mean depends on the tracks, whose errors are correlated from f
 the correlation ρ of two errors of a group, the mean of n has the variance σ² (ρ + (1 - ρ) / n). ρ
 is measured as the intraclass correlation over all groups (Fisher 1925).
 
-Keyframe k has the pose X(k), the velocity V(k) and the bias B(k), feature j the position L(j).
+Keyframe k has the pose X(k), the velocity V(k) and the bias B(k).
 """
 
 from __future__ import annotations

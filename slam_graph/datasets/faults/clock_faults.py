@@ -61,7 +61,7 @@ def restamped(frame: CameraFrame | FeatureFrame, stamp_ns: int) -> CameraFrame |
 class ClockJump(_Rewritten):
     """The clock of all sensors jumps, and stays so."""
 
-    by_s: float = 1.0
+    by_s: float = Field(1.0, ge=-1e5, le=1e5)
     """How far; back if negative. What then seems to be older than what was there is left out."""
 
     def stamped(self, stamps_ns: IntArray, around: Surroundings) -> IntArray:

@@ -40,14 +40,21 @@ class Surroundings:
 class Fault(Settings):
     """A fault: what it does to frames, IMU samples and ground truth; here, nothing."""
 
-    at_s: float = Field(6.0, ge=0.0)
+    at_s: float = Field(6.0, ge=0.0, le=1e6)
     """When it begins, in seconds after the first frame."""
 
-    duration_s: float = Field(1.0, gt=0.0)
+    duration_s: float = Field(1.0, gt=0.0, le=1e6)
     """How long it lasts."""
 
     seed: int = 0
     """Of what is random in it."""
+
+    def require(self, around: Surroundings) -> None:
+        """Refuse a recording that cannot have this fault.
+
+        Raises:
+            DataError: naming what it lacks.
+        """
 
     def frames(self, frames: FrameStream, around: Surroundings) -> FrameStream:
         """The frames with the fault. Frames out of order are left out later."""

@@ -82,6 +82,19 @@ class CameraFault(FrameFault):
     camera: int | None = Field(None, ge=0)
     """Which camera; all if it is not said."""
 
+    def require(self, around: Surroundings) -> None:
+        """Refuse a recording without the camera.
+
+        Raises:
+            DataError: if it has fewer.
+        """
+        count = len(around.rig.cameras)
+        if self.camera is not None and self.camera >= count:
+            raise DataError(
+                f"a fault of camera {self.camera}, counted from 0, and the recording has {count}; "
+                "choose another one by camera=0, or all by camera=null"
+            )
+
     def changed(self, frame: Frame, around: Surroundings, rng: np.random.Generator) -> Frame:
         """The frame with other images or features."""
         cameras = around.rig.cameras

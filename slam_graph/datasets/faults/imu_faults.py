@@ -141,7 +141,7 @@ class ImuLate(ImuFault):
     duration_s: float = Field(WHOLE_S, gt=0.0)
     """How long it lasts: to the end."""
 
-    by_s: float = 0.03
+    by_s: float = Field(0.03, ge=-1e5, le=1e5)
     """How much too late."""
 
     def changed(self, block: ImuData, inside: BoolArray, rng: np.random.Generator) -> ImuData:

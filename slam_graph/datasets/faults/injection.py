@@ -11,7 +11,6 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-import yaml
 
 from slam_graph.datasets.faults import clock_faults, frame_faults, imu_faults  # noqa: F401
 from slam_graph.datasets.faults.fault import FAULTS, Fault, Surroundings
@@ -39,6 +38,7 @@ def inject(recording: RecordedSequence, faults: Iterable[str | Fault]) -> Record
 
     Raises:
         ConfigError: if a text names no fault, or a wrong setting of it.
+        DataError: if a fault is of a camera that is not there.
     """
     found = [fault if isinstance(fault, Fault) else fault_from(fault) for fault in faults]
     return FaultySequence(recording, found) if found else recording
@@ -57,10 +57,7 @@ def fault_from(text: str) -> Fault:
         key, separator, value = (piece.strip() for piece in part.partition("="))
         if not key or not separator or not value:
             raise ConfigError(f"{where}: expected NAME:setting=value,setting=value")
-        try:
-            tree.values[key] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{where}: '{value}' is no value") from error
+        tree.values[key] = None if value == "null" else value
     return tree.validated(FAULTS[name])
 
 
@@ -86,6 +83,8 @@ class FaultySequence(RecordedSequence):
         self.faults = list(faults)
         start_ns = recording.info().start_ns
         self._around = Surroundings(recording.rig, start_ns, recording.diagnostics)
+        for fault in self.faults:
+            fault.require(self._around)
 
     @property
     def has_groundtruth(self) -> bool:

@@ -25,12 +25,9 @@ _LARGE = np.repeat([4.0, 35.0], 3)
 _AT_THE_END = 3
 """So many samples in a row with the same large value in one axis are at the end of its range."""
 
-_STUCK = 10
-"""So many samples in a row with the same values in all axes come from a sensor that is stuck."""
-
-_NOISE = np.repeat([3e-4, 3e-3], 3)
-"""Third differences of a signal with noise are larger (rad/s, m/s²). Simulated signals without
-noise repeat themselves when the platform stands."""
+_STUCK, _STUCK_S = 10, 0.05
+"""So many samples in a row, and over so long, with the same values in all axes come from a sensor
+that is stuck. Some drivers repeat each value of a slower sensor a few times."""
 
 _AROUND = 5
 """A sample is compared with so many on either side."""
@@ -44,7 +41,7 @@ _SPIKE_SIGMAS = 10.0
 _SIGMA_OF_MEDIAN_DEVIATION = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 
-_CONTEXT = 16
+_CONTEXT = 128
 """Samples on either side that decide on one: more than any of the counts above."""
 
 
@@ -85,7 +82,9 @@ class _Judge:
     def true_samples(self, data: ImuData, begin: int, end: int) -> Iterator[ImuData]:
         """Those of the samples from `begin` to `end` that can be true, if there are any."""
         wrong = np.zeros(len(data), bool)
-        for kind, found in self._judged(np.hstack([data.gyro, data.accel])):
+        period_ns = max(float(np.median(np.diff(data.stamps_ns))), 1.0) if len(data) > 1 else 1e9
+        stuck = min(max(_STUCK, round(_STUCK_S * 1e9 / period_ns)), _CONTEXT)
+        for kind, found in self._judged(np.hstack([data.gyro, data.accel]), stuck):
             for k in (np.flatnonzero(found[begin:end] & ~wrong[begin:end]) + begin).tolist():
                 what = f"IMU sample at {data.stamps_ns[k]} left out: {_values(data, k)}"
                 self._diagnostics.warn(kind, what)
@@ -94,31 +93,36 @@ class _Judge:
         if len(rows):
             yield ImuData(data.stamps_ns[rows], data.gyro[rows], data.accel[rows])
 
-    def _judged(self, values: FloatArray) -> Iterator[tuple[str, BoolArray]]:
+    def _judged(self, values: FloatArray, stuck: int) -> Iterator[tuple[str, BoolArray]]:
         """Which samples are wrong, by cause.
 
         Args:
             values: (N, 6) angular rates in rad/s and specific forces in m/s².
+            stuck: so many equal samples in a row come from a sensor that is stuck.
         """
         size = np.abs(values)
         yield "imu_out_of_range", _single(np.asarray(np.any(size > _RANGE, axis=1)))
         at_the_end = _in_runs(size[1:] == size[:-1], _AT_THE_END) & (size > _LARGE)
         yield "imu_saturated", np.asarray(np.any(at_the_end, axis=1))
-        yield "imu_stuck", self._stuck(values)
+        yield "imu_stuck", self._stuck(values, stuck)
         yield "imu_spike", _spikes(values)
 
-    def _stuck(self, values: FloatArray) -> BoolArray:
-        """Which samples (N,) are in a run of equal ones, in a signal with noise.
+    def _stuck(self, values: FloatArray, count: int) -> BoolArray:
+        """Which samples (N,) are in a run of `count` equal ones or more, in a signal with noise.
 
-        The first one of a run may be true, but is not worth the doubt.
+        Of noise, third differences are three times as large as first ones; of a smooth signal they
+        are far smaller. Simulated signals without noise repeat themselves when the platform stands.
+        The first sample of a run may be true, but is not worth the doubt.
         """
         same = (values[1:] == values[:-1]).all(axis=1)
-        third, moving = np.abs(np.diff(values, n=3, axis=0)), ~same[2:]
+        moving = ~same[2:]
         if not self.noisy and np.sum(moving) >= _STUCK:
-            self.noisy = bool(np.any(np.median(third[moving], axis=0) > _NOISE))
+            first = np.median(np.abs(np.diff(values, axis=0))[2:][moving], axis=0)
+            third = np.median(np.abs(np.diff(values, n=3, axis=0))[moving], axis=0)
+            self.noisy = bool(np.any(third > first))
         if not self.noisy:
             return np.zeros(len(values), bool)
-        return _in_runs(same[:, None], _STUCK)[:, 0]
+        return _in_runs(same[:, None], count)[:, 0]
 
 
 def _values(data: ImuData, row: int) -> str:
