@@ -112,8 +112,9 @@ def test_brown_distortion() -> None:
         assert same(slopes[rows], expected[1])
 
 
+@pytest.mark.parametrize(("noise", "bound"), [(1e-6, 1e-12), (2e-3, 1e-8)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_triangulation(weighted: bool) -> None:
+def test_triangulation(weighted: bool, noise: float, bound: float) -> None:
     rng = np.random.default_rng(4)
     counts = np.array([2, 5, 9, 4, 6])
     starts = np.append(0, np.cumsum(counts))
@@ -121,7 +122,7 @@ def test_triangulation(weighted: bool) -> None:
     positions = rng.normal(0.0, 0.5, truth.shape)
     turns = Rotation.from_rotvec(rng.normal(0.0, 0.2, truth.shape))
     seen = turns.inv().apply(truth - positions)
-    normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, 2e-3, (len(seen), 2))
+    normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, noise, (len(seen), 2))
     normalized[starts[4] :] *= -1.0  # rays that meet behind the cameras
     weights = (
         np.eye(2) + rng.normal(0.0, 0.1, (len(seen), 2, 2)) if weighted else np.ones((0, 2, 2))
@@ -140,8 +141,9 @@ def test_triangulation(weighted: bool) -> None:
         r = np.einsum("nij,nj->ni", weights[: starts[4]], r) if weighted else r
         errors.append(np.add.reduceat(np.sum(r**2, axis=1), starts[:4]))
     assert same(*errors)
-    # whether the last of the steps, which have converged, lowers the error is decided by rounding
-    assert all(same(a, b, 1e-8) for a, b in zip(*found, strict=True))
+    # whether the last of the steps, which have converged, lowers the error is decided by rounding;
+    # with large residuals it moves the point by more
+    assert all(same(a, b, bound) for a, b in zip(*found, strict=True))
     np.testing.assert_allclose(found[0][0][:4], truth[starts[:4]], atol=0.5)
 
 
