@@ -70,7 +70,12 @@ def _counted_cameras(value: Any) -> Any:
 
 
 class LimitsConfig(Settings):
-    """Beyond these limits a run counts as diverged and ends."""
+    """Beyond these limits an estimate counts as lost."""
+
+    recovery: bool = True
+    """Whether a run whose estimate is lost starts again, as a new segment of the trajectory. It is
+    given up when three segments in a row were shorter than five seconds. Without it a run ends
+    where its estimate is lost."""
 
     max_speed: float = expert(default=100.0, gt=0)
     """Largest plausible speed, m/s."""
@@ -126,7 +131,7 @@ class RunConfig(Settings):
     localization: LocalizationConfig = LocalizationConfig()
     """How the run is located in a map that was saved before."""
     limits: LimitsConfig = LimitsConfig()
-    """When a run is given up as diverged."""
+    """When an estimate is lost, and whether the run then starts again."""
 
     def _facts(self) -> dict[str, object]:
         """The policies of the algorithm, and what differs from the defaults."""

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary
 from slam_graph.backend.smoothing.final_adjustment import FinalBa
-from slam_graph.backend.smoothing.state_covariances import gauge_motion
+from slam_graph.backend.world_gauge import gauge_motion
 from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.evaluation.evaluation_report import nees_of_run

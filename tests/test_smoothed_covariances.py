@@ -35,7 +35,6 @@ from slam_graph.backend.smoothing.state_covariances import (
     KeyframeCovariances,
     aligned_covariances,
     frame_covariances,
-    gauge_motion,
     keyframe_covariances,
 )
 from slam_graph.backend.smoothing.state_elimination import (
@@ -44,6 +43,7 @@ from slam_graph.backend.smoothing.state_elimination import (
     StateColumns,
 )
 from slam_graph.backend.solve.state import dim, stacked_poses
+from slam_graph.backend.world_gauge import gauge_motion
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.experiment.tasks import find_sources

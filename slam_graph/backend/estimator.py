@@ -28,6 +28,7 @@ from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.initializer import Initializer
+from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.start_review import StartReview
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
@@ -60,6 +61,7 @@ class Estimator:
         replayed: the states that supersede all before, if the last frame led to a new beginning.
         states: all that the last frame led to: one, none, or several where frames have waited.
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
+        joint: how the present segment continues the one before; None in the first.
     """
 
     def __init__(
@@ -87,6 +89,8 @@ class Estimator:
         )
         self._check = StartCalibration(rig, config)
         self._given: NavState | None = None
+        self._before: NavState | None = None
+        self.joint: SegmentJoint | None = None
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
         self._report = StepReport()
@@ -136,6 +140,18 @@ class Estimator:
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
+
+    def begin_segment(self, before: NavState | None) -> None:
+        """Forget the state, which is lost, and start again with the frames that follow.
+
+        Args:
+            before: the last good state; the new start is put where the IMU predicts it from there.
+        """
+        self._given, self._start_mode = None, "auto"
+        self._before, self.joint = before, None
+        if self._held is not None:
+            self._held.clear()
+        self._begin(self._context.imu)
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
@@ -273,6 +289,13 @@ class Estimator:
             self._standstill.add_dynamic(self._initializer.outliers)
             scale_sigma = self._initializer.scale_sigma
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            window = self._placed(window)
+        return window
+
+    def _placed(self, window: Window) -> Window:
+        """A window that has just begun, in the world of the segment before if there is one."""
+        if self._before is not None:
+            window, self.joint = place(window, self._before, self._context)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
@@ -286,9 +309,9 @@ class Estimator:
         if window is None:
             return state
         self._standstill.dynamic = review.outliers
-        self.window, self._engine = window, self._make_engine(self._context)
+        self.window, self._engine = self._placed(window), self._make_engine(self._context)
         self._context.propagation.restart()
-        self.replayed = self.states = [window.current(window.prior)]
+        self.replayed = self.states = [self.window.current(self.window.prior)]
         return self.replayed[0]
 
     # --- output ----------------------------------------------------------------------------------

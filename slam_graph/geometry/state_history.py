@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,14 @@ class StateHistory:
         self._states.extend(row.tolist())
         self._sigmas.extend(np.sqrt(variances).tolist())
         self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the states at and after a time."""
+        kept = bisect_left(self._stamps_ns, stamp_ns)
+        del self._stamps_ns[kept:]
+        del self._states[kept * _STATE_WIDTH :]
+        del self._sigmas[kept * _ERROR_WIDTH :]
+        del self._pose_covariances[kept * _POSE_WIDTH**2 :]
 
     def trajectory(self) -> Trajectory:
         """The states as a trajectory with velocities and biases."""

@@ -15,11 +15,11 @@ from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
-from slam_graph.pipeline.supervision import Agreement, DivergenceError, check_sane
+from slam_graph.pipeline.supervision import DivergenceError, check_sane
 from slam_graph.pipeline.tracking import TrackedPacket
 from slam_graph.results import RunInput, RunResult
-from slam_graph.sensors import FeatureFrame
 
 _LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame: the IMU reaches back that far."""
@@ -130,22 +130,25 @@ class Estimation:
             result.input.rig, config.algorithm, config.backend, sequence.diagnostics
         )
         self._start = KnownStart.of(sequence, result.input)
-        self._agreement = Agreement(config.limits)
+        self._recovery = Recovery(result, self.estimator, sequence.diagnostics)
         self._result = result
 
     def estimate(self, tracked: TrackedPacket) -> EstimatedFrame:
         """Estimate the state at the next frame.
 
         Raises:
-            DivergenceError: if the state cannot be true.
+            DivergenceError: if the estimate is lost for good.
         """
-        estimator, features = self.estimator, tracked.features
-        if not estimator.initialized:
-            self._start_from_known_state(tracked.packet.frame.stamp_ns)
-        estimator.add_imu(tracked.packet.imu)
-        state = self._solve(features)
+        estimator, lost = self.estimator, False
+        try:
+            state = self._solve(tracked)
+        except DivergenceError as error:
+            self._recovery.begin_segment(error)
+            self._start = KnownStart()
+            state, lost = None, True
         tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
         ids, points = estimator.landmarks()
+        features = tracked.features
         frame = EstimatedFrame(
             tracked.packet,
             features,
@@ -156,7 +159,7 @@ class Estimation:
             estimator.imu_noise,
             estimator.initialized,
             estimator.corrected_rig,
-            estimator.replayed is not None,
+            estimator.replayed is not None or lost,
             estimator.solved_ns != features.stamp_ns,
             tracked.clock.milliseconds,
             tracked.frame_stats,
@@ -168,13 +171,9 @@ class Estimation:
         """Note the states of frames that waited for IMU samples which do not come."""
         states = self.estimator.finish()
         if self.estimator.replayed is None:
-            self._append(states)
+            self._recovery.append(states)
         else:
-            self._result.supersede(states)
-
-    def _append(self, states: list[NavState]) -> None:
-        for state in states:
-            self._result.history.append(state)
+            self._recovery.supersede(states)
 
     def _start_from_known_state(self, stamp_ns: int) -> None:
         state = self._start.at(stamp_ns)
@@ -182,41 +181,46 @@ class Estimation:
             self.estimator.start(state)
             self._result.start_was_given = True
 
-    def _solve(self, features: FeatureFrame) -> NavState | None:
-        """The state at a frame. A singular system means divergence: sane states do not cause one.
+    def _solve(self, tracked: TrackedPacket) -> NavState | None:
+        """The state at the next frame, checked and noted.
 
         Raises:
-            DivergenceError: if the linear algebra fails.
+            DivergenceError: if it cannot be true, or the linear algebra fails: a singular system
+                means divergence, as sane states do not cause one.
         """
+        estimator, result, features = self.estimator, self._result, tracked.features
+        stamp_ns = features.stamp_ns
+        if not estimator.initialized:
+            self._start_from_known_state(tracked.packet.frame.stamp_ns)
+        estimator.add_imu(tracked.packet.imu)
+        self._recovery.check_recorded(stamp_ns, tracked.packet.imu)
         try:
-            return self.estimator.add_frame(features)
+            state = estimator.add_frame(features)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             reason = " ".join(str(error).split())[:200]
             raise DivergenceError(
-                f"diverged at frame {features.stamp_ns}: the equations cannot be solved ({reason})"
+                f"diverged at frame {stamp_ns}: the equations cannot be solved ({reason})"
             ) from error
-
-    def _note(self, frame: EstimatedFrame, tracked: TrackedPacket) -> None:
-        """Check the state, and note it with how it was found.
-
-        Raises:
-            DivergenceError: if it cannot be true.
-        """
-        estimator, result, logs = self.estimator, self._result, self._result.logs
-        stamp_ns = frame.features.stamp_ns
-        if estimator.costs:
-            logs.steps.append(stamp_ns, estimator.costs, estimator.columns)
-        logs.innovations.append(stamp_ns, estimator.innovations)
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
-            result.supersede(estimator.replayed)
-            self._agreement = Agreement(result.config.limits)
+            self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
             result.start_was_given &= estimator.start_is_given
-        if frame.state is not None:
-            check_sane(frame.state, result.config.limits)
-            self._agreement.check(stamp_ns, estimator.innovations)
+        if state is not None:
+            check_sane(state, result.config.limits)
+            self._recovery.agreement.check(stamp_ns, estimator.innovations)
             if estimator.replayed is None:
-                self._append(estimator.states)
+                self._recovery.append(estimator.states)
+        return state
+
+    def _note(self, frame: EstimatedFrame, tracked: TrackedPacket) -> None:
+        """Note how the state was found."""
+        estimator, result, logs = self.estimator, self._result, self._result.logs
+        stamp_ns = frame.features.stamp_ns
+        if estimator.initialized and estimator.replayed is None:
+            if estimator.costs:
+                logs.steps.append(stamp_ns, estimator.costs, estimator.columns)
+            logs.innovations.append(stamp_ns, estimator.innovations)
+        if frame.state is not None:
             result.point_map.update(frame.landmark_ids, frame.landmarks)
             if estimator.calibration is not None:
                 logs.calibration.append(estimator.calibration)

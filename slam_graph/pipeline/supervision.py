@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType
 
 import numpy as np
@@ -24,6 +25,9 @@ from slam_graph.results import RunResult
 
 _LONGEST_GAP_S = 0.5
 """A gap between two frames whose features were tested counts as at most this much time."""
+
+_LOOKED_BACK = 3.0
+"""Tests are kept for so many further intervals, to find the beginning of a disagreement."""
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +64,22 @@ def check_sane(state: NavState, limits: LimitsConfig) -> None:
             )
 
 
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """How many features of a frame the gate has tested and rejected.
+
+    Attributes:
+        stamp_ns: of the frame.
+        tested_s: time with tested features up to it.
+        tested, rejected: numbers of features.
+    """
+
+    stamp_ns: int
+    tested_s: float
+    tested: int
+    rejected: int
+
+
 class Agreement:
     """Whether the images still agree with the state, by the share that the χ² gate rejects.
 
@@ -73,7 +93,7 @@ class Agreement:
 
     def __init__(self, limits: LimitsConfig) -> None:
         self._limits = limits
-        self._tests: deque[tuple[float, int, int]] = deque()
+        self._tests: deque[_Test] = deque()
         self._tested_s = 0.0
         self._last_ns: int | None = None
 
@@ -88,20 +108,35 @@ class Agreement:
         if self._last_ns is not None:
             self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, _LONGEST_GAP_S)
         self._last_ns = stamp_ns
-        self._tests.append((self._tested_s, innovations.tested, innovations.rejected))
+        new = _Test(stamp_ns, self._tested_s, innovations.tested, innovations.rejected)
+        self._tests.append(new)
         begin_s = self._tested_s - self._limits.disagreement_s
-        while len(self._tests) > 1 and self._tests[1][0] <= begin_s:
+        while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._limits.disagreement_s:
             self._tests.popleft()
-        if self._tests[0][0] > begin_s:
+        if self._tests[0].tested_s > begin_s:
             return
-        tested, rejected = (sum(test[k] for test in self._tests) for k in (1, 2))
-        share = rejected / tested
+        late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
+        recent = list(self._tests)[late[0] - 1 :]
+        share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
         if share > self._limits.max_rejected_share:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
                 f"what was seen in {self._limits.disagreement_s:g} s was rejected (the limit is "
                 f"{self._limits.max_rejected_share:.0%})"
             )
+
+    def agreed_until(self) -> int | None:
+        """Time of the last frame before the images contradicted the state; None if they always did.
+
+        They contradict it over the longest time up to now in which more is rejected than allowed.
+        """
+        tests, first = list(self._tests), len(self._tests)
+        tested = rejected = 0
+        for k in reversed(range(len(tests))):
+            tested, rejected = tested + tests[k].tested, rejected + tests[k].rejected
+            if rejected > self._limits.max_rejected_share * tested:
+                first = k
+        return tests[first - 1].stamp_ns if first else None
 
 
 @contextmanager
@@ -132,7 +167,11 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
 def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked, ending = result.config.min_coverage, result.ending
-    if not estimator.initialized:
+    if not estimator.initialized and result.segments:
+        ending.status, ending.message = "diverged", result.segments[-1].ended_by
+        ending.error = DivergenceError(f"{ending.message}, and the run did not start again")
+        ending.message = str(ending.error)
+    elif not estimator.initialized:
         ending.status = "not_initialized"
         ending.message = (
             f"never initialised in {result.logs.frames} frames: waiting for {estimator.waiting_for}"

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -72,11 +73,16 @@ class FrameTable:
             self._keyframe_rows |= {self._row_of[n] for n in window.keyframes if n in self._row_of}
         self._stamps_ns.append(features.stamp_ns)
 
-    def supersede(self) -> None:
-        """Forget what is said of states; counts of frames stay."""
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget what is said of states at and after a time; counts of frames stay.
+
+        Frames of the window are numbered anew after this.
+        """
+        first = bisect_left(self._stamps_ns, stamp_ns)
         if len(self):
-            self._table()[:, _OF_STATES] = np.nan
-        self._row_of, self._keyframe_rows = {}, set()
+            self._table()[first:, _OF_STATES] = np.nan
+        self._row_of = {}
+        self._keyframe_rows = {row for row in self._keyframe_rows if row < first}
 
     @property
     def stamps_ns(self) -> IntArray:

@@ -11,7 +11,7 @@ import importlib
 import math
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from slam_graph import evaluation
 from slam_graph.errors import DataError
 from slam_graph.geometry import StateHistory, Trajectory
+from slam_graph.results.segments import Segment, estimated_s
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
@@ -105,7 +106,9 @@ def consistency_table(
         return {"unavailable": str(error)}
 
 
-def extent_table(start_ns: int, end_ns: int, frames: int, trajectory: Trajectory) -> Table:
+def extent_table(
+    start_ns: int, end_ns: int, frames: int, trajectory: Trajectory, segments: Sequence[Segment]
+) -> Table:
     """How much was asked for, read and estimated.
 
     Args:
@@ -113,6 +116,7 @@ def extent_table(start_ns: int, end_ns: int, frames: int, trajectory: Trajectory
         end_ns: last time that was asked for.
         frames: that were read.
         trajectory: that was estimated.
+        segments: its stretches.
     """
     stamps = trajectory.stamps_ns
     started = len(stamps) > 0
@@ -122,20 +126,37 @@ def extent_table(start_ns: int, end_ns: int, frames: int, trajectory: Trajectory
         "recorded_s": (end_ns - start_ns) * 1e-9,
         "frames": frames,
         "estimated_frames": len(stamps),
-        "estimated_s": float(stamps[-1] - stamps[0]) * 1e-9 if started else 0.0,
-        "coverage": coverage(start_ns, end_ns, trajectory),
+        "estimated_s": estimated_s(segments),
+        "coverage": coverage(start_ns, end_ns, segments),
         "initialization_s": float(stamps[0] - start_ns) * 1e-9 if started else None,
     }
 
 
-def coverage(start_ns: int, end_ns: int, trajectory: Trajectory) -> float:
-    """Estimated time over the time asked for, from 0 to 1."""
-    stamps = trajectory.stamps_ns
-    if len(stamps) == 0:
+def coverage(start_ns: int, end_ns: int, segments: Sequence[Segment]) -> float:
+    """Estimated time over the time asked for, from 0 to 1; what lies between segments is not."""
+    if not segments:
         return 0.0
     if end_ns <= start_ns:
         return 1.0
-    return min(float(stamps[-1] - stamps[0]) / (end_ns - start_ns), 1.0)
+    return min(estimated_s(segments) / ((end_ns - start_ns) * 1e-9), 1.0)
+
+
+def segments_table(
+    segments: Sequence[Segment], trajectory: Trajectory, truth: Trajectory | None
+) -> list[Table]:
+    """What each segment reached, each aligned on its own; empty for a run in one piece."""
+    if len(segments) < 2:
+        return []
+    return [
+        {
+            "begin_ns": segment.begin_ns,
+            "end_ns": segment.end_ns,
+            "joined_by": segment.joined_by,
+            "ended_by": segment.ended_by,
+            "accuracy": accuracy_table(truth, segment.part_of(trajectory)),
+        }
+        for segment in segments
+    ]
 
 
 def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table | None:

@@ -195,6 +195,7 @@ LOOP_COLUMNS = ("first_stamp_ns", "second_stamp_ns", "accepted")
 IN_MAP = "trajectory_map.tum"
 GROUNDTRUTH = "groundtruth.tum"
 STATES = "states.csv"
+SEGMENTS = "segments.csv"
 SMOOTHED_STATES = "states_smoothed.csv"
 POINTS = "map.ply"
 CONFIG = "config.yaml"

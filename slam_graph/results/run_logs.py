@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -43,6 +44,13 @@ class StepLog:
         self._stamps_ns.append(stamp_ns)
         self._steps.append(len(costs) - 1)
         self._costs.extend((costs[0], costs[-1]))
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the frames at and after a time."""
+        kept = bisect_left(self._stamps_ns, stamp_ns)
+        for column in (self._stamps_ns, self._steps, self._columns):
+            del column[kept:]
+        del self._costs[2 * kept :]
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -85,6 +93,12 @@ class InnovationLog:
             self._stamps_ns.append(stamp_ns)
             self._rows.extend(_values_of(innovations))
 
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the frames at and after a time."""
+        kept = bisect_left(self._stamps_ns, stamp_ns)
+        del self._stamps_ns[kept:]
+        del self._rows[kept * len(_INNOVATION_COLUMNS) :]
+
     @property
     def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
@@ -116,6 +130,12 @@ class CalibrationLog:
         parameters = estimate.parameters()
         values = [parameter.value for parameter in parameters]
         self._rows.append((estimate.stamp_ns, values + [p.sigma for p in parameters]))
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the estimates at and after a time; where none is left, the last one too."""
+        del self._rows[bisect_left(self._rows, stamp_ns, key=lambda row: row[0]) :]
+        if not self._rows:
+            self.latest = None
 
     def table(self) -> dict[str, dict[str, Any]] | None:
         """The last estimate: start, value and standard deviation of each parameter by its name."""
@@ -239,11 +259,15 @@ class RunLogs:
     features: Counter[str] = field(default_factory=Counter)
     last_frame_ns: int | None = None
 
-    def supersede(self) -> None:
-        """Begin anew with what is said of states; times and counts of frames stay."""
-        self.steps, self.innovations = StepLog(), InnovationLog()
-        self.calibration = CalibrationLog()
-        self.by_frame.supersede()
+    def forget_states(self, since_ns: int | None) -> None:
+        """Forget what is said of states from a time on; times and counts of frames stay.
+
+        Args:
+            since_ns: the time; None for all.
+        """
+        since_ns = np.iinfo(np.int64).min if since_ns is None else since_ns
+        for log in (self.steps, self.innovations, self.calibration, self.by_frame):
+            log.forget_from(since_ns)
 
     def count_frame(
         self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,9 +17,10 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, kalibr_text
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.geometry import NavState, StateHistory, Trajectory
+from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
+from slam_graph.results import segments
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder
@@ -34,6 +34,7 @@ from slam_graph.results.run_picture import (
     with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
+from slam_graph.results.segments import Segment
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ class RunResult(RunSummary):
         input: what was run.
         ending: how it ended.
         history: the causal estimate of every frame, with covariances.
+        segments: stretches of it, each from a start to where the estimate was lost.
         start_was_given: whether the first state came with the data, in the world of the truth.
         corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
@@ -117,6 +119,7 @@ class RunResult(RunSummary):
     input: RunInput
     ending: Ending = field(default_factory=Ending)
     history: StateHistory = field(default_factory=StateHistory)
+    segments: list[Segment] = field(default_factory=list)
     start_was_given: bool = False
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
@@ -134,12 +137,17 @@ class RunResult(RunSummary):
             f"{len(self.history)} states of {self.logs.frames} frames)"
         )
 
-    def supersede(self, states: Sequence[NavState]) -> None:
-        """Put other states in the place of all so far; the map and what was logged begin anew."""
-        self.history, self.point_map = StateHistory(), PointMap()
-        self.logs.supersede()
-        for state in states:
-            self.history.append(state)
+    def forget_states(self, since_ns: int | None) -> None:
+        """Take back the states from a time on, and what was logged of them.
+
+        Args:
+            since_ns: the time; None for all states. The points of the map begin anew with these.
+        """
+        if since_ns is None:
+            self.history, self.point_map = StateHistory(), PointMap()
+        else:
+            self.history.forget_from(since_ns)
+        self.logs.forget_states(since_ns)
 
     @property
     def config(self) -> RunConfig:
@@ -254,13 +262,15 @@ class RunResult(RunSummary):
     @property
     def coverage(self) -> float:
         """Estimated time over the time asked for, from 0 to 1."""
-        return tables.coverage(self.input.start_ns, self.input.end_ns, self.trajectory)
+        return tables.coverage(self.input.start_ns, self.input.end_ns, self.segments)
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`; computed when it is first asked for."""
         asked, logs, truth = self.input, self.logs, self.groundtruth
-        extent = tables.extent_table(asked.start_ns, asked.end_ns, logs.frames, self.trajectory)
+        extent = tables.extent_table(
+            asked.start_ns, asked.end_ns, logs.frames, self.trajectory, self.segments
+        )
         frames = max(logs.frames, 1)
         located = self.localization
         table: dict[str, Any] = tables.finite(
@@ -273,6 +283,7 @@ class RunResult(RunSummary):
                 "cameras": len(asked.rig.cameras),
                 "seed": self.config.seed,
                 "extent": {**extent, "start_was_given": self.start_was_given},
+                "segments": tables.segments_table(self.segments, self.trajectory, truth),
                 "accuracy": tables.accuracy_table(truth, self.trajectory),
                 "final_ba": tables.final_ba_table(self.final_ba, truth),
                 "loop_closure": tables.loop_closure_table(self.loops, self.loop_closed, truth),
@@ -325,6 +336,11 @@ class RunResult(RunSummary):
         files = ResultFolder(folder)
         files.text(names.TRAJECTORY, self.trajectory.tum_lines())
         files.text(names.STATES, names.state_lines(self.history))
+        files.text(names.SEGMENTS, segments.csv_lines(self.segments, self.trajectory))
+        if len(self.segments) > 1:
+            for number, segment in enumerate(self.segments):
+                part = segment.part_of(self.trajectory)
+                files.text(f"trajectory_segment_{number}.tum", part.tum_lines())
         if self.final_ba is not None:
             files.text(names.SMOOTHED, self.final_ba.trajectory.tum_lines())
             files.text(names.SMOOTHED_STATES, names.state_lines(self.final_ba.history))

@@ -20,6 +20,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise, MotionChange
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
+from slam_graph.backend.solve.state import State
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
@@ -131,6 +132,26 @@ class Propagation:
 
     def _counts_vibration(self) -> bool:
         return self.noise.vibrates or not self._vibration.vanishes
+
+    def predict(self, state: NavState, imu: ImuBuffer, stamp_ns: int) -> NavState:
+        """The state at a later time by the IMU alone, with its covariance.
+
+        Args:
+            state: with its covariance.
+            imu: samples from the time of the state on.
+            stamp_ns: the later time.
+        """
+        samples = imu.between(state.stamp_ns, stamp_ns)
+        bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+        pim = samples.preintegrated(bias, self._params(imu, samples))
+        predicted = state.predicted(pim, stamp_ns)
+        if state.covariance is None:
+            return predicted
+        both = State()
+        both.insert_imu_state(0, state)
+        both.insert_imu_state(1, predicted)
+        transition = _Transition.of(imu_factor(0, 1, pim), both.estimate)
+        return replace(predicted, covariance=transition.predicted(state.covariance))
 
     def reported(self, state: NavState) -> NavState:
         """The state of the last frame with the covariance that vibration gives it."""

@@ -15,7 +15,6 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -32,8 +31,8 @@ from slam_graph.backend.smoothing.recording_problem import (
 )
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.backend.smoothing.state_covariances import in_gauge_of
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
+from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, level_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 from slam_graph.sensors import Rig
@@ -237,18 +236,7 @@ def _overlap(longest: int) -> int:
 
 def _aligned(states: list[NavState], moving: NavState, fixed: NavState) -> list[NavState]:
     """States moved by the translation and yaw that align `moving` with `fixed`."""
-    turn = fixed.world_T_body.rotation().compose(moving.world_T_body.rotation().inverse())
-    yaw = gtsam.Rot3.Yaw(turn.yaw())
-    shift = fixed.world_T_body.translation() - yaw.rotate(moving.world_T_body.translation())
-    move = gtsam.Pose3(yaw, shift)
-    return [
-        replace(
-            state,
-            world_T_body=move.compose(state.world_T_body),
-            velocity=np.asarray(yaw.rotate(state.velocity)),
-        )
-        for state in states
-    ]
+    return in_moved_world(states, level_motion(moving.world_T_body, fixed.world_T_body))
 
 
 def _progress(

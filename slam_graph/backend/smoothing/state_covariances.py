@@ -29,6 +29,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.backend.world_gauge import gauge_motion
 from slam_graph.geometry import NavState
 
 _ERROR = 15
@@ -193,51 +194,6 @@ def aligned_covariances(
     P += N @ known.aligned_away @ N.transpose(0, 2, 1)
     P = _turned(rotations, P, transpose=True)
     return _turned(rotations, P.transpose(0, 2, 1), transpose=True)
-
-
-def gauge_motion(arms: FloatArray) -> FloatArray:
-    """How (N, 6, 4) poses move with position and yaw of the world, with axes of the world.
-
-    Args:
-        arms: (N, 3) positions relative to the point about which the yaw turns.
-    """
-    motion = np.zeros((len(arms), 6, 4))
-    motion[:, 2, 3] = 1.0
-    motion[:, 3:, :3] = np.eye(3)
-    motion[:, 3:, 3] = np.cross([0.0, 0.0, 1.0], arms)
-    return motion
-
-
-def in_gauge_of(link: NavState, states: list[NavState]) -> list[NavState]:
-    """States of a segment with covariances relative to what those of an earlier one are.
-
-    What is not known of position and yaw at the state where the segments join is added to all
-    others, as if the two segments had independent errors.
-
-    Args:
-        link: the state of the earlier segment whose position and yaw the later one was given.
-        states: of the later segment, with covariances relative to these.
-    """
-    if link.covariance is None:
-        return states
-    R = link.world_T_body.rotation().matrix()
-    given = np.zeros((4, _ERROR))
-    given[:3, _POSITION] = R
-    given[3, _ROTATION] = R[2]
-    unknown = given @ link.covariance @ given.T
-    return [_moved(state, unknown, link) for state in states]
-
-
-def _moved(state: NavState, unknown: FloatArray, link: NavState) -> NavState:
-    """A state with the uncertainty (4, 4) of position and yaw at `link` added."""
-    if state.covariance is None:
-        return state
-    turn = state.world_T_body.rotation().matrix().T
-    arm = state.world_T_body.translation() - link.world_T_body.translation()
-    N = np.zeros((_ERROR, 4))
-    N[_POSE] = _turned(turn[None], gauge_motion(arm[None]))[0]
-    N[_VELOCITY, 3] = np.cross([0.0, 0.0, 1.0], state.velocity)
-    return replace(state, covariance=state.covariance + N @ unknown @ N.T)
 
 
 def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:

@@ -220,6 +220,27 @@ class State:
             tangents.insert(key, offset)
         self.estimate = self.first.retract(tangents)
 
+    def moved(self, motion: gtsam.Pose3) -> State:
+        """The same state in a world that is moved.
+
+        Args:
+            motion: new_T_old of the two worlds; a rotation about the vertical, as gravity stays.
+        """
+        other, turn = self.copy(), motion.rotation().matrix()
+        for values in (other.first, other.estimate):
+            for key in self.offsets:
+                letter = letter_and_index(key)[0]
+                if letter == "x":
+                    values.update(key, motion.compose(values.atPose3(key)))
+                elif letter == "v":
+                    values.update(key, turn @ values.atVector(key))
+                elif letter == "l":
+                    values.update(key, motion.transformFrom(values.atPoint3(key)))
+        for key, offset in self.offsets.items():  # those of poses are of the body
+            if letter_and_index(key)[0] in "vl":
+                other.offsets[key] = turn @ offset
+        return other
+
     def nav_state(self, frame: int, stamp_ns: int, covariance: FloatArray | None) -> NavState:
         """The state of a frame that still has its velocity and bias."""
         bias = self.estimate.atConstantBias(B(frame))

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The joint of two segments: a new start is put where the IMU predicts it from the last good state.
+
+A start defines its own world, in position and yaw. After an estimate is lost, the next start is
+moved into the world of the segment before, by the prediction of the IMU over the time in between.
+That holds only if the prediction and the start agree in what both know: velocity and tilt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.start_review import contradict
+from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import letter_and_index
+from slam_graph.backend.window import Window
+from slam_graph.backend.world_gauge import gauge_covariance, level_motion, with_unknown_gauge
+from slam_graph.geometry import NavState
+
+_UNKNOWN_M = 1000.0
+"""Standard deviation of a position of which nothing is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentJoint:
+    """How a segment continues the one before.
+
+    Attributes:
+        before: the last good state of the segment before.
+        predicted: the state at the start of the new segment as the IMU predicts it from `before`,
+            with its covariance.
+        holds: whether the start agrees with the prediction. If not, the place of the new segment
+            is not known: something else happened in between than the IMU has measured.
+    """
+
+    before: NavState
+    predicted: NavState
+    holds: bool
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(4, 4) of position (m), in axes of the world, and yaw (rad) of the new segment."""
+        if self.holds:
+            return gauge_covariance(self.predicted)
+        return np.diag([_UNKNOWN_M**2] * 3 + [np.pi**2])
+
+    def added_to(self, state: NavState) -> NavState:
+        """A state of the new segment with a covariance relative to the segment before."""
+        return with_unknown_gauge(state, self.covariance, self.predicted.world_T_body.translation())
+
+
+def place(window: Window, before: NavState, context: EngineContext) -> tuple[Window, SegmentJoint]:
+    """A window that has just begun, moved into the world of the segment before, and the joint.
+
+    Args:
+        window: after a start; its world is its own.
+        before: the last good state of the segment before, with its covariance.
+        context: shared with the engine; it has the IMU samples from that state on.
+    """
+    start = window.current(window.prior)
+    predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
+    measured = context.imu.covers(before.stamp_ns)
+    joint = SegmentJoint(before, predicted, measured and not contradict(start, predicted))
+    return moved(window, level_motion(start.world_T_body, predicted.world_T_body)), joint
+
+
+def moved(window: Window, motion: gtsam.Pose3) -> Window:
+    """A window that has just begun, in a world that is moved.
+
+    Args:
+        window: without factors and tracks that are not in its prior yet.
+        motion: new_T_old of the two worlds; a rotation about the vertical.
+    """
+    rotation = motion.rotation().matrix()
+    ids, points = window.last_points
+    return replace(
+        window,
+        state=window.state.moved(motion),
+        prior=_turned(window.prior, rotation),
+        last_points=(ids, points @ rotation.T + motion.translation()),
+    )
+
+
+def _turned(prior: SquareRootInformation, rotation: FloatArray) -> SquareRootInformation:
+    """A prior with the axes of velocities and points turned; tangents of poses are of the body."""
+    Rd = np.array(prior.Rd)
+    for key in prior.layout.dims:
+        if letter_and_index(key)[0] in "vl":
+            columns = prior.layout.indices([key])
+            Rd[:, columns] = Rd[:, columns] @ rotation.T
+    return SquareRootInformation(prior.layout, triangularize(Rd))

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recovery: an estimate that is lost ends its segment, and the run starts again as a new one.
+
+States from where the images began to contradict the estimate are taken back. The new segment is put
+where the IMU predicts its start from the last good state; how well that is known is its joint.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from slam_graph.backend import Estimator
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry import NavState
+from slam_graph.pipeline.supervision import Agreement, DivergenceError
+from slam_graph.results import RunResult
+from slam_graph.results.segments import JoinedBy, Segment
+from slam_graph.sensors import ImuData
+
+_SHORT_S, _MOST_SHORT = 5.0, 3
+"""After so many segments in a row that each lasted less than this, the run is given up: not a
+fault that passes is the cause, but one that stays, such as a wrong calibration."""
+_REMEMBERED_NS = 30_000_000_000
+"""States are remembered for so long: one of them is the last good one when the estimate is lost."""
+_LONGEST_BLIND_S = 1.0
+"""Longest time without frames and without IMU samples after which an estimate goes on."""
+
+
+class Recovery:
+    """Notes states by segments, and begins a new segment where the estimate is lost.
+
+    Args:
+        result: of the run; it is given the states and the segments.
+        estimator: the back end.
+        diagnostics: counts new segments.
+    """
+
+    def __init__(self, result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> None:
+        self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
+        self._agreement = Agreement(result.config.limits)
+        self._recent: deque[NavState] = deque()
+        self._short = 0
+
+    @property
+    def agreement(self) -> Agreement:
+        """Of the images with the present segment."""
+        return self._agreement
+
+    def append(self, states: list[NavState]) -> None:
+        """Note new states; the first after a start begins a segment."""
+        for state in states:
+            segments = self._result.segments
+            if not segments or segments[-1].ended_by:
+                segments.append(self._begun(state))
+            segments[-1].end_ns = state.stamp_ns
+            self._recent.append(state)
+            while self._recent[0].stamp_ns < state.stamp_ns - _REMEMBERED_NS:
+                self._recent.popleft()
+            joint = self._estimator.joint
+            self._result.history.append(state if joint is None else joint.added_to(state))
+
+    def supersede(self, states: list[NavState]) -> None:
+        """Put other states in the place of those of the present segment."""
+        segments = self._result.segments
+        if segments and not segments[-1].ended_by:
+            segments.pop()
+        since_ns = segments[-1].end_ns + 1 if segments else None
+        self._result.forget_states(since_ns)
+        self._agreement = Agreement(self._result.config.limits)
+        self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
+        self.append(states)
+
+    def check_recorded(self, stamp_ns: int, imu: ImuData) -> None:
+        """Refuse to go on after a time of which nothing is recorded.
+
+        Args:
+            stamp_ns: time of the next frame.
+            imu: samples since the frame before.
+
+        Raises:
+            DivergenceError: if neither frames nor samples were recorded for too long.
+        """
+        if not self._recent or not self._estimator.initialized:
+            return
+        known_ns = [self._recent[-1].stamp_ns, *imu.stamps_ns.tolist(), stamp_ns]
+        blind_s = float(np.max(np.diff(np.sort(known_ns)))) * 1e-9
+        if blind_s > _LONGEST_BLIND_S:
+            message = f"lost at frame {stamp_ns}: nothing was recorded for {blind_s:.1f} s"
+            raise DivergenceError(message)
+
+    def begin_segment(self, lost: DivergenceError) -> None:
+        """End the segment where the images last agreed with it, and start again.
+
+        Args:
+            lost: why.
+
+        Raises:
+            DivergenceError: the same, if a new start has no prospect or is not wanted.
+        """
+        result = self._result
+        if not result.config.limits.recovery:
+            raise lost
+        good_ns = self._agreement.agreed_until()
+        while self._recent and (good_ns is None or self._recent[-1].stamp_ns > good_ns):
+            self._recent.pop()
+        self._close_segment(str(lost))
+        if self._short >= _MOST_SHORT:
+            raise lost
+        self._agreement = Agreement(result.config.limits)
+        before = self._recent[-1] if self._recent else None
+        self._estimator.begin_segment(before)
+        self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
+
+    def _close_segment(self, reason: str) -> None:
+        """Take back the states of the present segment that are not good."""
+        segments = self._result.segments
+        if not segments or segments[-1].ended_by:
+            self._short += 1
+            return
+        last = segments[-1]
+        good_ns = self._recent[-1].stamp_ns if self._recent else last.begin_ns - 1
+        last.end_ns, last.ended_by = good_ns, reason
+        self._short = self._short + 1 if last.seconds < _SHORT_S else 0
+        if last.end_ns <= last.begin_ns:
+            segments.pop()
+            good_ns = last.begin_ns - 1
+        self._result.forget_states(good_ns + 1)
+
+    def _begun(self, state: NavState) -> Segment:
+        """The segment that begins with a state."""
+        joint, stamp_ns = self._estimator.joint, state.stamp_ns
+        if joint is None:
+            return Segment(stamp_ns, stamp_ns, "none" if self._result.segments else "start")
+        joined: JoinedBy = "imu" if joint.holds else "none"
+        return Segment(stamp_ns, stamp_ns, joined, joint.covariance)
