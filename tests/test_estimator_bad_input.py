@@ -292,7 +292,7 @@ def test_a_dropped_frame_rejects_no_features(recording: list[Packet], name: str)
     assert isinstance(packet.frame, FeatureFrame)
     assert estimator.add_frame(packet.frame) is None
     assert len(estimator.rejected) == 0
-    assert estimator.innovations.tested == 0
+    assert estimator.report.innovations.tested == 0
 
 
 def test_a_solve_that_fails_loses_no_track(

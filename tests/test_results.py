@@ -166,6 +166,7 @@ def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
         biases = {"accel_bias": zero, "gyro_bias": zero}
         state = NavState(stamp, estimate.pose(index), zero, **biases, covariance=covariance)
         result.history.append(state)
+        result.segments.add(stamp)
         result.logs.count_frame(stamp, {"total": 1.0}, {"tracked": 10.0, "detect_ms": 1.0})
     result.ending.wall_s = 2.0
     return result

@@ -24,7 +24,7 @@ __all__ = [
     "RobustLoss",
     "TenfoldDamping",
     "WindowGraph",
-    "adjust_recording",
+    "adjust_worlds",
     "levenberg_marquardt",
     "triangulate_frames",
 ]
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.policies import AlgorithmConfig
-    from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
+    from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_worlds
     from slam_graph.backend.smoothing.frame_log import FrameLog
     from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
     from slam_graph.backend.solve.damped_steps import (
@@ -72,7 +72,7 @@ else:
             "policies": ("AlgorithmConfig",),
             "smoothing.final_adjustment": (
                 "FinalBa",
-                "adjust_recording",
+                "adjust_worlds",
             ),
             "smoothing.frame_log": ("FrameLog",),
             "smoothing.smoothing_config": ("FinalBaConfig",),

@@ -19,7 +19,6 @@ from threadpoolctl import ThreadpoolController
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
-from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
@@ -61,6 +60,7 @@ class Estimator:
         replayed: the states that supersede all before, if the last frame led to a new beginning.
         states: all that the last frame led to: one, none, or several where frames have waited.
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
+        report: what is known of the last step besides the state.
         joint: how the present segment continues the one before; None in the first.
     """
 
@@ -93,12 +93,10 @@ class Estimator:
         self.joint: SegmentJoint | None = None
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
-        self._report = StepReport()
+        self.report = StepReport()
         # the matrices are small: waking threads for them costs many times what they save
         self._threads = ThreadpoolController()
-        self.rig = rig
-        self.algorithm = algorithm
-        self.config = config
+        self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.diagnostics = diagnostics
         self.replayed: list[NavState] | None = None
@@ -193,7 +191,7 @@ class Estimator:
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
-        self._report = StepReport()
+        self.report = StepReport()
         self.solved_ns = frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
         state = self.window.state if self.window is not None else None
@@ -216,7 +214,7 @@ class Estimator:
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
-            stepped = self._engine.step(self.window, stamp_ns, frame, still, self._report)
+            stepped = self._engine.step(self.window, stamp_ns, frame, still, self.report)
             return self._reviewed(stamp_ns, whole, stepped)
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
@@ -283,7 +281,7 @@ class Estimator:
         """The first window, if this frame makes a start possible."""
         if not self._check.mounted:
             return None
-        with self._report.timed("start"):
+        with self.report.timed("start"):
             window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
@@ -303,7 +301,7 @@ class Estimator:
         review = self._review
         if review is None:
             return state
-        with self._report.timed("start"):
+        with self.report.timed("start"):
             window = review.better(stamp_ns, frame, state)
         self._review = None if review.done else review
         if window is None:
@@ -339,29 +337,9 @@ class Estimator:
         return self._initializer.waiting_for(self._check.contradiction(self._context.imu))
 
     @property
-    def timings(self) -> dict[str, float]:
-        """Seconds that each module took for the last frame."""
-        return self._report.timings
-
-    @property
-    def costs(self) -> tuple[float, ...]:
-        """The cost before the first step of the last frame and after each; empty if not known."""
-        return self._report.costs
-
-    @property
-    def columns(self) -> int:
-        """Dimension of the state in the last step; 0 if there are no costs."""
-        return self._report.columns
-
-    @property
-    def innovations(self) -> Innovations:
-        """How far the last frame was from what was predicted of it."""
-        return self._report.innovations
-
-    @property
     def rejected(self) -> IntArray:
         """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
-        return self._report.rejected
+        return self.report.rejected
 
     @property
     def dynamic(self) -> IntArray:

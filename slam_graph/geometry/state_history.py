@@ -61,6 +61,13 @@ class StateHistory:
         self._sigmas.extend(np.sqrt(variances).tolist())
         self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
 
+    def extend(self, other: StateHistory) -> None:
+        """Add all states of another history, which are later."""
+        self._stamps_ns.extend(other._stamps_ns)
+        self._states.extend(other._states)
+        self._sigmas.extend(other._sigmas)
+        self._pose_covariances.extend(other._pose_covariances)
+
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the states at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)

@@ -9,7 +9,7 @@ The causal and the smoothed trajectory stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -21,7 +21,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
-from slam_graph.loop_closure.loop_pose_graph import correct_keyframes
+from slam_graph.loop_closure.loop_pose_graph import SegmentBreak, correct_keyframes
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
 from slam_graph.pose_graph import Poses
@@ -41,15 +41,20 @@ class LoopClosures:
         loops: L loop closures that passed verification.
         accepted: (L,) whether the pose graph kept them.
         poses: K corrected world_T_body.
+        breaks: where the trajectory was lost and starts again.
     """
 
     keyframes: list[Keyframe]
     loops: list[Loop]
     accepted: BoolArray
     poses: Poses
+    breaks: Sequence[SegmentBreak] = ()
 
     def correct(self, trajectory: Trajectory) -> Trajectory:
-        """A trajectory without its drift: each pose moves with the two keyframes around it."""
+        """A trajectory without its drift: each pose moves with the keyframes around it.
+
+        These are the one before and the one after, as far as they are of the same segment.
+        """
         if not self.accepted.any():
             return trajectory
         stamps = np.array([k.stamp_ns for k in self.keyframes])
@@ -57,6 +62,11 @@ class LoopClosures:
         after = np.minimum(before + 1, len(stamps) - 1)
         length = np.maximum(stamps[after] - stamps[before], 1)
         weight = np.clip((trajectory.stamps_ns - stamps[before]) / length, 0.0, 1.0)
+        own, earlier, later = (
+            np.searchsorted([gap.begin_ns for gap in self.breaks], times, "right")
+            for times in (trajectory.stamps_ns, stamps[before], stamps[after])
+        )
+        weight = np.where(later != own, 0.0, np.where(earlier != own, 1.0, weight))
         causal = Poses.from_gtsam([k.world_T_body for k in self.keyframes])
         body = Poses(Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions)
         first, second = (
@@ -69,6 +79,12 @@ class LoopClosures:
             mixed.translations,
             Rotation.from_matrix(mixed.rotations).as_quat(),
         )
+
+    def across(self, begin_ns: int) -> int:
+        """How many accepted loop closures join what is before a time with what is after it."""
+        kept = (self.loops[k] for k in np.flatnonzero(self.accepted))
+        times = [[self.keyframes[k].stamp_ns for k in (loop.first, loop.second)] for loop in kept]
+        return sum(min(pair) < begin_ns <= max(pair) for pair in times)
 
     def csv_lines(self) -> Iterator[str]:
         """The loop closures that passed verification, as CSV."""
@@ -104,6 +120,7 @@ def close_loops(
     config: LoopClosureConfig,
     seed: int = 0,
     diagnostics: Diagnostics | None = None,
+    breaks: Sequence[SegmentBreak] = (),
 ) -> LoopClosures:
     """Find the loop closures of a run and correct its keyframes.
 
@@ -113,8 +130,10 @@ def close_loops(
         config: settings.
         seed: of the training of the vocabulary.
         diagnostics: counts rejected loop closures.
+        breaks: where the trajectory was lost and starts again.
     """
-    return correct_by(keyframes, _find_loops(keyframes, rig, config, seed), config, diagnostics)
+    loops = _find_loops(keyframes, rig, config, seed)
+    return correct_by(keyframes, loops, config, diagnostics, breaks)
 
 
 def correct_by(
@@ -122,22 +141,25 @@ def correct_by(
     loops: list[Loop],
     config: LoopClosureConfig,
     diagnostics: Diagnostics | None = None,
+    breaks: Sequence[SegmentBreak] = (),
 ) -> LoopClosures:
     """Correct keyframes by loop closures, some of which may be false."""
     causal = Poses.from_gtsam([k.world_T_body for k in keyframes])
     if not loops:
-        return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal)
+        return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal, breaks)
     stamps = np.array([k.stamp_ns for k in keyframes])
     level = config.degrees_of_freedom == 4
     accepted = np.ones(len(loops), np.bool_)
     for _ in range(_MAX_PASSES):
         held = np.flatnonzero(accepted)
         kept = [loops[k] for k in held]
-        poses, inliers = correct_keyframes(stamps, causal, kept, config, level, diagnostics)
+        poses, inliers = correct_keyframes(
+            stamps, causal, kept, config, level, diagnostics, breaks=breaks
+        )
         accepted[held[~inliers]] = False
         if inliers.all():
             break
-    return LoopClosures(keyframes, loops, accepted, poses)
+    return LoopClosures(keyframes, loops, accepted, poses, breaks)
 
 
 def _find_loops(

@@ -18,6 +18,9 @@ which is robust to false loop closures.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Protocol
+
 import numpy as np
 import scipy  # its parts are imported when they are first used
 from scipy.spatial.transform import Rotation
@@ -37,6 +40,20 @@ _LEVEL_SIGMA_RAD = 1e-4
 """Standard deviation of roll and pitch in a level graph, which keeps it well conditioned."""
 
 
+class SegmentBreak(Protocol):
+    """Where a trajectory was lost and starts again."""
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the first state of the later segment."""
+        ...
+
+    @property
+    def joint_sigmas(self) -> tuple[float, float]:
+        """How well its yaw (rad) and position (m) are known relative to the segment before."""
+        ...
+
+
 def correct_keyframes(
     stamps_ns: IntArray,
     poses: Poses,
@@ -45,6 +62,7 @@ def correct_keyframes(
     level: bool,
     diagnostics: Diagnostics | None = None,
     recording_of: IntArray | None = None,
+    breaks: Sequence[SegmentBreak] = (),
 ) -> tuple[Poses, BoolArray]:
     """Poses of keyframes without their drift, by loop closures some of which may be false.
 
@@ -57,13 +75,16 @@ def correct_keyframes(
         level: whether gravity determines roll and pitch.
         diagnostics: counts what went wrong.
         recording_of: (N,) number of the recording of each keyframe; all are of one if not given.
+        breaks: of the trajectory, in the order of time.
 
     Returns:
         The corrected world_T_body, and (L,) whether the pose graph kept the loop closure.
     """
     one = recording_of is None
-    drift = drift_sigmas(stamps_ns, poses, loops, config) if one else _configured_drift(config)
-    graph = loop_graph(stamps_ns, poses, loops, drift, level, recording_of)
+    segment_of = np.searchsorted([b.begin_ns for b in breaks], stamps_ns, "right")
+    inside = [x for x in loops if segment_of[x.first] == segment_of[x.second]]
+    drift = drift_sigmas(stamps_ns, poses, inside, config) if one else _configured_drift(config)
+    graph = loop_graph(stamps_ns, poses, loops, drift, level, recording_of, breaks)
     policy = PoseGraphPolicy.with_gnc("auto" if one else "file")
     solution = optimize_pose_graph(graph, policy, diagnostics)
     kept = solution.weights[len(solution.weights) - len(loops) :] > 0.5
@@ -77,6 +98,7 @@ def loop_graph(
     drift: tuple[float, float],
     level: bool,
     recording_of: IntArray | None = None,
+    breaks: Sequence[SegmentBreak] = (),
 ) -> PoseGraph:
     """The pose graph of keyframes, odometry between consecutive ones, and loop closures.
 
@@ -88,6 +110,7 @@ def loop_graph(
         level: whether the graph is one of level frames, with four degrees of freedom.
         recording_of: (N,) number of the recording of each keyframe; between recordings there is no
             odometry. All are of one recording if not given.
+        breaks: of the trajectory; odometry across one is known as well as the break says.
 
     Returns:
         A graph of level frames or of bodies.
@@ -103,6 +126,10 @@ def loop_graph(
     sigmas = [shift] * 3 + [yaw] * 3
     edges = np.column_stack([before, before + 1])
     covariances = seconds[:, None, None] * np.diag(np.square(sigmas))
+    for gap in breaks:
+        across = (stamps_ns[before] < gap.begin_ns) & (stamps_ns[before + 1] >= gap.begin_ns)
+        turn, offset = gap.joint_sigmas
+        covariances[across] += np.diag(np.square([offset] * 3 + [turn] * 3))
     name = "loop closures" if recording_of is None else "merged maps"
     graph = PoseGraph(
         np.arange(count), poses, edges, odometry, np.linalg.inv(covariances), name=name

@@ -146,7 +146,7 @@ class Estimation:
             self._recovery.begin_segment(error)
             self._start = KnownStart()
             state, lost = None, True
-        tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.timings.items()})
+        tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.report.timings.items()})
         ids, points = estimator.landmarks()
         features = tracked.features
         frame = EstimatedFrame(
@@ -207,7 +207,7 @@ class Estimation:
             result.start_was_given &= estimator.start_is_given
         if state is not None:
             check_sane(state, result.config.limits)
-            self._recovery.agreement.check(stamp_ns, estimator.innovations)
+            self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)
         return state
@@ -217,9 +217,9 @@ class Estimation:
         estimator, result, logs = self.estimator, self._result, self._result.logs
         stamp_ns = frame.features.stamp_ns
         if estimator.initialized and estimator.replayed is None:
-            if estimator.costs:
-                logs.steps.append(stamp_ns, estimator.costs, estimator.columns)
-            logs.innovations.append(stamp_ns, estimator.innovations)
+            if estimator.report.costs:
+                logs.steps.append(stamp_ns, estimator.report.costs, estimator.report.columns)
+            logs.innovations.append(stamp_ns, estimator.report.innovations)
         if frame.state is not None:
             result.point_map.update(frame.landmark_ids, frame.landmarks)
             if estimator.calibration is not None:

@@ -78,8 +78,7 @@ class Keyframes(Stage):
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate."""
         if frame.restarted:
-            keyframes = self._result.config.loop_closure.keyframes
-            self._log = KeyframeLog(self._result.causal_rig, keyframes)
+            self._restart()
         state = frame.state
         if state is None or frame.waits:
             return
@@ -88,6 +87,15 @@ class Keyframes(Stage):
         features = FeatureFrame(state.stamp_ns, frame.features.cameras)
         self._log.add(features, state.world_T_body, frame.image)
         self.seconds += time.perf_counter() - began
+
+    def _restart(self) -> None:
+        """Keep the keyframes of segments that have ended, and forget those after them."""
+        result, earlier = self._result, self._log.keyframes
+        ended = [segment for segment in result.segments if segment.ended_by]
+        self._log = KeyframeLog(result.causal_rig, result.config.loop_closure.keyframes)
+        if ended:
+            good_ns = ended[-1].end_ns
+            self._log.keyframes += [k for k in earlier if k.stamp_ns <= good_ns]
 
     @property
     def found(self) -> list[Keyframe]:
@@ -127,7 +135,10 @@ class LoopClosing(Stage):
                 result.config.loop_closure,
                 result.config.seed,
                 self._diagnostics,
+                result.segments.later,
             )
+            for segment in result.segments.later:
+                segment.loops = closures.across(segment.begin_ns)
             logger.info(
                 "loop closure: %d keyframes, %d loop closures, %d accepted, %.1f s in all",
                 len(self._keyframes.found),

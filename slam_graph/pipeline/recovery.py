@@ -17,7 +17,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
 from slam_graph.pipeline.supervision import Agreement, DivergenceError
 from slam_graph.results import RunResult
-from slam_graph.results.segments import JoinedBy, Segment
 from slam_graph.sensors import ImuData
 
 _SHORT_S, _MOST_SHORT = 5.0, 3
@@ -25,6 +24,9 @@ _SHORT_S, _MOST_SHORT = 5.0, 3
 fault that passes is the cause, but one that stays, such as a wrong calibration."""
 _REMEMBERED_NS = 30_000_000_000
 """States are remembered for so long: one of them is the last good one when the estimate is lost."""
+_MARGIN_NS = 500_000_000
+"""States so long before a contradiction are taken back too: it shows late, as new features are
+tested only after some frames."""
 _LONGEST_BLIND_S = 1.0
 """Longest time without frames and without IMU samples after which an estimate goes on."""
 
@@ -51,23 +53,23 @@ class Recovery:
 
     def append(self, states: list[NavState]) -> None:
         """Note new states; the first after a start begins a segment."""
+        joint, result = self._estimator.joint, self._result
         for state in states:
-            segments = self._result.segments
-            if not segments or segments[-1].ended_by:
-                segments.append(self._begun(state))
-            segments[-1].end_ns = state.stamp_ns
+            if joint is None:
+                result.segments.add(state.stamp_ns)
+                result.history.append(state)
+            else:
+                result.segments.add(state.stamp_ns, joint.covariance, joint.holds)
+                result.history.append(joint.added_to(state))
             self._recent.append(state)
             while self._recent[0].stamp_ns < state.stamp_ns - _REMEMBERED_NS:
                 self._recent.popleft()
-            joint = self._estimator.joint
-            self._result.history.append(state if joint is None else joint.added_to(state))
 
     def supersede(self, states: list[NavState]) -> None:
         """Put other states in the place of those of the present segment."""
         segments = self._result.segments
-        if segments and not segments[-1].ended_by:
-            segments.pop()
-        since_ns = segments[-1].end_ns + 1 if segments else None
+        segments.forget_last()
+        since_ns = segments[-1].end_ns + 1 if len(segments) else None
         self._result.forget_states(since_ns)
         self._agreement = Agreement(self._result.config.limits)
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
@@ -103,36 +105,23 @@ class Recovery:
         result = self._result
         if not result.config.limits.recovery:
             raise lost
-        good_ns = self._agreement.agreed_until()
-        while self._recent and (good_ns is None or self._recent[-1].stamp_ns > good_ns):
-            self._recent.pop()
-        self._close_segment(str(lost))
+        self._forget_bad_states(self._agreement.agreed_until())
+        before = self._recent[-1] if self._recent else None
+        lasted_s = result.segments.end(None if before is None else before.stamp_ns, str(lost))
+        end_ns = result.segments[-1].end_ns if len(result.segments) else None
+        result.forget_states(None if end_ns is None else end_ns + 1)
+        self._short = self._short + 1 if lasted_s < _SHORT_S else 0
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config.limits)
-        before = self._recent[-1] if self._recent else None
         self._estimator.begin_segment(before)
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
 
-    def _close_segment(self, reason: str) -> None:
-        """Take back the states of the present segment that are not good."""
+    def _forget_bad_states(self, good_ns: int | None) -> None:
+        """Forget the states of the present segment after a time, or all of them."""
         segments = self._result.segments
-        if not segments or segments[-1].ended_by:
-            self._short += 1
+        if not segments.goes_on:
             return
-        last = segments[-1]
-        good_ns = self._recent[-1].stamp_ns if self._recent else last.begin_ns - 1
-        last.end_ns, last.ended_by = good_ns, reason
-        self._short = self._short + 1 if last.seconds < _SHORT_S else 0
-        if last.end_ns <= last.begin_ns:
-            segments.pop()
-            good_ns = last.begin_ns - 1
-        self._result.forget_states(good_ns + 1)
-
-    def _begun(self, state: NavState) -> Segment:
-        """The segment that begins with a state."""
-        joint, stamp_ns = self._estimator.joint, state.stamp_ns
-        if joint is None:
-            return Segment(stamp_ns, stamp_ns, "none" if self._result.segments else "start")
-        joined: JoinedBy = "imu" if joint.holds else "none"
-        return Segment(stamp_ns, stamp_ns, joined, joint.covariance)
+        last_ns = segments[-1].begin_ns - 1 if good_ns is None else good_ns - _MARGIN_NS
+        while self._recent and self._recent[-1].stamp_ns > last_ns:
+            self._recent.pop()

@@ -74,9 +74,11 @@ class Smoothing(Stage):
     def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
         calibrated = result.logs.calibration.latest
-        result.final_ba = backend.adjust_recording(
+        groups = result.segments.worlds()
+        result.final_ba = backend.adjust_worlds(
             log,
             result.trajectory,
+            [(group[0].begin_ns, group[-1].end_ns) for group in groups],
             result.causal_rig if calibrated is None else calibrated.rig,
             result.config.backend,
             result.config.final_ba,

@@ -26,6 +26,8 @@ from slam_graph.results import RunResult
 _LONGEST_GAP_S = 0.5
 """A gap between two frames whose features were tested counts as at most this much time."""
 
+_GOOD_SHARE = 0.05
+"""Share of the features that is rejected while an estimate is good: some percent."""
 _LOOKED_BACK = 3.0
 """Tests are kept for so many further intervals, to find the beginning of a disagreement."""
 
@@ -128,14 +130,18 @@ class Agreement:
     def agreed_until(self) -> int | None:
         """Time of the last frame before the images contradicted the state; None if they always did.
 
-        They contradict it over the longest time up to now in which more is rejected than allowed.
+        The most likely time at which the share of rejected features changed from that of a good
+        state to one beyond the limit (a maximum of cumulated log-likelihood ratios: Page 1954).
         """
-        tests, first = list(self._tests), len(self._tests)
-        tested = rejected = 0
+        good, bad = _GOOD_SHARE, self._limits.max_rejected_share
+        kept, lost = np.log((1.0 - bad) / (1.0 - good)), np.log(bad / good)
+        tests = list(self._tests)
+        ratio, highest, first = 0.0, 0.0, len(tests)
         for k in reversed(range(len(tests))):
-            tested, rejected = tested + tests[k].tested, rejected + tests[k].rejected
-            if rejected > self._limits.max_rejected_share * tested:
-                first = k
+            rejected = tests[k].rejected
+            ratio += rejected * lost + (tests[k].tested - rejected) * kept
+            if ratio >= highest:
+                highest, first = ratio, k
         return tests[first - 1].stamp_ns if first else None
 
 
@@ -167,10 +173,10 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
 def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked, ending = result.config.min_coverage, result.ending
-    if not estimator.initialized and result.segments:
-        ending.status, ending.message = "diverged", result.segments[-1].ended_by
-        ending.error = DivergenceError(f"{ending.message}, and the run did not start again")
-        ending.message = str(ending.error)
+    lost = result.segments.lost
+    if not estimator.initialized and lost:
+        message = f"{lost}; the run did not start again: waiting for {estimator.waiting_for}"
+        ending.status, ending.message, ending.error = "diverged", message, DivergenceError(message)
     elif not estimator.initialized:
         ending.status = "not_initialized"
         ending.message = (

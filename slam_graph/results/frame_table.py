@@ -60,10 +60,10 @@ class FrameTable:
             counts: of the front end, by name.
         """
         seen = [len(camera) for camera in features.cameras]
-        window, found = estimator.window, estimator.innovations
+        window, found = estimator.window, estimator.report.innovations
         past, held = (0, 0) if window is None else (len(window.past), len(window.state_features))
         tested = bool(found.passed_dof)
-        costs = [*estimator.costs[:_MAX_COSTS]]
+        costs = [*estimator.report.costs[:_MAX_COSTS]]
         row: list[float] = [seen[0], sum(seen[1:]), estimated, past, held]
         row += [counts.get(REJECTED[0], 0.0), found.rejected, counts.get(REJECTED[2], 0.0)]
         row += [found.passed_distance, found.passed_dof, found.expected] if tested else 3 * [np.nan]

@@ -11,7 +11,7 @@ import importlib
 import math
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from slam_graph import evaluation
 from slam_graph.errors import DataError
 from slam_graph.geometry import StateHistory, Trajectory
-from slam_graph.results.segments import Segment, estimated_s
+from slam_graph.results.segments import Segments
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def consistency_table(
 
 
 def extent_table(
-    start_ns: int, end_ns: int, frames: int, trajectory: Trajectory, segments: Sequence[Segment]
+    start_ns: int, end_ns: int, frames: int, trajectory: Trajectory, segments: Segments
 ) -> Table:
     """How much was asked for, read and estimated.
 
@@ -126,23 +126,23 @@ def extent_table(
         "recorded_s": (end_ns - start_ns) * 1e-9,
         "frames": frames,
         "estimated_frames": len(stamps),
-        "estimated_s": estimated_s(segments),
+        "estimated_s": segments.seconds,
         "coverage": coverage(start_ns, end_ns, segments),
         "initialization_s": float(stamps[0] - start_ns) * 1e-9 if started else None,
     }
 
 
-def coverage(start_ns: int, end_ns: int, segments: Sequence[Segment]) -> float:
+def coverage(start_ns: int, end_ns: int, segments: Segments) -> float:
     """Estimated time over the time asked for, from 0 to 1; what lies between segments is not."""
-    if not segments:
+    if not len(segments):
         return 0.0
     if end_ns <= start_ns:
         return 1.0
-    return min(estimated_s(segments) / ((end_ns - start_ns) * 1e-9), 1.0)
+    return min(segments.seconds / ((end_ns - start_ns) * 1e-9), 1.0)
 
 
 def segments_table(
-    segments: Sequence[Segment], trajectory: Trajectory, truth: Trajectory | None
+    segments: Segments, trajectory: Trajectory, truth: Trajectory | None
 ) -> list[Table]:
     """What each segment reached, each aligned on its own; empty for a run in one piece."""
     if len(segments) < 2:

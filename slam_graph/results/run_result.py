@@ -20,7 +20,6 @@ from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
-from slam_graph.results import segments
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
 from slam_graph.results.result_files import ResultFolder
@@ -34,7 +33,7 @@ from slam_graph.results.run_picture import (
     with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
-from slam_graph.results.segments import Segment
+from slam_graph.results.segments import Segments
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
@@ -119,7 +118,7 @@ class RunResult(RunSummary):
     input: RunInput
     ending: Ending = field(default_factory=Ending)
     history: StateHistory = field(default_factory=StateHistory)
-    segments: list[Segment] = field(default_factory=list)
+    segments: Segments = field(default_factory=Segments)
     start_was_given: bool = False
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
@@ -336,7 +335,7 @@ class RunResult(RunSummary):
         files = ResultFolder(folder)
         files.text(names.TRAJECTORY, self.trajectory.tum_lines())
         files.text(names.STATES, names.state_lines(self.history))
-        files.text(names.SEGMENTS, segments.csv_lines(self.segments, self.trajectory))
+        files.text(names.SEGMENTS, self.segments.csv_lines(self.trajectory))
         if len(self.segments) > 1:
             for number, segment in enumerate(self.segments):
                 part = segment.part_of(self.trajectory)

@@ -7,7 +7,7 @@ A run that is never lost has one segment. `segments.csv` has a row for each.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -21,7 +21,7 @@ JoinedBy = Literal["start", "imu", "none"]
 
 _COLUMNS = (
     *("segment", "world", "begin_ns", "end_ns", "states", "joined_by"),
-    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "ended_by"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "loops", "ended_by"),
 )
 
 
@@ -33,6 +33,7 @@ class Segment:
         begin_ns, end_ns: times of its first and its last state.
         joined_by: what puts it into the world of the segment before.
         joint_covariance: (4, 4) of that: position (m) in axes of the world, and yaw (rad).
+        loops: number of accepted loop closures to earlier segments, if loops were closed.
         ended_by: what ended it; empty for the end of the recording.
     """
 
@@ -40,7 +41,14 @@ class Segment:
     end_ns: int
     joined_by: JoinedBy = "start"
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+    loops: int = 0
     ended_by: str = ""
+
+    @property
+    def joint_sigmas(self) -> tuple[float, float]:
+        """Standard deviations of the joint: yaw (rad), and position (m) along the worst axis."""
+        variances = np.diag(self.joint_covariance)
+        return float(np.sqrt(variances[3])), float(np.sqrt(variances[:3].max()))
 
     @property
     def seconds(self) -> float:
@@ -53,39 +61,103 @@ class Segment:
         return trajectory.select((stamps >= self.begin_ns) & (stamps <= self.end_ns))
 
 
-def worlds(segments: Sequence[Segment]) -> list[list[Segment]]:
-    """Segments in groups that are joined: all poses of a group are in one world."""
-    groups: list[list[Segment]] = []
-    for segment in segments:
-        if segment.joined_by == "none" or not groups:
-            groups.append([])
-        groups[-1].append(segment)
-    return groups
+class Segments:
+    """All segments of a run, in the order of time.
 
-
-def estimated_s(segments: Iterable[Segment]) -> float:
-    """Time that is estimated, without what lies between segments, s."""
-    return sum(segment.seconds for segment in segments)
-
-
-def csv_lines(segments: Sequence[Segment], trajectory: Trajectory) -> Iterator[str]:
-    """Segments as CSV; times between two of them have no state.
-
-    Args:
-        segments: in the order of time.
-        trajectory: all states.
+    Attributes:
+        lost: why the estimate was lost, the last time that it was; empty if it never was.
     """
-    yield ",".join(_COLUMNS) + "\n"
-    number = 0
-    for world, group in enumerate(worlds(segments)):
-        for segment in group:
+
+    def __init__(self) -> None:
+        self.lost = ""
+        self._all: list[Segment] = []
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def __iter__(self) -> Iterator[Segment]:
+        return iter(self._all)
+
+    def __getitem__(self, number: int) -> Segment:
+        return self._all[number]
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the last segment has not ended."""
+        return bool(self._all) and not self._all[-1].ended_by
+
+    @property
+    def later(self) -> list[Segment]:
+        """All but the first."""
+        return self._all[1:]
+
+    @property
+    def seconds(self) -> float:
+        """Time that is estimated, without what lies between segments."""
+        return sum(segment.seconds for segment in self._all)
+
+    def add(self, stamp_ns: int, joint: FloatArray | None = None, joined: bool = False) -> None:
+        """Note a state: it continues the last segment, or begins one where that has ended.
+
+        Args:
+            stamp_ns: its time.
+            joint: (4, 4) covariance of the joint, if a segment begins that is not the first.
+            joined: whether the joint holds.
+        """
+        if not self.goes_on:
+            by: JoinedBy = "start" if not self._all else "imu" if joined else "none"
+            known = np.zeros((4, 4)) if joint is None else joint
+            self._all.append(Segment(stamp_ns, stamp_ns, by, known))
+        self._all[-1].end_ns = stamp_ns
+
+    def end(self, good_ns: int | None, reason: str) -> float:
+        """End the last segment, if it goes on, and say how long it lasted, s.
+
+        Args:
+            good_ns: time of its last state that is good; if there is none it is forgotten.
+            reason: why it ends.
+        """
+        self.lost = reason
+        if not self.goes_on:
+            return 0.0
+        last = self._all[-1]
+        if good_ns is None or good_ns <= last.begin_ns:
+            self._all.pop()
+            return 0.0
+        last.end_ns, last.ended_by = good_ns, reason
+        return last.seconds
+
+    def forget_last(self) -> None:
+        """Forget the last segment, if it goes on."""
+        if self.goes_on:
+            self._all.pop()
+
+    def worlds(self) -> list[list[Segment]]:
+        """Segments in groups that are joined: all poses of a group are in one world."""
+        groups: list[list[Segment]] = []
+        for segment in self._all:
+            if segment.joined_by == "none" or not groups:
+                groups.append([])
+            groups[-1].append(segment)
+        return groups
+
+    def csv_lines(self, trajectory: Trajectory) -> Iterator[str]:
+        """Segments as CSV; times between two of them have no state.
+
+        Args:
+            trajectory: all states.
+        """
+        yield ",".join(_COLUMNS) + "\n"
+        world = -1
+        for number, segment in enumerate(self._all):
+            world += segment.joined_by == "none" or number == 0
             sigmas = np.sqrt(np.diag(segment.joint_covariance))
             cells = [
                 *(str(number), str(world), str(segment.begin_ns), str(segment.end_ns)),
                 str(len(segment.part_of(trajectory))),
                 segment.joined_by,
                 *(f"{sigma:.6g}" for sigma in sigmas),
+                str(segment.loops),
                 '"{}"'.format(segment.ended_by.replace('"', "'")),
             ]
             yield ",".join(cells) + "\n"
-            number += 1

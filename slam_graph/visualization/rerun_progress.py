@@ -110,11 +110,11 @@ class StepSeries:
         past = 0 if estimator.window is None else len(estimator.window.past)
         numbers = [seen[0], sum(seen[1:]), len(frame.landmark_ids), past]
         add("backend/counts", number, stamp_ns, np.array(numbers, np.float64))
-        innovations = estimator.innovations
+        innovations = estimator.report.innovations
         rejected = [counts.get("rejected_ransac", 0.0), float(innovations.rejected)]
         add("backend/rejected", number, stamp_ns, [*rejected, counts.get("rejected_stereo", 0.0)])
-        if estimator.costs:
-            add("backend/cost", number, stamp_ns, estimator.costs[:8])
+        if estimator.report.costs:
+            add("backend/cost", number, stamp_ns, estimator.report.costs[:8])
         if innovations.passed_dof:
             self._add_nis(number, stamp_ns, estimator)
         if frame.state is not None:
@@ -122,7 +122,7 @@ class StepSeries:
 
     def _add_nis(self, number: int, stamp_ns: int, estimator: Estimator) -> None:
         """Squared innovations over their degrees of freedom, with what is expected of them."""
-        innovations = estimator.innovations
+        innovations = estimator.report.innovations
         sums = (innovations.passed_distance, innovations.passed_dof, innovations.expected)
         values, bounds = nis_rows(*(np.array([float(value)]) for value in sums))
         self._series.add("consistency/nis", number, stamp_ns, values[0])

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,3 +89,13 @@ def summary_of(
         seconds=time.perf_counter() - began[0],
         cpu_seconds=time.process_time() - began[1],
     )
+
+
+def total_of(summaries: list[FinalBaSummary]) -> FinalBaSummary:
+    """Figures of several adjustments together."""
+    seconds, cpu_seconds = (
+        sum(getattr(part, name) for part in summaries) for name in ("seconds", "cpu_seconds")
+    )
+    whole = summary_of([*summaries], sum(part.frames for part in summaries), (0.0, 0.0))
+    segments = sum(part.segments for part in summaries)
+    return replace(whole, segments=segments, seconds=seconds, cpu_seconds=cpu_seconds)

@@ -12,14 +12,14 @@ from __future__ import annotations
 import logging
 import time
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of
+from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
@@ -75,6 +75,46 @@ class FinalBa:
     def trajectory(self) -> Trajectory:
         """Poses of all frames, with velocities and biases."""
         return self.history.trajectory()
+
+
+def adjust_worlds(
+    log: FrameLog,
+    causal: Trajectory,
+    worlds: Sequence[tuple[int, int]],
+    rig: Rig,
+    backend: BackendConfig,
+    config: FinalBaConfig,
+    report: Report,
+) -> FinalBa | None:
+    """Solve each part of a recording as a whole whose poses are in one world.
+
+    Args:
+        log: all frames.
+        causal: as for `adjust_recording`.
+        worlds: times of the first and the last state of each part, in the order of time. Frames
+            before the first part belong to it, and those after the last one to that.
+        rig: as for `adjust_recording`.
+        backend: noise and triangulation.
+        config: settings.
+        report: is given the progress after each step.
+    """
+    parts: list[FinalBa] = []
+    for number, (begin_ns, end_ns) in enumerate(worlds):
+        inside = (causal.stamps_ns >= begin_ns) & (causal.stamps_ns <= end_ns)
+        offset_ns = round(rig.pose_offset_s * 1e9)
+        part = log.part(
+            None if number == 0 else begin_ns - offset_ns,
+            None if number == len(worlds) - 1 else end_ns - offset_ns,
+        )
+        found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+        if found is not None:
+            parts.append(found)
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    history = StateHistory()
+    for found in parts:
+        history.extend(found.history)
+    return FinalBa(history, total_of([found.summary for found in parts]), None)
 
 
 def adjust_recording(

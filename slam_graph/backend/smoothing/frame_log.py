@@ -12,6 +12,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,23 @@ class FrameLog:
             self._last_ids = cameras[0].ids
         self._frames.append(frame.stamp_ns)
         self._noise.extend(noise)
+
+    def part(self, begin_ns: int | None, end_ns: int | None) -> FrameLog:
+        """The log of the frames from one time to another, on the clock of the cameras.
+
+        Args:
+            begin_ns: of the first frame; None for the beginning.
+            end_ns: of the last frame; None for the end.
+        """
+        stamps = self.frames_ns
+        first = 0 if begin_ns is None else int(np.searchsorted(stamps, begin_ns))
+        stop = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
+        part = copy(self)
+        part._frames = self._frames[first:stop]
+        part._noise = self._noise[2 * first : 2 * stop]
+        inside = [k - first for k in self._keyframes if first <= k < stop]
+        part._keyframes = array("q", inside if inside[:1] == [0] or stop <= first else [0, *inside])
+        return part
 
     @property
     def frames_ns(self) -> IntArray:

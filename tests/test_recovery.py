@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recovery: what is lost is taken back, and the run goes on as a new segment, honestly joined."""
+
+import csv
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+
+from slam_graph.backend.cost.gating import Innovations
+from slam_graph.backend.initialization.segment_joint import moved
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
+from slam_graph.backend.window import Window
+from slam_graph.config import LimitsConfig
+from slam_graph.datasets.faults.injection import inject
+from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.geometry.trajectory import NavState
+from slam_graph.pipeline.run_recording import run
+from slam_graph.pipeline.supervision import Agreement
+from slam_graph.results.run_result import RunResult
+from slam_graph.simulation.simulator import simulate
+
+CAUSAL = ("final_ba.enabled=false",)
+FAULT_S, BLIND_S = 6.0, 3.0
+
+
+def flown(*faults: str, algorithm: str = "msckf", settings: tuple[str, ...] = CAUSAL) -> RunResult:
+    """A run over 16 s of simulated stereo."""
+    sequence = simulate(trajectory="figure8", cameras=2, duration_s=16.0, seed=1)
+    return run(inject(sequence, faults), algorithm=algorithm, overrides=settings)
+
+
+def error_m(result: RunResult, number: int) -> float:
+    """Error of a segment that is aligned on its own."""
+    assert result.groundtruth is not None
+    part = result.segments[number].part_of(result.trajectory)
+    return ape(result.groundtruth, part, alignment="yaw").statistics.rmse
+
+
+@pytest.fixture(scope="module")
+def blind() -> RunResult:
+    return flown(f"all_missing:at_s={FAULT_S},duration_s={BLIND_S}")
+
+
+def test_after_a_time_without_anything_a_new_segment_begins(blind: RunResult) -> None:
+    assert blind.status == "ok"
+    assert [segment.joined_by for segment in blind.segments] == ["start", "imu"]
+    start_ns = blind.input.start_ns
+    ends = (blind.segments[0].end_ns - start_ns, blind.segments[1].begin_ns - start_ns)
+    assert FAULT_S - 1.0 < ends[0] * 1e-9 <= FAULT_S
+    assert FAULT_S + BLIND_S < ends[1] * 1e-9 < FAULT_S + BLIND_S + 5.0
+    assert blind.warnings["new_segment"] == 1
+
+
+def test_what_a_clean_run_reaches_is_reached_after_the_fault(blind: RunResult) -> None:
+    clean = error_m(flown(), 0)
+    assert max(error_m(blind, 0), error_m(blind, 1)) < 2.0 * clean
+
+
+def test_the_joint_is_as_wrong_as_it_says(blind: RunResult) -> None:
+    """Where the IMU predicts the start of the segment, against the truth in the first world."""
+    truth = blind.groundtruth
+    assert truth is not None
+    first = blind.segments[0].part_of(blind.trajectory)
+    aligned = ape(truth, first, alignment="yaw").similarity
+    later = blind.segments[1].part_of(blind.trajectory)
+    begin = aligned.apply(later[:1])
+    nearest = int(np.argmin(np.abs(truth.stamps_ns - begin.stamps_ns[0])))
+    off = begin.positions[0] - truth.positions[nearest]
+    sigmas = np.sqrt(np.diag(blind.segments[1].joint_covariance))[:3]
+    assert np.all(np.abs(off) < 3.0 * sigmas)
+    row = int(np.searchsorted(blind.trajectory.stamps_ns, begin.stamps_ns[0]))
+    assert np.linalg.norm(blind.sigmas[row, 3:6]) > 0.99 * np.linalg.norm(sigmas)
+
+
+def test_time_between_segments_is_not_covered(blind: RunResult, tmp_path: Path) -> None:
+    first, second = blind.segments
+    recorded_s = blind.input.recorded_s
+    assert blind.coverage == pytest.approx((first.seconds + second.seconds) / recorded_s)
+    stamps = blind.trajectory.stamps_ns
+    assert not np.any((stamps > first.end_ns) & (stamps < second.begin_ns))
+
+    blind.save(tmp_path)
+    with (tmp_path / "segments.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["states"]) for row in rows] == [
+        len((tmp_path / f"trajectory_segment_{k}.tum").read_text().splitlines()) for k in (0, 1)
+    ]
+    assert "nothing was recorded for 3.0 s" in rows[0]["ended_by"]
+    assert sum(int(row["states"]) for row in rows) == len(stamps)
+
+
+@pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])
+def test_every_engine_starts_again(algorithm: str) -> None:
+    result = flown("all_missing:at_s=6,duration_s=2", algorithm=algorithm)
+    assert result.status == "ok"
+    assert [segment.joined_by for segment in result.segments] == ["start", "imu"]
+    assert error_m(result, 1) < 0.05
+
+
+def test_a_segment_somewhere_else_is_not_joined_and_places_join_it() -> None:
+    """A part of the flight is cut out: the IMU knows nothing of it, recognised places do."""
+    sequence = simulate(
+        trajectory="rooms",
+        duration_s=75.0,
+        rate_hz=10.0,
+        seed=3,
+        cameras=2,
+        landmarks={"density": 4.0},
+        tracks={"features": 70, "descriptors": True},
+    )
+    settings = (*CAUSAL, "loop_closure.enabled=true", "loop_closure.places.words=300")
+    cut = inject(sequence, ["kidnapped:at_s=20,duration_s=6"])
+    result = run(cut, algorithm="msckf", overrides=settings)
+    assert result.status == "ok"
+    assert [segment.joined_by for segment in result.segments] == ["start", "none"]
+    assert result.segments[1].loops > 0
+    assert result.groundtruth is not None
+    assert result.loop_closed is not None
+    apart = ape(result.groundtruth, result.trajectory, alignment="yaw").statistics.rmse
+    joined = ape(result.groundtruth, result.loop_closed, alignment="yaw").statistics.rmse
+    assert joined < 0.1
+    assert apart > 5.0 * joined
+
+
+def test_worlds_that_are_not_joined_are_smoothed_apart() -> None:
+    result = flown("kidnapped:at_s=6,duration_s=3.7", settings=())
+    assert [segment.joined_by for segment in result.segments] == ["start", "none"]
+    assert result.smoothed is not None
+    for segment in result.segments:
+        part = segment.part_of(result.smoothed)
+        assert result.groundtruth is not None
+        assert ape(result.groundtruth, part, alignment="yaw").statistics.rmse < 0.02
+
+
+def test_a_run_that_is_lost_again_and_again_is_given_up() -> None:
+    result = flown(settings=(*CAUSAL, "limits.max_speed=1e-9"))
+    assert result.status == "diverged"
+    assert result.warnings["new_segment"] == 2
+    assert len(result.history) == 0
+    assert result.logs.frames < 100
+
+
+def test_without_recovery_a_run_ends_where_it_is_lost() -> None:
+    fault = f"all_missing:at_s={FAULT_S},duration_s={BLIND_S}"
+    result = flown(fault, settings=(*CAUSAL, "limits.recovery=false"))
+    assert result.status == "diverged"
+    assert "nothing was recorded" in result.message
+    assert len(result.segments) == 1
+
+
+def test_images_agreed_until_the_rejections_began() -> None:
+    limits = LimitsConfig()
+    agreement, step_ns = Agreement(limits), 10**8
+    assert agreement.agreed_until() is None
+    for k in range(55):
+        agreement.check(k * step_ns, Innovations(tested=10, rejected=0 if k < 40 else 10))
+    until = agreement.agreed_until()
+    assert until is not None
+    assert until == 39 * step_ns
+
+
+def test_a_window_in_a_moved_world_knows_the_same() -> None:
+    rng = np.random.default_rng(0)
+    state, zero = State(), np.zeros(3)
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3))
+    nav = NavState(0, pose, rng.normal(size=3), accel_bias=zero, gyro_bias=zero)
+    state.insert_imu_state(0, nav)
+    state.insert_point(7, rng.normal(size=3))
+    layout = Layout(dims_of([L(7), *imu_state_keys(0)]))
+    Rd = np.triu(rng.normal(size=(layout.size + 1, layout.size + 1)))
+    Rd[np.diag_indices_from(Rd)] += 4.0
+    state.freeze(layout.dims)
+    state.update(layout, 0.1 * rng.normal(size=layout.size))
+    window = Window(0, 0, state, SquareRootInformation(layout, np.asfortranarray(Rd)))
+    motion = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([3.0, -2.0, 1.0]))
+    other = moved(window, motion)
+
+    expected = motion.compose(state.estimate.atPose3(X(0)))
+    assert other.state.estimate.atPose3(X(0)).equals(expected, 1e-12)
+    turn = motion.rotation().matrix()
+    before, after = window.current(window.prior), other.current(other.prior)
+    assert before.covariance is not None
+    T = np.eye(15)
+    T[6:9, 6:9] = turn
+    np.testing.assert_allclose(after.covariance, T @ before.covariance @ T.T, atol=1e-12)
+    np.testing.assert_allclose(after.velocity, turn @ before.velocity, atol=1e-12)
+    seen = [
+        w.state.estimate.atPose3(X(0)).transformTo(w.state.estimate.atPoint3(L(7)))
+        for w in (window, other)
+    ]
+    np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)
+    costs = [
+        float(np.sum((w.prior.R @ w.state.offset(layout) - w.prior.d) ** 2))
+        for w in (window, other)
+    ]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-12)
