@@ -72,7 +72,7 @@ def _counted_cameras(value: Any) -> Any:
 class LimitsConfig(Settings):
     """Beyond these limits an estimate counts as lost."""
 
-    recovery: bool = True
+    recovery: bool = expert(default=True)
     """Whether a run whose estimate is lost starts again, as a new segment of the trajectory. It is
     given up when three segments in a row were shorter than five seconds. Without it a run ends
     where its estimate is lost."""
