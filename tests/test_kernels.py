@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
 from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
 from slam_graph.kernels.epipolar import (
     constraint_moments,
@@ -365,3 +366,27 @@ def test_track_level_is_that_of_opencv() -> None:
     # OpenCV's sums are rounded; a point at the limit of the last step may take one more
     assert np.median(error_px) == 0.0
     assert error_px.max() < 0.05
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 100])
+@pytest.mark.parametrize("distance_px", [1.0, 8.0])
+@pytest.mark.parametrize("levels", [3, 200])
+def test_strongest_maxima_are_those_of_opencv(count: int, distance_px: float, levels: int) -> None:
+    rng = np.random.default_rng(7)
+    image = cv2.GaussianBlur(rng.integers(0, levels, (60, 73), np.uint8), (0, 0), 1.5)
+    image[20:50, 30:60] = 0  # without gradients all scores are alike
+    image[35:40, 40:45] = levels
+    allowed = np.full(image.shape, 255, np.uint8)
+    allowed[:30, 10:20] = 0
+    scores = cv2.cornerMinEigenVal(image, 7)
+    smallest = 0.3 * float(scores.max())
+    given = scores, allowed, count, 0.05, smallest, distance_px
+    found = strongest_maxima(*given)
+    np.testing.assert_array_equal(found, strongest_maxima_numpy(*given))
+    if count:  # to OpenCV, 0 means all
+        corners, strengths = cv2.goodFeaturesToTrackWithQuality(
+            image, count, 0.05, distance_px, allowed, blockSize=7
+        )
+        opencv = np.column_stack([np.reshape(corners, (-1, 2)), np.ravel(strengths)])
+        np.testing.assert_array_equal(found, opencv[opencv[:, 2] >= smallest])
+    assert len(strongest_maxima(scores, np.zeros_like(allowed), 9, 0.05, 0.0, 1.0)) == 0

@@ -18,11 +18,15 @@ from slam_graph.arrays import IntArray
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
+from slam_graph.kernels.corners import strongest_maxima
 
 _INSTALL = "pip install 'slam-graph[descriptors]'"
 
 _CORNER_WINDOW_PX = 7
 """Side of the window over which gradients are summed for the scores of Shi-Tomasi and Harris."""
+
+_SOBEL_PX = 3
+"""Side of the filter that takes the gradients."""
 
 _RELATIVE_SCORE = 0.05
 """A corner of a cell has at least this share of the eigenvalue of the cell's best one: low, because
@@ -98,23 +102,14 @@ class _GradientCorners:
 
     def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest corners."""
-        corners, scores = cv2.goodFeaturesToTrackWithQuality(
-            image,
-            count,
-            # the share is one of eigenvalues, of which Harris' score is the square
-            _RELATIVE_SCORE ** (2 if self._harris else 1),
-            distance_px,
-            allowed,
-            blockSize=_CORNER_WINDOW_PX,
-            useHarrisDetector=self._harris,
-            k=_HARRIS_K,
-        )
-        if corners is None:
-            return Keypoints.concatenate([])
-        strengths = np.ravel(scores).astype(np.float32)
-        strong = strengths >= self._smallest
-        corners = np.asarray(corners, np.float32).reshape(-1, 2)
-        return Keypoints.of(corners[strong], strengths[strong], float(_CORNER_WINDOW_PX))
+        if self._harris:
+            scores = cv2.cornerHarris(image, _CORNER_WINDOW_PX, _SOBEL_PX, _HARRIS_K)
+        else:
+            scores = cv2.cornerMinEigenVal(image, _CORNER_WINDOW_PX, None, _SOBEL_PX)
+        # the share is one of eigenvalues, of which Harris' score is the square
+        share = _RELATIVE_SCORE ** (2 if self._harris else 1)
+        found = strongest_maxima(scores, allowed, count, share, self._smallest, distance_px)
+        return Keypoints.of(found[:, :2], found[:, 2], float(_CORNER_WINDOW_PX))
 
 
 @DETECTORS.register("shi_tomasi")

@@ -181,10 +181,11 @@ class Tracks:
 
     def common(self, other: Tracks) -> tuple[IntArray, IntArray]:
         """Indices here and there (M,) of the features in both."""
-        _, here, there = np.intersect1d(
-            self.ids, other.ids, assume_unique=True, return_indices=True
-        )
-        return here, there
+        if len(other) == 0:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        there = np.minimum(np.searchsorted(other.ids, self.ids), len(other) - 1)
+        here = np.flatnonzero(other.ids[there] == self.ids)
+        return here, there[here]
 
     def observations(self) -> FeatureObservations:
         """As the back end receives them."""
