@@ -90,7 +90,7 @@ class Window:
 
     def points(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of all features that the last step estimated."""
-        in_state = stacked_points(self.state.estimate, self.state_features.tolist())
+        in_state = stacked_points(self.state.estimate, self.state_features)
         ids, points = self.last_points
         other = ~is_in(ids, self.state_features)
         return (

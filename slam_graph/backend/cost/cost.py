@@ -256,7 +256,7 @@ class Cost:
     ) -> Geometry:
         """Poses and points of observations; the points of features of the state if not given."""
         if points is None:
-            points = stacked_points(values, obs.ids.tolist())
+            points = stacked_points(values, obs.ids)
         return Geometry(*rig.poses(values, obs.frames), points)
 
     def factor_rows(self, layout: Layout) -> FloatArray:

@@ -72,7 +72,7 @@ class SmootherEngine:
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
-        return self._features.active, stacked_points(self._estimate, self._features.active.tolist())
+        return self._features.active, stacked_points(self._estimate, self._features.active)
 
     def factor_graph(self, window: Window) -> WindowGraph:
         """All factors and estimates that the smoother holds."""
