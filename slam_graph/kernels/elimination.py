@@ -14,6 +14,19 @@ from slam_graph.kernels.compilation import compiled
 __all__ = ["eliminate_columns", "eliminate_columns_numpy"]
 
 
+_at = np.uintp
+"""An index without a sign. Numba would test others for negative ones, and not use vectors."""
+
+
+@compiled()
+def _rotate(row: FloatArray, other: FloatArray, c: float, s: float) -> None:
+    """Rotate two rows by an angle of which cosine and sine are given."""
+    for k in range(len(row)):
+        above, below = row[_at(k)], other[_at(k)]
+        row[_at(k)] = c * above - s * below
+        other[_at(k)] = c * below + s * above
+
+
 @compiled("void(f8[:, :], i8[::1], f8[:, ::1], f8[:, :])")
 def eliminate_columns(
     R: FloatArray, order: IntArray, carried: FloatArray, kept: FloatArray
@@ -57,14 +70,8 @@ def eliminate_columns(
             other = carried[column]
             length = math.hypot(other[column], x)
             c, s = other[column] / length, x / length
-            for k in range(column, w):
-                above, below = row[k], other[k]
-                row[k] = c * above - s * below
-                other[k] = c * below + s * above
-            for k in range(first, width):
-                above, below = row[k], other[k]
-                row[k] = c * above - s * below
-                other[k] = c * below + s * above
+            _rotate(row[column:w], other[column:w], c, s)
+            _rotate(row[first:], other[first:], c, s)
         for k in range(first, width):
             kept[i - top, k - w] = row[k]
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +36,9 @@ class Layout:
 
     def __init__(self, dims: Mapping[int, int]) -> None:
         self.dims = dict(dims)
-        self.columns: dict[int, slice] = {}
-        self.size = 0
-        for key, dim in self.dims.items():
-            self.columns[key] = slice(self.size, self.size + dim)
-            self.size += dim
-        self._numbers = np.arange(self.size)
+        ends = list(accumulate(self.dims.values(), initial=0))
+        self.columns = dict(zip(self.dims, map(slice, ends, ends[1:]), strict=True))
+        self.size = ends[-1]
 
     def __contains__(self, key: int) -> bool:
         return key in self.dims
@@ -51,8 +49,13 @@ class Layout:
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given."""
-        parts = [self._numbers[self.columns[k]] for k in keys]
-        return np.concatenate(parts) if parts else np.zeros(0, np.intp)
+        slices = [self.columns[k] for k in keys]
+        starts = np.array([columns.start for columns in slices], np.intp)
+        ends = np.array([columns.stop for columns in slices], np.intp)
+        dims = ends - starts
+        # numbers that go on by one, but for a jump where a variable begins
+        jumps = starts - np.cumsum(dims) + dims
+        return np.arange(dims.sum()) + np.repeat(jumps, dims)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
