@@ -27,6 +27,9 @@ class ImuBuffer:
             How many were left out.
         """
         newest = self.data.stamps_ns[-1] if len(self.data) else np.iinfo(np.int64).min
+        if _follows(imu, newest):
+            self.data = ImuData.concatenate([self.data, imu])
+            return 0
         latest = np.maximum.accumulate(np.concatenate([[newest], imu.stamps_ns]))[:-1]
         good = (imu.stamps_ns > latest) & np.isfinite(imu.gyro).all(axis=1)
         good &= np.isfinite(imu.accel).all(axis=1)
@@ -73,10 +76,10 @@ class ImuBuffer:
         stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
         seconds = (t[around] - start_ns) * 1e-9
         at = (stamps - start_ns) * 1e-9
-        gyro, accel = (
-            np.stack([np.interp(at, seconds, values[around, axis]) for axis in range(3)], axis=1)
-            for values in (self.data.gyro, self.data.accel)
-        )
+        gyro, accel = np.empty((2, len(at), 3))
+        for result, values in ((gyro, self.data.gyro[around]), (accel, self.data.accel[around])):
+            for axis in range(3):
+                result[:, axis] = np.interp(at, seconds, values[:, axis])
         return ImuData(stamps, gyro, accel)
 
     def trend(self, stamp_ns: int, around_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -98,3 +101,15 @@ class ImuBuffer:
         line = np.column_stack([np.ones(len(seconds)), seconds])
         found = np.linalg.lstsq(line, np.hstack([samples.gyro, samples.accel]), rcond=None)[0]
         return found[0, :3], found[1, :3], found[0, 3:]
+
+
+def _follows(imu: ImuData, newest_ns: int) -> bool:
+    """Whether all samples are finite and in order, and later than the newest one."""
+    stamps = imu.stamps_ns
+    return bool(
+        len(stamps) > 0
+        and stamps[0] > newest_ns
+        and (stamps[1:] > stamps[:-1]).all()
+        and np.isfinite(imu.gyro).all()
+        and np.isfinite(imu.accel).all()
+    )

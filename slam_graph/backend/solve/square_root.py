@@ -16,13 +16,16 @@ from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray
 from slam_graph.kernels.elimination import eliminate_columns
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
+
+_SMALL_TRIANGLE = 64
+"""Triangles up to this size are inverted at once."""
 
 
 class Layout:
@@ -204,22 +207,18 @@ class SquareRootInformation:
         first = int(columns.min(initial=self.layout.size))
         size = self.layout.size - first
         if 3 * len(columns) > size:  # the inverse of all is cheaper: it leaves zeros out
-            inverse, info = lapack.dtrtri(self.R[first:, first:])
-            root = np.ascontiguousarray(inverse[columns - first]).T
-        else:
-            right = np.zeros((size, len(columns)), order="F")
-            right[columns - first, np.arange(len(columns))] = 1.0
-            root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
+            inverse = _inverse(self.R[first:, first:])
+            return np.ascontiguousarray(inverse[columns - first]).T
+        right = np.zeros((size, len(columns)), order="F")
+        right[columns - first, np.arange(len(columns))] = 1.0
+        root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(root, dtype=np.float64)
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
-        inverse, info = lapack.dtrtri(self.R)
-        if info != 0:
-            raise np.linalg.LinAlgError("the information is singular")
-        return np.asarray(np.triu(inverse), dtype=np.float64)
+        return np.asarray(np.triu(_inverse(self.R)), dtype=np.float64)
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
@@ -268,6 +267,30 @@ def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
     if info != 0 or not np.all(np.isfinite(x)):
         raise np.linalg.LinAlgError("the cost does not determine all of its variables")
     return np.asarray(x, dtype=np.float64)
+
+
+def _inverse(R: FloatArray) -> FloatArray:
+    """The inverse of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
+
+    By the inverses of its halves and triangular products of these, which take half of the time of
+    LAPACK's `dtrtri` for a few hundred columns.
+
+    Raises:
+        numpy.linalg.LinAlgError: if it is singular.
+    """
+    n = len(R)
+    if n <= _SMALL_TRIANGLE:
+        small, info = lapack.dtrtri(R)
+        if info != 0:
+            raise np.linalg.LinAlgError("the information is singular")
+        return np.asarray(small, dtype=np.float64)
+    half = n // 2
+    inverse = np.zeros((n, n), order="F")
+    inverse[:half, :half] = upper = _inverse(R[:half, :half])
+    inverse[half:, half:] = lower = _inverse(R[half:, half:])
+    corner = blas.dtrmm(-1.0, upper, R[:half, half:])
+    inverse[:half, half:] = blas.dtrmm(1.0, lower, corner, side=1, overwrite_b=1)
+    return inverse
 
 
 def triangularize(Ab: FloatArray) -> FloatArray:
