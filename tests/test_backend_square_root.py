@@ -169,3 +169,19 @@ def test_a_triangle_has_the_same_normal_equations(shape: tuple[int, int]) -> Non
     assert R.shape == (7, 7)
     assert np.all(np.tril(R, -1) == 0.0)
     np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 64, 65, 200])
+def test_covariance_is_the_inverse_of_the_information(size: int) -> None:
+    rng = np.random.default_rng(size)
+    layout = Layout(dict.fromkeys(range(size), 1))
+    prior = SquareRootInformation(layout, triangularize(rng.normal(size=(2 * size + 2, size + 1))))
+    information = prior.R.T @ prior.R
+    np.testing.assert_allclose(prior.covariance() @ information, np.eye(size), atol=1e-9)
+    some = [*range(0, size, 2)]
+    np.testing.assert_allclose(
+        prior.covariance_of(some),
+        np.linalg.inv(information)[np.ix_(some, some)],
+        rtol=1e-9,
+        atol=1e-12,
+    )

@@ -21,6 +21,7 @@ from slam_graph.backend.solve.state import (
     distortion_key,
     imu_state_keys,
     letter_and_index,
+    stacked_points,
 )
 from slam_graph.geometry.trajectory import NavState
 
@@ -212,3 +213,24 @@ def test_the_prior_is_a_function_of_the_offsets(state: State, first_estimates: b
     assert bool(offset.any()) is first_estimates
     assert state.frozen == set(keep)  # until the next marginalization
     np.testing.assert_allclose(prior.shifted(offset).Rd, expected.Rd, atol=1e-12)
+
+
+def test_points_are_those_of_their_keys() -> None:
+    rng = np.random.default_rng(3)
+    values = gtsam.Values()
+    points = {int(j): rng.normal(size=3) for j in rng.permutation(1000)[:40]}
+    for feature, point in points.items():
+        values.insert(L(feature), point)
+    # others of three numbers, with keys before and after those of features, and some of none
+    values.insert(distortion_key(0, 3), rng.normal(size=3))
+    values.insert(V(7), rng.normal(size=3))
+    values.insert(T(0), np.zeros(1))
+    values.insert(B(7), gtsam.imuBias.ConstantBias())
+    values.insert(X(7), gtsam.Pose3())
+    wanted = np.array([*points])[:15]
+    for at in (values, values.retract(values.zeroVectors())):
+        found = stacked_points(at, wanted)
+        np.testing.assert_array_equal(found, [points[j] for j in wanted.tolist()])
+    assert stacked_points(values, np.zeros(0, np.int64)).shape == (0, 3)
+    with pytest.raises(KeyError, match="not all of the features"):
+        stacked_points(values, np.array([wanted[0], 1000]))

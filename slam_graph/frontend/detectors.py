@@ -103,9 +103,10 @@ class _GradientCorners:
     def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest corners."""
         if self._harris:
-            scores = cv2.cornerHarris(image, _CORNER_WINDOW_PX, _SOBEL_PX, _HARRIS_K)
+            all_scores = cv2.cornerHarris(image, _CORNER_WINDOW_PX, _SOBEL_PX, _HARRIS_K)
         else:
-            scores = cv2.cornerMinEigenVal(image, _CORNER_WINDOW_PX, None, _SOBEL_PX)
+            all_scores = cv2.cornerMinEigenVal(image, _CORNER_WINDOW_PX, None, _SOBEL_PX)
+        scores = np.ascontiguousarray(all_scores, np.float32)
         # the share is one of eigenvalues, of which Harris' score is the square
         share = _RELATIVE_SCORE ** (2 if self._harris else 1)
         found = strongest_maxima(scores, allowed, count, share, self._smallest, distance_px)

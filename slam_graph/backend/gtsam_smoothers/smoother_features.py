@@ -202,9 +202,7 @@ class SmootherFeatures:
         self.innovations = Innovations()
         if len(obs) == 0:
             return np.zeros(0, np.bool_)
-        at = Geometry(
-            *stacked_poses(estimate, obs.frames), stacked_points(estimate, obs.ids)
-        )
+        at = Geometry(*stacked_poses(estimate, obs.frames), stacked_points(estimate, obs.ids))
         residuals, depths = self._rig.residuals(obs, at)
         by_pose, _ = self._rig.jacobians(obs, at)
         sigma = self._config.noise.pixel_sigma

@@ -58,7 +58,7 @@ class Layout:
         dims = ends - starts
         # numbers that go on by one, but for a jump where a variable begins
         jumps = starts - np.cumsum(dims) + dims
-        return np.arange(dims.sum()) + np.repeat(jumps, dims)
+        return np.asarray(np.arange(dims.sum()) + np.repeat(jumps, dims), np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

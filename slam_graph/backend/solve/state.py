@@ -270,7 +270,7 @@ def stacked_points(values: gtsam.Values, features: IntArray) -> FloatArray:
     """
     if len(features) == 0:
         return np.zeros((0, 3))
-    keys = np.array(values.keys())  # noqa: SIM118
+    keys = np.array(values.keys())
     first, end = keys.searchsorted((L(0), L(_INDEX_MASK)))
     known = keys[first:end] - L(0)
     places = known.searchsorted(features)
