@@ -378,7 +378,7 @@ def test_strongest_maxima_are_those_of_opencv(count: int, distance_px: float, le
     image[35:40, 40:45] = levels
     allowed = np.full(image.shape, 255, np.uint8)
     allowed[:30, 10:20] = 0
-    scores = cv2.cornerMinEigenVal(image, 7)
+    scores = np.asarray(cv2.cornerMinEigenVal(image, 7), np.float32)
     smallest = 0.3 * float(scores.max())
     given = scores, allowed, count, 0.05, smallest, distance_px
     found = strongest_maxima(*given)
