@@ -25,7 +25,7 @@ import slam_graph as sg
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment import executors
 from slam_graph.experiment.batch_plan import Entry, _names, plan
-from slam_graph.experiment.batch_task import MARK, BatchTask, remove_remains
+from slam_graph.experiment.batch_task import MARK, BatchTask
 
 CONFIG = sg.load_config()
 FAST = ["final_ba.enabled=false"]

@@ -13,6 +13,7 @@ PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
     {"errors", "diagnostics", "version", "arrays", "lazy"},
+    {"files"},
     {"kernels", "plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},

@@ -32,7 +32,8 @@ from slam_graph.cli import (
 from slam_graph.cli.console import echo_json
 from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
-from slam_graph.errors import SlamGraphError
+from slam_graph.errors import DataError, SlamGraphError
+from slam_graph.files import refused
 from slam_graph.version import __version__
 
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
@@ -121,13 +122,32 @@ def _global_options(
 
 def main() -> None:
     """Launch a command; a `SlamGraphError` becomes one line on stderr and its exit code."""
+    code = 0
     try:
         app(prog_name="slam-graph")
+    except SystemExit as leaving:
+        code = leaving.code
     except SlamGraphError as error:
         typer.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_code)
+        code = error.exit_code
+    except OSError as error:  # of the system, in a place where nobody expected it
+        where = f"{error.filename}: " if error.filename is not None else ""
+        typer.echo(f"error: {where}{refused(error)}", err=True)
+        code = DataError.exit_code
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        code = INTERRUPTED
+    sys.exit(_flushed() or code)
+
+
+def _flushed() -> int:
+    """Write what is left of the output, and return 1 if that cannot be done, else 0."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        sys.stdout = None  # else Python tries again, and prints a traceback
+        typer.echo(f"error: the output cannot be written ({refused(error)})", err=True)
+        return DataError.exit_code
+    return 0
 
 
 if __name__ == "__main__":

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from slam_graph.errors import DataError
 from slam_graph.experiment.batch_page import write_page
 from slam_graph.experiment.batch_plan import absolute_sources, plan
 from slam_graph.experiment.batch_summary import Row, rows_of, write_csv
-from slam_graph.experiment.batch_task import BatchTask, remove_remains, running
+from slam_graph.experiment.batch_task import BatchTask, running
 from slam_graph.experiment.comparison_plan import Progress
 from slam_graph.experiment.executors import Executor, executor_for
+from slam_graph.files import make_folder, remove_remains
 from slam_graph.results import ResultFolder
 
 Watch = Callable[[Mapping[str, float], int], None]
@@ -117,7 +117,7 @@ def batch(
         "graph_times": list(graph_times),
     }
     done = Batch(folder, plan(names, folder, config, list(overrides), settings, common, extras))
-    _make(folder)
+    make_folder(folder)
     remove_remains(folder)
     missing = [task for task in done.tasks if not task.is_done()]
     done.skipped = len(done.tasks) - len(missing)
@@ -127,14 +127,6 @@ def batch(
     finally:
         _summarize(done)
     return done
-
-
-def _make(folder: Path) -> None:
-    """Make the folder of a batch."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot make a folder: {error.strerror}") from error
 
 
 def _do(

@@ -16,6 +16,7 @@ from slam_graph.display import Displayed
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.tasks import RecordTask, RunTask, Source, Task
+from slam_graph.files import make_folder
 
 WITHOUT_FEJ = "_no_fej"
 """Suffix of the name of an algorithm without first-estimates Jacobians."""
@@ -134,6 +135,7 @@ def run_tasks(
         progress: called after each task.
     """
     folder = Path(folder).resolve()
+    make_folder(folder)
     recordings, runs = plan(sources, configs, seeds, folder)
     comparison = Comparison(folder, runs)
     _do(comparison, recordings, executor, progress)

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,8 @@ import numpy as np
 from slam_graph import maps
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
+from slam_graph.files import appearing, write_text, writing
+from slam_graph.results.result_files import LATEST, refuse_to_replace
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -134,7 +133,7 @@ def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
     """
     path = Path(path)
     refuse_to_replace(path, force)
-    with _writable(path, "map "), appearing(path) as partial:
+    with writing(path, "map "), appearing(path) as partial:
         maps.write_map(partial, content)
 
 
@@ -191,28 +190,12 @@ def export_map(
     for file in (*clouds, *tracks):
         refuse_to_replace(file, force)
     for file in clouds:
-        with _writable(file):
-            write_ply(file, content.points, content.poses.translations)
+        write_ply(file, content.points, content.poses.translations)
     for file, trajectory in zip(tracks, content.trajectories(), strict=False):
-        with _writable(file):
-            write_text(file, trajectory.tum_lines())
+        write_text(file, trajectory.tum_lines())
     return [*clouds, *tracks]
 
 
 def _numbered(path: Path, count: int) -> list[Path]:
     """Paths of `count` files: the path itself if it is only one."""
     return [path.with_stem(f"{path.stem}_{n}") if count > 1 else path for n in range(count)]
-
-
-@contextmanager
-def _writable(path: Path, what: str = "") -> Iterator[None]:
-    """Say which file cannot be written.
-
-    Raises:
-        DataError: if the block raises an error of the system (a full disk, no permission).
-    """
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise DataError(f"{path}: {what}cannot be written ({reason})") from error

@@ -17,10 +17,11 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalPolicy, BalSolution
 from slam_graph.display import Displayed
+from slam_graph.files import appearing, write_text
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
-from slam_graph.results.result_files import ResultFolder, appearing, write_text
+from slam_graph.results.result_files import ResultFolder
 
 
 @dataclass(eq=False, repr=False)

@@ -21,26 +21,11 @@ import numpy as np
 from slam_graph import datasets
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
+from slam_graph.files import appearing, make_folder, refused, write_text, writing
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 
 LATEST = "latest"
 """Name of the link to the newest results."""
-
-
-@contextmanager
-def appearing(path: Path) -> Iterator[Path]:
-    """A path to write to, which becomes `path` when the block ends well and vanishes otherwise.
-
-    The content is on the disk before the name is: a crash leaves the old file or the new one.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        yield partial
-        with partial.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def refuse_to_replace(path: Path, force: bool) -> None:
@@ -75,17 +60,14 @@ def folder_name(name: str) -> str:
     return plain
 
 
-def write_text(path: Path, lines: Iterable[str]) -> None:
-    """Write lines (with their line ends) as a whole file."""
-    with appearing(path) as partial, partial.open("w", encoding="utf-8") as file:
-        file.writelines(lines)
-
-
 class ResultFolder:
     """Writes the files of a result into one folder, each whole or not at all.
 
     Args:
         folder: made if it is missing.
+
+    Raises:
+        DataError: if the folder or a file cannot be written.
 
     Attributes:
         folder: of all files.
@@ -94,7 +76,7 @@ class ResultFolder:
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         self.files: list[Path] = []
 
     @staticmethod
@@ -165,7 +147,7 @@ def _new_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
                 continue
             return folder
     except OSError as error:
-        raise DataError(f"{root / dataset}: cannot make a folder: {error.strerror}") from error
+        raise DataError(f"{root / dataset}: cannot make a folder ({refused(error)})") from error
     raise DataError(f"{root / dataset}: too many runs at {name}")
 
 
@@ -181,9 +163,14 @@ def _link_latest(folder: Path) -> Path:
     if link.exists() and not link.is_symlink():
         raise DataError(f"{link}: not a link; move it away, the newest results are in {folder}")
     partial = folder.parent / f".{LATEST}.{os.getpid()}.partial"
-    partial.unlink(missing_ok=True)
-    partial.symlink_to(folder.name)
-    os.replace(partial, link)
+    with writing(link):
+        try:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(folder.name)
+            os.replace(partial, link)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
     return link
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam_graph.errors import DataError
-from slam_graph.results.result_files import appearing, write_text
+from slam_graph.files import appearing, make_folder, write_text
 from slam_graph.results.scene import COLMAP_OFFSET_PX, Scene
 from slam_graph.sensors import Camera, Rig
 
@@ -44,7 +44,7 @@ def write_colmap(folder: Path, scene: Scene) -> list[Path]:
     Raises:
         DataError: if COLMAP has no such camera model.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     files = {
         "cameras.txt": _camera_lines(scene),
         "images.txt": _image_lines(scene),
@@ -66,7 +66,7 @@ def write_nerfstudio(folder: Path, scene: Scene, images: str = "images") -> list
     Raises:
         DataError: if nerfstudio has no such camera model, or the cameras have different ones.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     models = {_model(mounted.camera) for mounted in scene.cameras}
     if len(models) > 1:
         raise DataError("nerfstudio takes one camera model for all cameras, and these have several")
