@@ -17,7 +17,7 @@ from benchmarks import baseline, report
 from benchmarks.registry import BENCHMARKS
 from benchmarks.suite import Outcome, data_folder, require
 from slam_graph.errors import SlamGraphError
-from slam_graph.results.result_files import write_text
+from slam_graph.files import write_text
 
 FAILED = 1
 

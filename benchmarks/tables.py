@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.baseline import BASELINE_FILE, Baseline, read_baseline
 from benchmarks.documents import TABLES, Figures
 from slam_graph.errors import DataError, SlamGraphError
-from slam_graph.results.result_files import write_text
+from slam_graph.files import write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 

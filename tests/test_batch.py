@@ -26,6 +26,7 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment import executors
 from slam_graph.experiment.batch_plan import Entry, _names, plan
 from slam_graph.experiment.batch_task import MARK, BatchTask
+from slam_graph.files import remove_remains
 
 CONFIG = sg.load_config()
 FAST = ["final_ba.enabled=false"]

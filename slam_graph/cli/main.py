@@ -10,8 +10,10 @@ Modules that are slow to import are imported inside the commands.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -34,6 +36,7 @@ from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_tex
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
 from slam_graph.errors import DataError, SlamGraphError
 from slam_graph.files import refused
+from slam_graph.interrupts import terminate_like_interrupt
 from slam_graph.version import __version__
 
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
@@ -120,13 +123,29 @@ def _global_options(
     """Options before the command."""
 
 
-def main() -> None:
-    """Launch a command; a `SlamGraphError` becomes one line on stderr and its exit code."""
-    code = 0
+def run_command() -> int | str:
+    """Run a command; a `SlamGraphError` becomes one line on stderr and its exit code.
+
+    Returns:
+        The exit code.
+    """
+    heard = False
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        nonlocal heard
+        heard = True
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+    terminate_like_interrupt()
+    code: int | str = 0
     try:
         app(prog_name="slam-graph")
     except SystemExit as leaving:
-        code = leaving.code
+        code = leaving.code or 0
+    except KeyboardInterrupt:
+        code = _interrupted()
     except SlamGraphError as error:
         typer.echo(f"error: {error}", err=True)
         code = error.exit_code
@@ -134,9 +153,16 @@ def main() -> None:
         where = f"{error.filename}: " if error.filename is not None else ""
         typer.echo(f"error: {where}{refused(error)}", err=True)
         code = DataError.exit_code
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-    sys.exit(_flushed() or code)
+    except Exception:
+        if not heard:  # imports of other libraries turn Ctrl-C into errors of their own
+            raise
+        code = _interrupted()
+    return _flushed() or code
+
+
+def _interrupted() -> int:
+    typer.echo("interrupted", err=True)
+    return INTERRUPTED
 
 
 def _flushed() -> int:
@@ -144,10 +170,15 @@ def _flushed() -> int:
     try:
         sys.stdout.flush()
     except OSError as error:
-        sys.stdout = None  # else Python tries again, and prints a traceback
+        sys.stdout = None  # else Python tries again at its end
         typer.echo(f"error: the output cannot be written ({refused(error)})", err=True)
         return DataError.exit_code
     return 0
+
+
+def main() -> None:
+    """Run a command, and leave with its exit code."""
+    sys.exit(run_command())
 
 
 if __name__ == "__main__":

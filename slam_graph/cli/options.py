@@ -14,6 +14,7 @@ import typer
 from pydantic import BaseModel
 
 from slam_graph.cli.loading import loading
+from slam_graph.interrupts import completed
 
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
@@ -312,7 +313,8 @@ def write_result(
     """Write all files into a new folder, named after the problem."""
     from slam_graph.results import ResultFolder
 
-    with ResultFolder.of_run(output, name) as made:
+    with completed() as begin, ResultFolder.of_run(output, name) as made:
+        begin()
         made.files += result.save(made.folder)
         made.text("run.log", log)
     return made.folder, made.files

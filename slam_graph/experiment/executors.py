@@ -49,7 +49,7 @@ class LocalProcesses:
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or os.cpu_count() or 1
-        self._running: set[subprocess.Popen[str]] = set()
+        self._running: set[_TaskProcess] = set()
         self._stopped = False
 
     def do(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
@@ -68,7 +68,7 @@ class LocalProcesses:
     def _do(self, task: str) -> str | None:
         if self._stopped:
             return "stopped"
-        process = _start(task)
+        process = _TaskProcess(task)
         self._running.add(process)
         try:
             if self._stopped:  # since it was asked for above
@@ -158,23 +158,37 @@ def _do_in_process(task: str) -> str | None:
         known = worker.state.tasks.get(key)
         return known is not None and known.state != "cancelled"
 
-    return _wait(_start(task), wanted)
+    return _wait(_TaskProcess(task), wanted)
 
 
-def _start(task: str) -> subprocess.Popen[str]:
-    """Start the process of a task; Ctrl-C in the terminal does not reach it."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "slam_graph.experiment.tasks", task],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **ONE_THREAD},
-        start_new_session=True,
-    )
+class _TaskProcess(subprocess.Popen[str]):
+    """The process of a task; Ctrl-C in the terminal does not reach it, and it outlives nobody.
+
+    Args:
+        task: as JSON.
+    """
+
+    def __init__(self, task: str) -> None:
+        theirs, self._lifeline = os.pipe()  # its end is closed also when this process is killed
+        try:
+            super().__init__(
+                [sys.executable, "-m", "slam_graph.experiment.tasks", task],
+                stdin=theirs,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, **ONE_THREAD},
+                start_new_session=True,
+            )
+        finally:
+            os.close(theirs)
+
+    def release(self) -> None:
+        """Close the pipe, when the process has ended."""
+        os.close(self._lifeline)
 
 
-def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
+def _stop(processes: Sequence[_TaskProcess]) -> None:
     """End the processes of tasks, all at once, with SIGINT: they leave no incomplete files then.
 
     What has not ended in time, or when there is another Ctrl-C, is killed.
@@ -191,7 +205,7 @@ def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
             process.kill()
 
 
-def _wait(process: subprocess.Popen[str], wanted: Callable[[], bool] | None = None) -> str | None:
+def _wait(process: _TaskProcess, wanted: Callable[[], bool] | None = None) -> str | None:
     """Wait for the process of a task.
 
     Args:
@@ -208,6 +222,7 @@ def _wait(process: subprocess.Popen[str], wanted: Callable[[], bool] | None = No
         except subprocess.TimeoutExpired:
             if wanted is not None and not wanted():
                 _stop([process])
+    process.release()
     if process.returncode == 0:
         return None
     if process.returncode < 0:

@@ -42,7 +42,14 @@ if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
 
 Status = Literal[
-    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
+    "ok",
+    "interrupted",
+    "not_initialized",
+    "diverged",
+    "low_coverage",
+    "no_map",
+    "failed",
+    "unfinished",
 ]
 
 _TRUTH_MARGIN_NS = 1_000_000_000

@@ -185,7 +185,7 @@ class RerunStream:
             self._partial = None
 
     def _flush(self) -> None:
-        """Send what is left. On a full disk Rerun would wait for ever: its file must grow meanwhile.
+        """Send what is left. Its file must grow: on a full disk Rerun waits for ever.
 
         Raises:
             DataError: if the file cannot be written.
