@@ -280,6 +280,24 @@ class _Result(Protocol):
         ...
 
 
+TlsCaFile = Annotated[
+    Path | None,
+    typer.Option("--tls-ca-file", metavar="PEM", help="Authority that the scheduler is proved by."),
+]
+TlsCert = Annotated[
+    Path | None, typer.Option("--tls-cert", metavar="PEM", help="Certificate of this client.")
+]
+TlsKey = Annotated[
+    Path | None, typer.Option("--tls-key", metavar="PEM", help="Key of that certificate.")
+]
+
+
+def tls_files(ca_file: Path | None, cert: Path | None, key: Path | None) -> dict[str, Path]:
+    """The files for TLS that are given, by name."""
+    given = {"ca_file": ca_file, "cert": cert, "key": key}
+    return {name: path for name, path in given.items() if path is not None}
+
+
 def read_policy(
     kind: type[_Policy],
     file: Path | None,

@@ -59,6 +59,7 @@ def batch(
     sources: Mapping[str, str] | None = None,
     jobs: int | None = None,
     scheduler: str | None = None,
+    tls: Mapping[str, str | Path] | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
     rerun: Literal["off", "save"] = "off",
@@ -86,6 +87,7 @@ def batch(
         sources: where each sensor is, in formats that leave it open.
         jobs: processes at a time; the number of cores if None.
         scheduler: address of a Dask scheduler to do the runs on instead of this machine.
+        tls: PEM files for an encrypted connection to it: `ca_file`, `cert`, `key`.
         progress: called after each run with the name of the recording, why it failed or None, the
             number of runs done, and that of all.
         watch: called now and then, by another thread, with the part from 0 to 1 that is done of
@@ -104,7 +106,7 @@ def batch(
         DataError: if no recording is found.
     """
     names = [str(one) for one in ([what] if isinstance(what, str | Path) else what)]
-    executor = executor_for(jobs, scheduler)
+    executor = executor_for(jobs, scheduler, tls)
     folder = Path(output).resolve()
     common = {
         "format": format,
