@@ -7,10 +7,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
+from zlib import crc32
 
 import numpy as np
 import pytest
 from recordings import write_euroc
+from recordings_public import write_tum_rgbd
 from recordings_ros import bag_writer, write_bag
 from typer.testing import CliRunner
 
@@ -24,6 +26,7 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
+from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph import InformationRepair
 from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.results.result_files import ResultFolder, folder_name
@@ -283,6 +286,28 @@ def test_chunks_of_bags_unpack_within_a_bound(monkeypatch: pytest.MonkeyPatch) -
         unpack(bz2.compress(zeros)[:-4])
 
 
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_bag_compressed_by_zstd_is_read_within_a_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    from rosbags.rosbag2 import Writer
+
+    opened = Writer.__init__
+
+    def compressed(self: Writer, *arguments: object, **options: object) -> None:
+        opened(self, *arguments, **options)  # type: ignore[arg-type]
+        self.set_compression(Writer.CompressionMode[mode], Writer.CompressionFormat.ZSTD)
+
+    monkeypatch.setattr(Writer, "__init__", compressed)
+    path = write_bag(tmp_path, "sqlite", frames=3)
+    assert open_dataset(path).info().frames == 3
+    monkeypatch.setattr(bounded_unpacking, "_LEAST", 100)
+    monkeypatch.setattr(bounded_unpacking, "_RATIO", 0)
+    bounded_unpacking.bound_unpacking.cache_clear()
+    with pytest.raises(DataError, match="unpacks to more than"):
+        read_all(path)
+
+
 @pytest.mark.parametrize("name", ["bz2", "lz4"])
 def test_a_compressed_bag_is_read(tmp_path: Path, name: str) -> None:
     from rosbags.rosbag1 import Writer
@@ -306,6 +331,41 @@ def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
     path.write_bytes(bz2.compress(b"1 1 1\n" + b" " * 10**7))
     with pytest.raises(DataError, match="unpacks to more than 50 times"):
         read_bal(path)
+
+
+# --- names of other files -------------------------------------------------------------------------
+
+
+def test_no_image_of_another_folder_is_read(tmp_path: Path) -> None:
+    """TUM's lists and KITTI's folders too: a link or a name that leads out is not followed."""
+    folder = write_tum_rgbd(tmp_path / "rgbd")
+    index = folder / "rgb.txt"
+    lines = index.read_text().splitlines()
+    for name in ("../secret.png", "/etc/hostname", "rgb/../../secret.png", "a" * 300):
+        changed = [*lines[:-1], f"{lines[-1].split()[0]} {name}"]
+        index.write_text("\n".join(changed) + "\n")
+        with pytest.raises(DataError, match=r"rgb\.txt:\d+: .* is not a file in"):
+            read_all(folder)
+
+
+def test_masks_that_claim_too_much_are_refused(tmp_path: Path) -> None:
+    mask = tmp_path / "mask.png"
+    for size in ((100_000).to_bytes(4, "big"), (2**31 - 1).to_bytes(4, "big")):
+        header = b"IHDR" + size + size + b"\x08\x00\x00\x00\x00"
+        chunk = (13).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big")
+        mask.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+        with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera"):
+            camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    for name in ("my.yaml", "truth.txt", "graph.g2o", "problem.txt"):
+        path = tmp_path / name
+        path.write_bytes(b"\xff\xfe\x00\xc3\x28\n" * 3)
+        for read in (load_config, read_groundtruth, read_pose_graph, read_bal, open_dataset):
+            with pytest.raises(SlamGraphError) as caught:
+                read(path)
+            assert "\n" not in str(caught.value)
 
 
 def test_an_empty_bag_is_refused(tmp_path: Path) -> None:

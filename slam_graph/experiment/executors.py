@@ -146,7 +146,6 @@ class DaskCluster:
                 client.cancel(futures)
                 raise
 
-
     def _security(self) -> Any:
         """The security of Dask; None leaves all to its own settings."""
         from distributed.security import Security
