@@ -224,7 +224,7 @@ def test_eqvio(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["rgb.txt", "accelerometer.txt", "groundtruth.txt"])
 def test_tum_rgbd(tmp_path: Path, name: str) -> None:
-    folder = write_tum_rgbd(tmp_path / "flight", frames=4)
+    folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=4)
     if not (folder / name).is_file():
         pytest.skip("not in this recording")
     tried(folder / name, lambda: read_all(folder), 40)

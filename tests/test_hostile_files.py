@@ -290,13 +290,13 @@ def test_chunks_of_bags_unpack_within_a_bound(monkeypatch: pytest.MonkeyPatch) -
 def test_a_bag_compressed_by_zstd_is_read_within_a_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
-    from rosbags.rosbag2 import Writer
+    from rosbags.rosbag2.writer import CompressionFormat, CompressionMode, Writer
 
     opened = Writer.__init__
 
     def compressed(self: Writer, *arguments: object, **options: object) -> None:
         opened(self, *arguments, **options)  # type: ignore[arg-type]
-        self.set_compression(Writer.CompressionMode[mode], Writer.CompressionFormat.ZSTD)
+        self.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
 
     monkeypatch.setattr(Writer, "__init__", compressed)
     path = write_bag(tmp_path, "sqlite", frames=3)
@@ -338,7 +338,7 @@ def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
 
 def test_no_image_of_another_folder_is_read(tmp_path: Path) -> None:
     """TUM's lists and KITTI's folders too: a link or a name that leads out is not followed."""
-    folder = write_tum_rgbd(tmp_path / "rgbd")
+    folder = write_tum_rgbd(tmp_path / "rgbd_freiburg1")
     index = folder / "rgb.txt"
     lines = index.read_text().splitlines()
     for name in ("../secret.png", "/etc/hostname", "rgb/../../secret.png", "a" * 300):
