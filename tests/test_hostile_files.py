@@ -21,6 +21,7 @@ from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
@@ -73,6 +74,24 @@ def test_a_calibration_is_refused_in_one_line(tmp_path: Path, name: str) -> None
     path.write_text(text)
     with pytest.raises(DataError, match=rf"my\.yaml{expected.split(' ')[0]}"):
         read_yaml(path)
+
+
+def test_what_a_file_says_is_quoted_in_part(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    write_kalibr(simulate(duration_s=1.0).rig, path)
+    whole = path.read_text()
+    path.write_text(whole.replace("pinhole", "1" * 5000, 1))
+    with pytest.raises(DataError, match="unknown camera model '1111") as caught:
+        read_kalibr(path)
+    assert len(str(caught.value)) < 2000
+    row = next(
+        line for line in whole.splitlines() if line.lstrip().startswith("- [") and "," in line
+    )
+    first = row.split("[")[1].split(",")[0]
+    for value in ("1e200", "-1e308"):
+        path.write_text(whole.replace(row, row.replace(first, value, 1), 1))
+        with pytest.raises(DataError, match="is not a rotation"):
+            read_kalibr(path)
 
 
 def test_an_override_is_bounded_like_a_file() -> None:
