@@ -15,16 +15,7 @@ from pathlib import Path
 
 from slam_graph.errors import DataError
 
-__all__ = [
-    "appearing",
-    "make_folder",
-    "partial_folder",
-    "partial_name",
-    "refused",
-    "remove_remains",
-    "write_text",
-    "writing",
-]
+__all__ = ["Files"]
 
 _PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]+)\.(?P<pid>\d+)\.partial$")
 """Names of what is being written: they tell by whom."""
@@ -179,3 +170,16 @@ def _lives(pid: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+class Files:
+    """What is done with files."""
+
+    appearing = staticmethod(appearing)
+    make_folder = staticmethod(make_folder)
+    partial_folder = staticmethod(partial_folder)
+    partial_name = staticmethod(partial_name)
+    refused = staticmethod(refused)
+    remove_remains = staticmethod(remove_remains)
+    write_text = staticmethod(write_text)
+    writing = staticmethod(writing)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["completed", "end_with", "terminate_like_interrupt"]
+__all__ = ["Interrupts"]
 
 _GRACE_S = 10.0
 """Time for a process to end after Ctrl-C before it is killed."""
@@ -84,3 +84,11 @@ def end_with(pipe: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+class Interrupts:
+    """What is done about signals."""
+
+    completed = staticmethod(completed)
+    end_with = staticmethod(end_with)
+    terminate_like_interrupt = staticmethod(terminate_like_interrupt)

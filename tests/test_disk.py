@@ -14,7 +14,7 @@ import pytest
 
 from slam_graph.cli.main import main
 from slam_graph.errors import DataError
-from slam_graph.files import appearing, partial_folder, remove_remains
+from slam_graph.files import Files
 from slam_graph.simulation.simulator import simulate
 
 SMALL = 4000
@@ -198,18 +198,18 @@ def test_remains_of_killed_processes_are_removed(tmp_path: Path) -> None:
     )
     assert done.returncode == -signal.SIGKILL
     assert len(list(tmp_path.glob(".*.partial"))) == 2
-    own = partial_folder(tmp_path / "own")
-    remove_remains(tmp_path)
+    own = Files.partial_folder(tmp_path / "own")
+    Files.remove_remains(tmp_path)
     assert list(tmp_path.iterdir()) == [own]
 
 
 _LEAVES = """
 import os, signal, sys
 from pathlib import Path
-from slam_graph.files import appearing, partial_folder
+from slam_graph.files import Files
 folder = Path(sys.argv[1])
-partial_folder(folder / "flight")
-with appearing(folder / "a.txt") as partial:
+Files.partial_folder(folder / "flight")
+with Files.appearing(folder / "a.txt") as partial:
     partial.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -217,6 +217,6 @@ with appearing(folder / "a.txt") as partial:
 
 def test_long_names_are_cut(tmp_path: Path) -> None:
     path = tmp_path / ("é" * 100)
-    with appearing(path) as partial:
+    with Files.appearing(path) as partial:
         partial.write_text("whole")
     assert path.read_text() == "whole"

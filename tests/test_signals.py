@@ -18,7 +18,7 @@ from slam_graph.backend import adjust_recording
 from slam_graph.config import load_config
 from slam_graph.experiment.comparison_results import read_result
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
-from slam_graph.interrupts import completed
+from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
 from slam_graph.results import load_result
 from slam_graph.simulation.simulator import simulate
@@ -123,7 +123,7 @@ def test_an_interrupt_in_the_final_adjustment_keeps_the_causal_result(
 
 def signals(count: int, done: list[int]) -> None:
     """Send a signal so many times while something is to be completed."""
-    with completed() as begin:
+    with Interrupts.completed() as begin:
         begin()
         for _ in range(count):
             signal.raise_signal(signal.SIGINT)

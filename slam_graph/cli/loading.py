@@ -12,7 +12,7 @@ from importlib.util import find_spec, module_from_spec
 from types import ModuleType
 from typing import Any
 
-from slam_graph.interrupts import completed
+from slam_graph.interrupts import Interrupts
 
 _UNUSED = ("f2py", "testing")
 """Parts of NumPy that SciPy imports because it copies all names of NumPy; nobody uses them, and
@@ -33,7 +33,9 @@ def loading(text: str = "loading") -> Iterator[None]:
         sys.stderr.flush()
     gc.disable()
     try:
-        with completed() as begin:  # Ctrl-C in the middle of an import is not always heard
+        with (
+            Interrupts.completed() as begin
+        ):  # Ctrl-C in the middle of an import is not always heard
             begin()
             _postpone_unused()
             yield

@@ -35,8 +35,8 @@ from slam_graph.cli.console import echo_json
 from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
 from slam_graph.errors import DataError, SlamGraphError
-from slam_graph.files import refused
-from slam_graph.interrupts import terminate_like_interrupt
+from slam_graph.files import Files
+from slam_graph.interrupts import Interrupts
 from slam_graph.version import __version__
 
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
@@ -138,7 +138,7 @@ def run_command() -> int | str:
 
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupt)
-    terminate_like_interrupt()
+    Interrupts.terminate_like_interrupt()
     code: int | str = 0
     try:
         app(prog_name="slam-graph")
@@ -151,7 +151,7 @@ def run_command() -> int | str:
         code = error.exit_code
     except OSError as error:  # of the system, in a place where nobody expected it
         where = f"{error.filename}: " if error.filename is not None else ""
-        typer.echo(f"error: {where}{refused(error)}", err=True)
+        typer.echo(f"error: {where}{Files.refused(error)}", err=True)
         code = DataError.exit_code
     except Exception:
         if not heard:  # imports of other libraries turn Ctrl-C into errors of their own
@@ -171,7 +171,7 @@ def _flushed() -> int:
         sys.stdout.flush()
     except OSError as error:
         sys.stdout = None  # else Python tries again at its end
-        typer.echo(f"error: the output cannot be written ({refused(error)})", err=True)
+        typer.echo(f"error: the output cannot be written ({Files.refused(error)})", err=True)
         return DataError.exit_code
     return 0
 

@@ -14,7 +14,7 @@ import typer
 from pydantic import BaseModel
 
 from slam_graph.cli.loading import loading
-from slam_graph.interrupts import completed
+from slam_graph.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
@@ -331,7 +331,7 @@ def write_result(
     """Write all files into a new folder, named after the problem."""
     from slam_graph.results import ResultFolder
 
-    with completed() as begin, ResultFolder.of_run(output, name) as made:
+    with Interrupts.completed() as begin, ResultFolder.of_run(output, name) as made:
         begin()
         made.files += result.save(made.folder)
         made.text("run.log", log)

@@ -48,7 +48,7 @@ from slam_graph.cli.options import (
     run_settings,
 )
 from slam_graph.cli.watching import Watching, keep_serving
-from slam_graph.interrupts import completed
+from slam_graph.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -304,7 +304,7 @@ def execute(
         from slam_graph.pipeline import run as run_pipeline
         from slam_graph.results import ResultFolder
 
-    with completed() as begin, ResultFolder.of_run(output, sequence.info().name) as made:
+    with Interrupts.completed() as begin, ResultFolder.of_run(output, sequence.info().name) as made:
         recording = made.folder / "recording.rrd"
         with (
             watching.viewer(recording, sequence.info().name, known_map) as viewer,

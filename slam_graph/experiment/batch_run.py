@@ -17,7 +17,7 @@ from slam_graph.experiment.batch_summary import Row, rows_of, write_csv
 from slam_graph.experiment.batch_task import BatchTask, running
 from slam_graph.experiment.comparison_plan import Progress
 from slam_graph.experiment.executors import Executor, executor_for
-from slam_graph.files import make_folder, remove_remains
+from slam_graph.files import Files
 from slam_graph.results import ResultFolder
 
 Watch = Callable[[Mapping[str, float], int], None]
@@ -119,8 +119,8 @@ def batch(
         "graph_times": list(graph_times),
     }
     done = Batch(folder, plan(names, folder, config, list(overrides), settings, common, extras))
-    make_folder(folder)
-    remove_remains(folder)
+    Files.make_folder(folder)
+    Files.remove_remains(folder)
     missing = [task for task in done.tasks if not task.is_done()]
     done.skipped = len(done.tasks) - len(missing)
     try:

@@ -23,7 +23,7 @@ from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.experiment.settings_hash import settings_hash
-from slam_graph.files import partial_folder, partial_name, writing
+from slam_graph.files import Files
 from slam_graph.pipeline import run
 from slam_graph.results import ResultFolder
 from slam_graph.settings import Settings
@@ -141,7 +141,7 @@ def running(output: Path) -> dict[str, float]:
     """What part of each recording that is being run now is done, from 0 to 1, by its name."""
     parts: dict[str, float] = {}
     for folder in sorted(output.glob(".*.partial")):
-        name = partial_name(folder)
+        name = Files.partial_name(folder)
         with suppress(OSError, ValueError):
             if name is not None:
                 parts[name] = float((folder / _PROGRESS).read_text(encoding="ascii"))
@@ -169,11 +169,11 @@ def _appearing_folder(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not (path / MARK).is_file():
         raise DataError(f"{path}: is no result of a batch; move it away or choose another --output")
-    partial = partial_folder(path)
+    partial = Files.partial_folder(path)
     try:
         yield partial
         shutil.rmtree(path, ignore_errors=True)
-        with writing(path):
+        with Files.writing(path):
             partial.chmod(0o755)
             partial.rename(path)
     finally:

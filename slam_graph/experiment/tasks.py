@@ -27,7 +27,7 @@ from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.frontend import build_frontend
-from slam_graph.interrupts import end_with, terminate_like_interrupt
+from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
 from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
@@ -245,9 +245,9 @@ def main() -> None:
 
     Standard input may be a pipe: when its other end is closed, the task is given up.
     """
-    terminate_like_interrupt()
+    Interrupts.terminate_like_interrupt()
     if stat.S_ISFIFO(os.fstat(sys.stdin.fileno()).st_mode):
-        end_with(sys.stdin.fileno())
+        Interrupts.end_with(sys.stdin.fileno())
     _ANY_TASK.validate_json(sys.argv[1]).do()
 
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.display import Displayed
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.files import make_folder, write_text
+from slam_graph.files import Files
 
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 
@@ -215,8 +215,8 @@ class Trajectory(Displayed):
         format = format or ("euroc" if path.suffix == ".csv" else "tum")
         if format not in writers:
             raise DataError(f"no trajectory format '{format}'; {closest(format, writers)}")
-        make_folder(path.parent)
-        write_text(path, writers[format]())
+        Files.make_folder(path.parent)
+        Files.write_text(path, writers[format]())
         return path
 
     def as_dict(self) -> dict[str, FloatArray | IntArray]:

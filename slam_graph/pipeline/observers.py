@@ -18,7 +18,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.results.snapshot import save_so_far
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
 _SNAPSHOT_PERIOD_S, _SNAPSHOT_SHARE = 10.0, 0.02
@@ -94,7 +93,7 @@ class Snapshots(Stage):
             return
         folder, self._folder = self._folder, None
         with warn_on_failure(self._diagnostics, "not_kept", "the run is not kept if it is killed"):
-            save_so_far(self._result, folder, now - self._began)
+            self._result.save_so_far(folder, now - self._began)
             self._folder = folder
         after = time.monotonic()
         self._due = after + max(_SNAPSHOT_PERIOD_S, (after - now) / _SNAPSHOT_SHARE)

@@ -46,7 +46,7 @@ def run(
     known_map: SlamMap | None = None,
     *,
     graph_times: SequenceOf[int | float] = (),
-    so_far: Path | None = None,
+    so_far: Path | str | None = None,
     overrides: Iterable[str] | Mapping[str, Any] = (),
     **options: Any,
 ) -> RunResult:
@@ -90,7 +90,7 @@ def run(
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
         GraphKeeping(result, estimator, graph_times, diagnostics),
-        *([] if so_far is None else [Snapshots(result, so_far, diagnostics)]),
+        *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),
     ]
 

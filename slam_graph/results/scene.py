@@ -22,7 +22,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
-from slam_graph.files import make_folder, writing
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.results.scene_points import refined_points
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
@@ -259,11 +259,11 @@ def _frames(recording: Sequence) -> Iterator[CameraFrame]:
 
 
 def _write(path: Path, image: np.ndarray) -> None:
-    make_folder(path.parent)
+    Files.make_folder(path.parent)
     good, data = cv2.imencode(path.suffix, image)
     if not good:
         raise DataError(f"{path}: the image cannot be encoded")
-    with writing(path):  # `imwrite` does not say if the disk is full
+    with Files.writing(path):  # `imwrite` does not say if the disk is full
         path.write_bytes(data.tobytes())
 
 

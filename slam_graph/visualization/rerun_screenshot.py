@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from slam_graph.errors import DataError
-from slam_graph.files import appearing
+from slam_graph.files import Files
 from slam_graph.visualization.rerun_stream import (
     DEFAULT_ADDRESS,
     free_port,
@@ -78,7 +78,7 @@ def save_screenshot(recording: Path, picture: Path, size: tuple[int, int] = (160
     smaller = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
     good, data = cv2.imencode(".png", smaller, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert good
-    with appearing(picture) as partial:
+    with Files.appearing(picture) as partial:
         partial.write_bytes(data.tobytes())
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
-from slam_graph.files import writing
+from slam_graph.files import Files
 
 RerunMode = Literal["save", "spawn", "connect", "serve"]
 
@@ -180,7 +180,7 @@ class RerunStream:
             return
         self._raw.disconnect()
         if self._path is not None and self._partial is not None:
-            with writing(self._path):
+            with Files.writing(self._path):
                 os.replace(self._partial, self._path)
             self._partial = None
 

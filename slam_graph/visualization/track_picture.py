@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
-from slam_graph.files import appearing, make_folder, partial_folder, writing
+from slam_graph.files import Files
 from slam_graph.sensors import CameraFrame, FeatureFrame
 
 Picture = NDArray[np.uint8]
@@ -111,7 +111,7 @@ class TrackPictures:
                 return
             if _frames_in(self._partial) != self._filmed:  # OpenCV does not say if a disk is full
                 raise DataError(f"{self._video}: cannot be written; is the disk full?")
-            with writing(self._video):
+            with Files.writing(self._video):
                 self._partial.replace(self._video)
         finally:
             shutil.rmtree(self._partial.parent, ignore_errors=True)
@@ -132,7 +132,7 @@ class TrackPictures:
     def _film(self, path: Path, drawn: Picture) -> None:
         """Append a picture to the video."""
         if self._writer is None:
-            self._partial = partial_folder(path) / path.name
+            self._partial = Files.partial_folder(path) / path.name
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (drawn.shape[1], drawn.shape[0])
             self._writer = cv2.VideoWriter(str(self._partial), code, _FRAMES_PER_S, size)
@@ -158,11 +158,11 @@ def _save(path: Path, picture: Picture) -> None:
     Raises:
         DataError: if it cannot be written.
     """
-    make_folder(path.parent)
+    Files.make_folder(path.parent)
     good, data = cv2.imencode(".png", picture)
     if not good:
         raise DataError(f"{path}: the picture cannot be encoded")
-    with appearing(path) as partial:
+    with Files.appearing(path) as partial:
         partial.write_bytes(data.tobytes())
 
 

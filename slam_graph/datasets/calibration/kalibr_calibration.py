@@ -27,7 +27,7 @@ from slam_graph.datasets.calibration.euroc_calibration import (
     with_shutter,
 )
 from slam_graph.errors import DataError
-from slam_graph.files import write_text
+from slam_graph.files import Files
 from slam_graph.sensors import ImuNoise, Rig, RigCamera
 
 _IMU_KEY = "imu0"
@@ -155,7 +155,7 @@ def write_kalibr(rig: Rig, path: str | Path) -> None:
     Raises:
         DataError: if it cannot be written.
     """
-    write_text(Path(path), [kalibr_text(rig)])
+    Files.write_text(Path(path), [kalibr_text(rig)])
 
 
 def kalibr_text(rig: Rig) -> str:

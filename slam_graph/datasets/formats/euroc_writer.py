@@ -24,7 +24,7 @@ from slam_graph.datasets.calibration.euroc_calibration import camera_entry, shut
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
-from slam_graph.files import partial_folder, writing
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import CameraFrame, ImuData, ImuNoise, Rig, RigCamera
 
@@ -100,9 +100,9 @@ class EurocWriter:
             raise DataError(f"{path}: {what}; remove it or write to another folder")
 
     def __enter__(self) -> Self:
-        self._folder = partial_folder(self._path)
+        self._folder = Files.partial_folder(self._path)
         try:
-            with writing(self._path):
+            with Files.writing(self._path):
                 self._begin()
         except BaseException as error:
             self.__exit__(type(error), error, None)
@@ -134,7 +134,7 @@ class EurocWriter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            with writing(self._path):  # what is buffered is written when a file is closed
+            with Files.writing(self._path):  # what is buffered is written when a file is closed
                 self._files.close()
                 if kind is None:
                     write_kalibr(self._rig, self._folder / CALIBRATION)
@@ -150,7 +150,7 @@ class EurocWriter:
 
     def write_imu(self, imu: ImuData) -> None:
         """The next samples."""
-        with writing(self._path):
+        with Files.writing(self._path):
             _write_rows(self._imu, imu.stamps_ns, np.column_stack([imu.gyro, imu.accel]))
 
     def write_frame(self, frame: CameraFrame) -> None:
@@ -162,7 +162,7 @@ class EurocWriter:
             good, data = cv2.imencode(".png", image)
             if not good:
                 raise DataError(f"{self._path}: the image at {frame.stamp_ns} cannot be encoded")
-            with writing(self._path):  # `imwrite` does not say if the disk is full
+            with Files.writing(self._path):  # `imwrite` does not say if the disk is full
                 (folder / name).write_bytes(data.tobytes())
                 index.write(f"{frame.stamp_ns},{name}\n")
 

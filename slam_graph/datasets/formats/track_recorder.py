@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.errors import DataError
-from slam_graph.files import partial_folder, writing
+from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
@@ -65,10 +65,10 @@ class TrackRecorder:
         self._record = layout.frame_record(len(rig.cameras))
 
     def __enter__(self) -> Self:
-        self._folder = partial_folder(self.path)
+        self._folder = Files.partial_folder(self.path)
         self._files = ExitStack()
         try:
-            with writing(self.path):
+            with Files.writing(self.path):
                 self._frames = self._open(layout.FRAMES)
                 self._features = self._open(layout.FEATURES)
                 self._imu = self._open(layout.IMU)
@@ -84,7 +84,7 @@ class TrackRecorder:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            with writing(self.path):  # what is buffered is written when a file is closed
+            with Files.writing(self.path):  # what is buffered is written when a file is closed
                 self._files.close()
                 if kind is None:
                     self._finish()
@@ -115,7 +115,7 @@ class TrackRecorder:
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
-        with writing(self.path):
+        with Files.writing(self.path):
             self._append(imu, frame)
 
     def _append(self, imu: ImuData, frame: FeatureFrame) -> None:
