@@ -41,16 +41,10 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
 
-Status = Literal[
-    "ok",
-    "interrupted",
-    "not_initialized",
-    "diverged",
-    "low_coverage",
-    "no_map",
-    "failed",
-    "unfinished",
+_Ended = Literal[
+    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
 ]
+Status = Literal[_Ended, "unfinished"]
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
