@@ -17,7 +17,7 @@ from benchmarks import baseline, report
 from benchmarks.registry import BENCHMARKS
 from benchmarks.suite import Outcome, data_folder, require
 from slam_graph.errors import SlamGraphError
-from slam_graph.results.result_files import write_text
+from slam_graph.files import Files
 
 FAILED = 1
 
@@ -116,9 +116,11 @@ def measured(name: str, data: Path) -> Outcome:
 def write(options: argparse.Namespace, results: report.Results, before: baseline.Baseline) -> None:
     """Write the files that are asked for."""
     if options.json:
-        write_text(options.json, [json.dumps(report.table(results), indent=2), "\n"])
+        Files.write_text(options.json, [json.dumps(report.table(results), indent=2), "\n"])
     if options.markdown:
-        write_text(options.markdown, [line + "\n" for line in report.markdown(results, before)])
+        Files.write_text(
+            options.markdown, [line + "\n" for line in report.markdown(results, before)]
+        )
     if options.update_baseline:
         measured = report.measured(results)
         baseline.write_baseline(

@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.baseline import BASELINE_FILE, Baseline, read_baseline
 from benchmarks.documents import TABLES, Figures
 from slam_graph.errors import DataError, SlamGraphError
-from slam_graph.results.result_files import write_text
+from slam_graph.files import Files
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     for path, text in old.items():
         if not options.check:
-            write_text(path, [text])
+            Files.write_text(path, [text])
         print(f"{path.relative_to(ROOT)}: {'out of date' if options.check else 'written'}")
     return 1 if options.check and old else 0
 

@@ -15,10 +15,18 @@ from typing import ClassVar
 __all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError", "closest"]
 
 
+_LONGEST = 1500
+"""Characters of a message that are shown."""
+
+
 class SlamGraphError(Exception):
-    """Root of all errors raised on purpose by this package."""
+    """Root of all errors raised on purpose by this package; its text is one line of some length."""
 
     exit_code: ClassVar[int] = 1
+
+    def __str__(self) -> str:
+        line = " ".join(super().__str__().splitlines())  # it may quote a file of a stranger
+        return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} …"
 
 
 class DataError(SlamGraphError):

@@ -25,7 +25,8 @@ import slam_graph as sg
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment import executors
 from slam_graph.experiment.batch_plan import Entry, _names, plan
-from slam_graph.experiment.batch_task import MARK, BatchTask, remove_remains
+from slam_graph.experiment.batch_task import MARK, BatchTask
+from slam_graph.files import Files
 
 CONFIG = sg.load_config()
 FAST = ["final_ba.enabled=false"]
@@ -416,7 +417,7 @@ def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     elsewhere, other = tmp_path / ".x.another.1.partial", tmp_path / ".notes.partial"
     for folder in (dead, own, elsewhere, other):
         folder.mkdir()
-    remove_remains(tmp_path)
+    Files.remove_remains(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {own.name, elsewhere.name, other.name}
 
 

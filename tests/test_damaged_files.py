@@ -8,14 +8,18 @@
 import os
 import shutil
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from map_flights import World
 from pose_graphs import laps
-from recordings import CAMERA_YAML, write_euroc
+from recordings import CAMERA_YAML, write_euroc, write_openvins
+from recordings_public import write_kitti_raw, write_tum_rgbd
 from recordings_ros import write_bag
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
@@ -23,8 +27,10 @@ from slam_graph.config import load_config
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
+from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.errors import SlamGraphError
+from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 from slam_graph.results.map_output import load_map, save_map
 from slam_graph.simulation.simulator import simulate
@@ -199,6 +205,47 @@ def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
     folder = shutil.copytree(tracks, tmp_path / "flight")
     tried(folder / name, lambda: read_all(folder), 40)
+
+
+@pytest.mark.parametrize(
+    "name", ["calib.yaml", "tracks.csv", "imu.csv", "groundtruth.csv", "init_state.csv"]
+)
+def test_openvins(tmp_path: Path, name: str) -> None:
+    folder = write_openvins(tmp_path / "flight", frames=4, features=5)
+    tried(folder / name, lambda: read_all(folder), 40)
+
+
+def test_eqvio(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.csv"
+    with wheel_tracks().open(encoding="utf-8") as whole:
+        path.write_text("".join(islice(whole, 120)), encoding="utf-8")
+    tried(path, lambda: read_all(path), 100)
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "accelerometer.txt", "groundtruth.txt"])
+def test_tum_rgbd(tmp_path: Path, name: str) -> None:
+    folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=4)
+    if not (folder / name).is_file():
+        pytest.skip("not in this recording")
+    tried(folder / name, lambda: read_all(folder), 40)
+
+
+@pytest.mark.parametrize(
+    "name", ["calib_cam_to_cam.txt", "calib_imu_to_velo.txt", "timestamps.txt"]
+)
+def test_kitti(tmp_path: Path, name: str) -> None:
+    folder = write_kitti_raw(tmp_path / "2011_09_26", frames=4)
+    file = next(iter(sorted((tmp_path / "2011_09_26").rglob(name))))
+    tried(file, lambda: read_all(folder), 30)
+
+
+def test_masks(tmp_path: Path) -> None:
+    path = tmp_path / "mask.png"
+    camera = simulate(duration_s=1.0).rig.cameras[0].camera
+    drawn = np.zeros((camera.height, camera.width), np.uint8)
+    drawn[10:400, 30:500] = 255
+    assert cv2.imwrite(str(path), drawn)
+    tried(path, lambda: camera_mask(camera, path, 21), 60)
 
 
 def test_maps(tmp_path: Path) -> None:

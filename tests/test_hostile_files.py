@@ -7,10 +7,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
+from zlib import crc32
 
 import numpy as np
 import pytest
 from recordings import write_euroc
+from recordings_public import write_tum_rgbd
 from recordings_ros import bag_writer, write_bag
 from typer.testing import CliRunner
 
@@ -19,11 +21,13 @@ from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
+from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph import InformationRepair
 from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.results.result_files import ResultFolder, folder_name
@@ -70,6 +74,24 @@ def test_a_calibration_is_refused_in_one_line(tmp_path: Path, name: str) -> None
     path.write_text(text)
     with pytest.raises(DataError, match=rf"my\.yaml{expected.split(' ')[0]}"):
         read_yaml(path)
+
+
+def test_what_a_file_says_is_quoted_in_part(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    write_kalibr(simulate(duration_s=1.0).rig, path)
+    whole = path.read_text()
+    path.write_text(whole.replace("pinhole", "1" * 5000, 1))
+    with pytest.raises(DataError, match="unknown camera model '1111") as caught:
+        read_kalibr(path)
+    assert len(str(caught.value)) < 2000
+    row = next(
+        line for line in whole.splitlines() if line.lstrip().startswith("- [") and "," in line
+    )
+    first = row.split("[")[1].split(",")[0]
+    for value in ("1e200", "-1e308"):
+        path.write_text(whole.replace(row, row.replace(first, value, 1), 1))
+        with pytest.raises(DataError, match="is not a rotation"):
+            read_kalibr(path)
 
 
 def test_an_override_is_bounded_like_a_file() -> None:
@@ -283,6 +305,28 @@ def test_chunks_of_bags_unpack_within_a_bound(monkeypatch: pytest.MonkeyPatch) -
         unpack(bz2.compress(zeros)[:-4])
 
 
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_bag_compressed_by_zstd_is_read_within_a_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    from rosbags.rosbag2.writer import CompressionFormat, CompressionMode, Writer
+
+    opened = Writer.__init__
+
+    def compressed(self: Writer, *arguments: object, **options: object) -> None:
+        opened(self, *arguments, **options)  # type: ignore[arg-type]
+        self.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+
+    monkeypatch.setattr(Writer, "__init__", compressed)
+    path = write_bag(tmp_path, "sqlite", frames=3)
+    assert open_dataset(path).info().frames == 3
+    monkeypatch.setattr(bounded_unpacking, "_LEAST", 100)
+    monkeypatch.setattr(bounded_unpacking, "_RATIO", 0)
+    bounded_unpacking.bound_unpacking.cache_clear()
+    with pytest.raises(DataError, match="unpacks to more than"):
+        read_all(path)
+
+
 @pytest.mark.parametrize("name", ["bz2", "lz4"])
 def test_a_compressed_bag_is_read(tmp_path: Path, name: str) -> None:
     from rosbags.rosbag1 import Writer
@@ -306,6 +350,41 @@ def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
     path.write_bytes(bz2.compress(b"1 1 1\n" + b" " * 10**7))
     with pytest.raises(DataError, match="unpacks to more than 50 times"):
         read_bal(path)
+
+
+# --- names of other files -------------------------------------------------------------------------
+
+
+def test_no_image_of_another_folder_is_read(tmp_path: Path) -> None:
+    """TUM's lists and KITTI's folders too: a link or a name that leads out is not followed."""
+    folder = write_tum_rgbd(tmp_path / "rgbd_freiburg1")
+    index = folder / "rgb.txt"
+    lines = index.read_text().splitlines()
+    for name in ("../secret.png", "/etc/hostname", "rgb/../../secret.png", "a" * 300):
+        changed = [*lines[:-1], f"{lines[-1].split()[0]} {name}"]
+        index.write_text("\n".join(changed) + "\n")
+        with pytest.raises(DataError, match=r"rgb\.txt:\d+: .* is not a file in"):
+            read_all(folder)
+
+
+def test_masks_that_claim_too_much_are_refused(tmp_path: Path) -> None:
+    mask = tmp_path / "mask.png"
+    for size in ((100_000).to_bytes(4, "big"), (2**31 - 1).to_bytes(4, "big")):
+        header = b"IHDR" + size + size + b"\x08\x00\x00\x00\x00"
+        chunk = (13).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big")
+        mask.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+        with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera"):
+            camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    for name in ("my.yaml", "truth.txt", "graph.g2o", "problem.txt"):
+        path = tmp_path / name
+        path.write_bytes(b"\xff\xfe\x00\xc3\x28\n" * 3)
+        for read in (load_config, read_groundtruth, read_pose_graph, read_bal, open_dataset):
+            with pytest.raises(SlamGraphError) as caught:
+                read(path)
+            assert "\n" not in str(caught.value)
 
 
 def test_an_empty_bag_is_refused(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import slam_graph
 PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
-    {"errors", "diagnostics", "version", "arrays", "lazy"},
-    {"kernels", "plugins", "display"},
+    {"errors", "diagnostics", "version", "arrays", "lazy", "interrupts"},
+    {"files", "kernels", "plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},
     {"datasets", "frontend"},

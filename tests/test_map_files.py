@@ -20,7 +20,8 @@ from map_flights import World
 from slam_graph.errors import DataError
 from slam_graph.maps.map_file import ARRAYS, arrays_of, read_map
 from slam_graph.maps.map_model import SlamMap
-from slam_graph.results.map_output import MAP_NAME, export_map, load_map, save_map
+from slam_graph.results.map_output import export_map, load_map, save_map
+from slam_graph.results.result_files import MAP_NAME
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,12 @@ from slam_graph.config import load_config
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.pipeline.tracking import Stopwatch
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, finite
-from slam_graph.results.result_files import ResultFolder, appearing, write_text
+from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_result import RunInput, RunResult
 from slam_graph.results.saved_run import load_result
@@ -30,10 +31,10 @@ NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
-    write_text(path, ["old\n"])
+    Files.write_text(path, ["old\n"])
 
     def fail() -> None:
-        with appearing(path) as partial:
+        with Files.appearing(path) as partial:
             partial.write_text("half")
             assert path.read_text() == "old\n"
             raise RuntimeError("crash")
@@ -41,7 +42,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="crash"):
         fail()
     assert path.read_text() == "old\n"
-    write_text(path, ["new\n"])
+    Files.write_text(path, ["new\n"])
     assert path.read_text() == "new\n"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
 

@@ -30,8 +30,12 @@ from slam_graph.cli.options import (
     Seed,
     Sources,
     Start,
+    TlsCaFile,
+    TlsCert,
+    TlsKey,
     graph_times,
     sources_from,
+    tls_files,
 )
 
 if TYPE_CHECKING:
@@ -68,6 +72,9 @@ def batch(
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to do the runs."),
     ] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     algorithm: Algorithm = None,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -140,6 +147,7 @@ def batch(
                 sources=sources_from(sources),
                 jobs=jobs,
                 scheduler=scheduler,
+                tls=tls_files(tls_ca_file, tls_cert, tls_key),
                 progress=None if shown is None else shown.ended,
                 watch=None if shown is None else shown.running,
                 rerun=rerun,

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slam_graph.cli.console import echo_json, echo_rich_table
-from slam_graph.cli.options import INTERRUPTED, ConfigFile, Json, Overrides
+from slam_graph.cli.options import (
+    INTERRUPTED,
+    ConfigFile,
+    Json,
+    Overrides,
+    TlsCaFile,
+    TlsCert,
+    TlsKey,
+    tls_files,
+)
 
 if TYPE_CHECKING:
     from slam_graph.experiment import Comparison
@@ -49,6 +58,9 @@ def compare(
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to do the work."),
     ] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds to run; all if not said.")
     ] = None,
@@ -93,6 +105,7 @@ def compare(
             without_fej=without_fej,
             workers=workers,
             scheduler=scheduler,
+            tls=tls_files(tls_ca_file, tls_cert, tls_key),
             progress=_print_task if progress else None,
             duration_s=duration,
             cameras=cameras,

@@ -12,6 +12,8 @@ from importlib.util import find_spec, module_from_spec
 from types import ModuleType
 from typing import Any
 
+from slam_graph.interrupts import Interrupts
+
 _UNUSED = ("f2py", "testing")
 """Parts of NumPy that SciPy imports because it copies all names of NumPy; nobody uses them, and
 they take half as long as all of `scipy.linalg`."""
@@ -31,8 +33,12 @@ def loading(text: str = "loading") -> Iterator[None]:
         sys.stderr.flush()
     gc.disable()
     try:
-        _postpone_unused()
-        yield
+        with (
+            Interrupts.completed() as begin
+        ):  # Ctrl-C in the middle of an import is not always heard
+            begin()
+            _postpone_unused()
+            yield
     finally:
         gc.freeze()
         gc.enable()

@@ -10,8 +10,10 @@ Modules that are slow to import are imported inside the commands.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -32,7 +34,9 @@ from slam_graph.cli import (
 from slam_graph.cli.console import echo_json
 from slam_graph.cli.help_texts import SuggestingGroup, add_examples, example_text
 from slam_graph.cli.options import INTERRUPTED, Algorithm, ConfigFile, Overrides
-from slam_graph.errors import SlamGraphError
+from slam_graph.errors import DataError, SlamGraphError
+from slam_graph.files import Files
+from slam_graph.interrupts import Interrupts
 from slam_graph.version import __version__
 
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
@@ -119,15 +123,62 @@ def _global_options(
     """Options before the command."""
 
 
-def main() -> None:
-    """Launch a command; a `SlamGraphError` becomes one line on stderr and its exit code."""
+def run_command() -> int | str:
+    """Run a command; a `SlamGraphError` becomes one line on stderr and its exit code.
+
+    Returns:
+        The exit code.
+    """
+    heard = False
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        nonlocal heard
+        heard = True
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+    Interrupts.terminate_like_interrupt()
+    code: int | str = 0
     try:
         app(prog_name="slam-graph")
+    except SystemExit as leaving:
+        code = leaving.code or 0
+    except KeyboardInterrupt:
+        code = _interrupted()
     except SlamGraphError as error:
         typer.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        code = error.exit_code
+    except OSError as error:  # of the system, in a place where nobody expected it
+        where = f"{error.filename}: " if error.filename is not None else ""
+        typer.echo(f"error: {where}{Files.refused(error)}", err=True)
+        code = DataError.exit_code
+    except Exception:
+        if not heard:  # imports of other libraries turn Ctrl-C into errors of their own
+            raise
+        code = _interrupted()
+    return _flushed() or code
+
+
+def _interrupted() -> int:
+    typer.echo("interrupted", err=True)
+    return INTERRUPTED
+
+
+def _flushed() -> int:
+    """Write what is left of the output, and return 1 if that cannot be done, else 0."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        sys.stdout = None  # else Python tries again at its end
+        typer.echo(f"error: the output cannot be written ({Files.refused(error)})", err=True)
+        return DataError.exit_code
+    return 0
+
+
+def main() -> None:
+    """Run a command, and leave with its exit code."""
+    sys.exit(run_command())
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ def localize(
     trajectory_map.tum, once the place is recognised. The exit code is 3 if it never is.
     """
     from slam_graph.errors import EstimationError
-    from slam_graph.results import find_map, load_map
+    from slam_graph.results import ResultFolder, load_map
 
     settings = run_settings(
         config,
@@ -91,7 +91,7 @@ def localize(
         duration_s=duration,
         seed=seed,
     )
-    path = find_map(map_)
+    path = ResultFolder.find_map(map_)
     known = load_map(path)
     with collected_log() as log:
         sequence = open_recording(
@@ -129,9 +129,9 @@ _Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.
 @app.command()
 def info(path: _MapPath, as_json: Json = False) -> None:
     """Show what a map holds."""
-    from slam_graph.results import find_map, load_map
+    from slam_graph.results import ResultFolder, load_map
 
-    file = find_map(path)
+    file = ResultFolder.find_map(path)
     table = _describe(load_map(file), file)
     if as_json:
         echo_json(table)
@@ -186,10 +186,10 @@ def merge(
 
     from slam_graph.config import load_config
     from slam_graph.maps import merge_maps
-    from slam_graph.results import load_map, refuse_to_replace, save_map
+    from slam_graph.results import ResultFolder, load_map, save_map
 
     settings = load_config(config, set_ or ())
-    refuse_to_replace(output, force)
+    ResultFolder.refuse_to_replace(output, force)
     merged = merge_maps(
         load_map(first), load_map(second), settings.loop_closure, settings.localization
     )

@@ -103,11 +103,11 @@ def optimize(
     with loading():
         from slam_graph.bundle_adjustment import BalPolicy
         from slam_graph.pose_graph import PoseGraphPolicy
-        from slam_graph.results import refuse_to_replace
+        from slam_graph.results import ResultFolder
 
     watching = Watching(rerun, address=rerun_address)
     if save is not None:
-        refuse_to_replace(save, force)
+        ResultFolder.refuse_to_replace(save, force)
         if not save.parent.is_dir():
             raise DataError(f"{save}: cannot be written; name a file in an existing folder")
     loss = {("cost", "robust"): robust}

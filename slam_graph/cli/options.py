@@ -14,6 +14,7 @@ import typer
 from pydantic import BaseModel
 
 from slam_graph.cli.loading import loading
+from slam_graph.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from slam_graph.config import RunConfig
@@ -279,6 +280,24 @@ class _Result(Protocol):
         ...
 
 
+TlsCaFile = Annotated[
+    Path | None,
+    typer.Option("--tls-ca-file", metavar="PEM", help="Authority that the scheduler is proved by."),
+]
+TlsCert = Annotated[
+    Path | None, typer.Option("--tls-cert", metavar="PEM", help="Certificate of this client.")
+]
+TlsKey = Annotated[
+    Path | None, typer.Option("--tls-key", metavar="PEM", help="Key of that certificate.")
+]
+
+
+def tls_files(ca_file: Path | None, cert: Path | None, key: Path | None) -> dict[str, Path]:
+    """The files for TLS that are given, by name."""
+    given = {"ca_file": ca_file, "cert": cert, "key": key}
+    return {name: path for name, path in given.items() if path is not None}
+
+
 def read_policy(
     kind: type[_Policy],
     file: Path | None,
@@ -312,7 +331,8 @@ def write_result(
     """Write all files into a new folder, named after the problem."""
     from slam_graph.results import ResultFolder
 
-    with ResultFolder.of_run(output, name) as made:
+    with Interrupts.completed() as begin, ResultFolder.of_run(output, name) as made:
+        begin()
         made.files += result.save(made.folder)
         made.text("run.log", log)
     return made.folder, made.files

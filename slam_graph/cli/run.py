@@ -48,6 +48,7 @@ from slam_graph.cli.options import (
     run_settings,
 )
 from slam_graph.cli.watching import Watching, keep_serving
+from slam_graph.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -303,7 +304,7 @@ def execute(
         from slam_graph.pipeline import run as run_pipeline
         from slam_graph.results import ResultFolder
 
-    with ResultFolder.of_run(output, sequence.info().name) as made:
+    with Interrupts.completed() as begin, ResultFolder.of_run(output, sequence.info().name) as made:
         recording = made.folder / "recording.rrd"
         with (
             watching.viewer(recording, sequence.info().name, known_map) as viewer,
@@ -316,7 +317,9 @@ def execute(
                 progress=bar,
                 known_map=known_map,
                 graph_times=graph_times,
+                so_far=made.folder,
             )
+        begin()
         made.files += result.save(made.folder)
         if recording.is_file():
             made.path(recording.name)

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from slam_graph.errors import DataError
 from slam_graph.experiment.batch_page import write_page
 from slam_graph.experiment.batch_plan import absolute_sources, plan
 from slam_graph.experiment.batch_summary import Row, rows_of, write_csv
-from slam_graph.experiment.batch_task import BatchTask, remove_remains, running
+from slam_graph.experiment.batch_task import BatchTask, running
 from slam_graph.experiment.comparison_plan import Progress
 from slam_graph.experiment.executors import Executor, executor_for
+from slam_graph.files import Files
 from slam_graph.results import ResultFolder
 
 Watch = Callable[[Mapping[str, float], int], None]
@@ -59,6 +59,7 @@ def batch(
     sources: Mapping[str, str] | None = None,
     jobs: int | None = None,
     scheduler: str | None = None,
+    tls: Mapping[str, str | Path] | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
     rerun: Literal["off", "save"] = "off",
@@ -86,6 +87,7 @@ def batch(
         sources: where each sensor is, in formats that leave it open.
         jobs: processes at a time; the number of cores if None.
         scheduler: address of a Dask scheduler to do the runs on instead of this machine.
+        tls: PEM files for an encrypted connection to it: `ca_file`, `cert`, `key`.
         progress: called after each run with the name of the recording, why it failed or None, the
             number of runs done, and that of all.
         watch: called now and then, by another thread, with the part from 0 to 1 that is done of
@@ -104,7 +106,7 @@ def batch(
         DataError: if no recording is found.
     """
     names = [str(one) for one in ([what] if isinstance(what, str | Path) else what)]
-    executor = executor_for(jobs, scheduler)
+    executor = executor_for(jobs, scheduler, tls)
     folder = Path(output).resolve()
     common = {
         "format": format,
@@ -117,8 +119,8 @@ def batch(
         "graph_times": list(graph_times),
     }
     done = Batch(folder, plan(names, folder, config, list(overrides), settings, common, extras))
-    _make(folder)
-    remove_remains(folder)
+    Files.make_folder(folder)
+    Files.remove_remains(folder)
     missing = [task for task in done.tasks if not task.is_done()]
     done.skipped = len(done.tasks) - len(missing)
     try:
@@ -127,14 +129,6 @@ def batch(
     finally:
         _summarize(done)
     return done
-
-
-def _make(folder: Path) -> None:
-    """Make the folder of a batch."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot make a folder: {error.strerror}") from error
 
 
 def _do(

@@ -10,10 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import re
 import shutil
-import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -26,6 +23,7 @@ from slam_graph.config import RunConfig
 from slam_graph.datasets import SequenceInfo, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.experiment.settings_hash import settings_hash
+from slam_graph.files import Files
 from slam_graph.pipeline import run
 from slam_graph.results import ResultFolder
 from slam_graph.settings import Settings
@@ -36,8 +34,6 @@ MARK = "batch.json"
 """The file that says which settings a folder of results is of; it is written last."""
 
 _PROGRESS = "progress"
-_PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]+)\.(?P<pid>\d+)\.partial$")
-"""Names of hidden folders of runs that are going on."""
 _PERIOD_S = 0.3
 _CAUSAL_PART = 0.85
 """Part of a run that the causal estimate usually takes; the rest is the final adjustment."""
@@ -145,35 +141,11 @@ def running(output: Path) -> dict[str, float]:
     """What part of each recording that is being run now is done, from 0 to 1, by its name."""
     parts: dict[str, float] = {}
     for folder in sorted(output.glob(".*.partial")):
-        found = _PARTIAL.match(folder.name)
+        name = Files.partial_name(folder)
         with suppress(OSError, ValueError):
-            if found:
-                parts[found["name"]] = float((folder / _PROGRESS).read_text(encoding="ascii"))
+            if name is not None:
+                parts[name] = float((folder / _PROGRESS).read_text(encoding="ascii"))
     return parts
-
-
-def remove_remains(output: Path) -> None:
-    """Remove what processes of this machine left that were killed."""
-    for folder in output.glob(".*.partial"):
-        found = _PARTIAL.match(folder.name)
-        if found and found["host"] == _host() and not _lives(int(found["pid"])):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _host() -> str:
-    """This machine, without dots."""
-    return socket.gethostname().replace(".", "-") or "localhost"
-
-
-def _lives(pid: int) -> bool:
-    """Whether there is a process with this number."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _read_mark(folder: Path) -> dict[str, Any] | None:
@@ -197,15 +169,13 @@ def _appearing_folder(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not (path / MARK).is_file():
         raise DataError(f"{path}: is no result of a batch; move it away or choose another --output")
-    partial = path.with_name(f".{path.name}.{_host()}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise DataError(f"{partial}: cannot make a folder: {error.strerror}") from error
+    partial = Files.partial_folder(path)
     try:
         yield partial
         shutil.rmtree(path, ignore_errors=True)
-        partial.rename(path)
+        with Files.writing(path):
+            partial.chmod(0o755)
+            partial.rename(path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

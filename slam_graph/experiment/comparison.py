@@ -36,6 +36,7 @@ def compare(
     without_fej: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
+    tls: Mapping[str, str | Path] | None = None,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Comparison:
@@ -61,6 +62,7 @@ def compare(
             name NAME_no_fej.
         workers: processes at a time; the number of cores if None.
         scheduler: address of a Dask scheduler to run the tasks on instead of this machine.
+        tls: PEM files for an encrypted connection to it: `ca_file`, `cert`, `key`.
         progress: called after each task with its name, why it failed or None, the number of tasks
             done, and that of all.
         settings: top-level settings of all runs, such as `duration_s` and `cameras`.
@@ -83,7 +85,7 @@ def compare(
         configs = with_variants(configs)
     inputs = [data] if isinstance(data, (str, Path)) else data
     sources = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth)
-    executor = executor_for(workers, scheduler)
+    executor = executor_for(workers, scheduler, tls)
     comparison = run_tasks(sources, configs, seeds, output, executor, progress or _ignore)
     write_report(comparison)
     return comparison

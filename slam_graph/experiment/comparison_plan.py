@@ -16,6 +16,7 @@ from slam_graph.display import Displayed
 from slam_graph.errors import ConfigError
 from slam_graph.experiment.executors import Executor
 from slam_graph.experiment.tasks import RecordTask, RunTask, Source, Task
+from slam_graph.files import Files
 
 WITHOUT_FEJ = "_no_fej"
 """Suffix of the name of an algorithm without first-estimates Jacobians."""
@@ -134,7 +135,10 @@ def run_tasks(
         progress: called after each task.
     """
     folder = Path(folder).resolve()
+    Files.make_folder(folder)
     recordings, runs = plan(sources, configs, seeds, folder)
+    for used in {recorded.root for recorded in recordings} | {task.result.parent for task in runs}:
+        Files.remove_remains(used)
     comparison = Comparison(folder, runs)
     _do(comparison, recordings, executor, progress)
     _do(comparison, [task for task in runs if task.tracks.is_dir()], executor, progress)

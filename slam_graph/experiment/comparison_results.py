@@ -20,9 +20,11 @@ covariance, or all F frames:
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,13 +74,18 @@ def write_result(path: Path, result: RunResult, about: Table) -> None:
 
 
 def read_result(path: Path) -> Table | None:
-    """The JSON file of a run, or None if it is missing or of another schema version."""
+    """The JSON file of a run; None if it or its series are missing, damaged or of another version.
+
+    The series are checked by their sums, which is much faster than to read the arrays.
+    """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError):
+        with ZipFile(path.with_suffix(".npz")) as series:
+            damaged = series.testzip() is not None
+    except (OSError, ValueError, BadZipFile, zlib.error, NotImplementedError, EOFError):
         return None
     valid = isinstance(table, dict) and table.get("schema_version") == SCHEMA_VERSION
-    return table if valid and path.with_suffix(".npz").is_file() else None
+    return table if valid and not damaged else None
 
 
 def read_series(path: Path) -> Series:

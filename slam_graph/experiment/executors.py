@@ -9,12 +9,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
-from slam_graph.errors import ConfigError, DataError
+from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.experiment.tasks import Task
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -27,6 +28,13 @@ _CONNECT_TIMEOUT_S = 10.0
 
 _LOOK_S = 0.3
 """A worker of Dask looks as often whether its task is still wanted."""
+
+TLS_FILES = {
+    "ca_file": "tls_ca_file",
+    "cert": "tls_client_cert",
+    "key": "tls_client_key",
+}
+"""Files for TLS, by their names in the commands of Dask, and its arguments for them."""
 
 Outcome = tuple[Task, str | None]
 """A task that has ended, and why it failed or None."""
@@ -49,7 +57,7 @@ class LocalProcesses:
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or os.cpu_count() or 1
-        self._running: set[subprocess.Popen[str]] = set()
+        self._running: set[_TaskProcess] = set()
         self._stopped = False
 
     def do(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
@@ -68,7 +76,7 @@ class LocalProcesses:
     def _do(self, task: str) -> str | None:
         if self._stopped:
             return "stopped"
-        process = _start(task)
+        process = _TaskProcess(task)
         self._running.add(process)
         try:
             if self._stopped:  # since it was asked for above
@@ -84,13 +92,15 @@ class DaskCluster:
     Workers need this package, and data and results under the same paths.
 
     Args:
-        address: of the scheduler, e.g. ``tcp://127.0.0.1:8786``.
+        address: of the scheduler, e.g. ``tcp://127.0.0.1:8786`` or ``tls://cluster:8786``.
+        tls: paths of PEM files by Dask's names for them (`TLS_FILES`), for an encrypted
+            connection; those that are not given are taken from Dask's own settings.
 
     Raises:
-        ConfigError: if Dask is not installed.
+        ConfigError: if Dask is not installed, or a file is missing.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, tls: Mapping[str, str | Path] | None = None) -> None:
         try:
             import distributed  # noqa: F401
         except ImportError as error:
@@ -98,6 +108,12 @@ class DaskCluster:
                 "--scheduler needs Dask; install it with: pip install 'slam-graph[compare]'"
             ) from error
         self.address = address
+        self.tls = {name: str(path) for name, path in (tls or {}).items()}
+        for name, path in self.tls.items():
+            if name not in TLS_FILES:
+                raise ConfigError(f"tls: no file '{name}'; {closest(name, TLS_FILES)}")
+            if not Path(path).is_file():
+                raise ConfigError(f"{path}: no such file; it was given as {name} for TLS")
 
     def do(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
         """Do all tasks.
@@ -108,9 +124,15 @@ class DaskCluster:
         from distributed import Client, as_completed
 
         try:
-            client = Client(self.address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise DataError(f"no Dask scheduler answers at '{self.address}'") from error
+            client = Client(
+                self.address,
+                timeout=_CONNECT_TIMEOUT_S,
+                set_as_default=False,
+                security=self._security(),
+            )
+        except (OSError, ValueError, TypeError) as error:
+            secured = " with these TLS files" if self.tls else ""
+            raise DataError(f"no Dask scheduler answers at '{self.address}'{secured}") from error
         with client:
             texts = [task.model_dump_json() for task in tasks]
             futures = client.map(_do_in_process, texts, pure=False, retries=0)
@@ -124,20 +146,33 @@ class DaskCluster:
                 client.cancel(futures)
                 raise
 
+    def _security(self) -> Any:
+        """The security of Dask; None leaves all to its own settings."""
+        from distributed.security import Security
 
-def executor_for(workers: int | None, scheduler: str | None) -> Executor:
+        if not self.tls:
+            return None
+        named = {TLS_FILES[name]: path for name, path in self.tls.items()}
+        return Security(require_encryption=True, **named)
+
+
+def executor_for(
+    workers: int | None, scheduler: str | None, tls: Mapping[str, str | Path] | None = None
+) -> Executor:
     """Processes on this machine, or a Dask cluster if there is an address of its scheduler.
 
     Raises:
-        ConfigError: if both are given, or Dask is not installed.
+        ConfigError: if both are given, files for TLS without a scheduler, or Dask is not installed.
     """
     if scheduler is None:
+        if tls:
+            raise ConfigError("TLS is for the connection to a Dask scheduler; give its address")
         return LocalProcesses(workers)
     if workers is not None:
         raise ConfigError(
             "a number of processes is for this machine, a Dask cluster has its own; give only one"
         )
-    return DaskCluster(scheduler)
+    return DaskCluster(scheduler, tls)
 
 
 def _do_in_process(task: str) -> str | None:
@@ -158,23 +193,37 @@ def _do_in_process(task: str) -> str | None:
         known = worker.state.tasks.get(key)
         return known is not None and known.state != "cancelled"
 
-    return _wait(_start(task), wanted)
+    return _wait(_TaskProcess(task), wanted)
 
 
-def _start(task: str) -> subprocess.Popen[str]:
-    """Start the process of a task; Ctrl-C in the terminal does not reach it."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "slam_graph.experiment.tasks", task],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **ONE_THREAD},
-        start_new_session=True,
-    )
+class _TaskProcess(subprocess.Popen[str]):
+    """The process of a task; Ctrl-C in the terminal does not reach it, and it outlives nobody.
+
+    Args:
+        task: as JSON.
+    """
+
+    def __init__(self, task: str) -> None:
+        theirs, self._lifeline = os.pipe()  # its end is closed also when this process is killed
+        try:
+            super().__init__(
+                [sys.executable, "-m", "slam_graph.experiment.tasks", task],
+                stdin=theirs,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, **ONE_THREAD},
+                start_new_session=True,
+            )
+        finally:
+            os.close(theirs)
+
+    def release(self) -> None:
+        """Close the pipe, when the process has ended."""
+        os.close(self._lifeline)
 
 
-def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
+def _stop(processes: Sequence[_TaskProcess]) -> None:
     """End the processes of tasks, all at once, with SIGINT: they leave no incomplete files then.
 
     What has not ended in time, or when there is another Ctrl-C, is killed.
@@ -191,7 +240,7 @@ def _stop(processes: Sequence[subprocess.Popen[str]]) -> None:
             process.kill()
 
 
-def _wait(process: subprocess.Popen[str], wanted: Callable[[], bool] | None = None) -> str | None:
+def _wait(process: _TaskProcess, wanted: Callable[[], bool] | None = None) -> str | None:
     """Wait for the process of a task.
 
     Args:
@@ -208,6 +257,7 @@ def _wait(process: subprocess.Popen[str], wanted: Callable[[], bool] | None = No
         except subprocess.TimeoutExpired:
             if wanted is not None and not wanted():
                 _stop([process])
+    process.release()
     if process.returncode == 0:
         return None
     if process.returncode < 0:

@@ -9,7 +9,10 @@ affect other runs, and a cluster needs no more than a shared folder.
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import stat
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,6 +27,7 @@ from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.frontend import build_frontend
+from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
 from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
@@ -164,11 +168,16 @@ class RecordTask(Settings):
         return self.root / f"{self.source.name}_seed{self.seed}_{key}"
 
     def is_done(self) -> bool:
-        """Whether the recording exists; it appears only when it is complete."""
-        return self.folder.is_dir()
+        """Whether the recording exists, and its files are as long as they should be."""
+        try:
+            open_dataset(self.folder, "recording").info()
+        except DataError:
+            return False
+        return True
 
     def do(self) -> None:
-        """Record the tracks."""
+        """Record the tracks, in the place of a recording that is damaged."""
+        shutil.rmtree(self.folder, ignore_errors=True)
         config = self.config
         sequence = self.source.open(self.seed, config.cameras)
         info = sequence.info()
@@ -232,7 +241,13 @@ _ANY_TASK: TypeAdapter[Task] = TypeAdapter(Annotated[Task, Field(discriminator="
 
 
 def main() -> None:
-    """Do the task given as JSON in the first argument."""
+    """Do the task given as JSON in the first argument.
+
+    Standard input may be a pipe: when its other end is closed, the task is given up.
+    """
+    Interrupts.terminate_like_interrupt()
+    if stat.S_ISFIFO(os.fstat(sys.stdin.fileno()).st_mode):
+        Interrupts.end_with(sys.stdin.fileno())
     _ANY_TASK.validate_json(sys.argv[1]).do()
 
 

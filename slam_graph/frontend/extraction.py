@@ -276,7 +276,10 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
     Raises:
         ConfigError: if it is missing, unreadable, or not of the size of the camera's images.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    except cv2.error:  # it claims more pixels than OpenCV takes
+        image = None
     if image is None:
         raise ConfigError(f"{path}: the mask of a camera is missing or not a readable image")
     if image.shape != (height, width):

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.display import Displayed
 from slam_graph.errors import ConfigError, DataError, closest
+from slam_graph.files import Files
 
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 
@@ -202,7 +203,7 @@ class Trajectory(Displayed):
         """Write the trajectory as a file.
 
         Args:
-            path: of the file, which is replaced.
+            path: of the file, which is replaced when the new one is complete.
             format: `tum`, `kitti` (without times) or `euroc` (CSV); by default `euroc` for a name
                 that ends with `.csv`, else `tum`.
 
@@ -214,11 +215,8 @@ class Trajectory(Displayed):
         format = format or ("euroc" if path.suffix == ".csv" else "tum")
         if format not in writers:
             raise DataError(f"no trajectory format '{format}'; {closest(format, writers)}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text("".join(writers[format]()), encoding="utf-8")
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        Files.make_folder(path.parent)
+        Files.write_text(path, writers[format]())
         return path
 
     def as_dict(self) -> dict[str, FloatArray | IntArray]:

@@ -7,8 +7,10 @@ Factor graphs of single frames: a stage that keeps those that are asked for.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
 from typing import Protocol, TypeGuard
 
 from slam_graph.backend import Estimator
@@ -17,6 +19,9 @@ from slam_graph.geometry import Trajectory
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
+
+_SNAPSHOT_PERIOD_S, _SNAPSHOT_SHARE = 10.0, 0.02
+"""The estimate so far is written no more often, and takes no more of the time of a run."""
 
 _FIRST_STAMP = 1_000_000_000
 """Whole numbers from here on are stamps in nanoseconds."""
@@ -63,6 +68,35 @@ class GraphKeeping(Stage):
 def _is_stamp(time: int | float) -> TypeGuard[int]:
     """Whether a time is a stamp, not seconds."""
     return isinstance(time, int) and time >= _FIRST_STAMP
+
+
+class Snapshots(Stage):
+    """Writes the estimate so far into a folder now and then, for the case that the run is killed.
+
+    What cannot be written is counted as a warning and not tried again.
+
+    Args:
+        result: of the run.
+        folder: to write to.
+        diagnostics: counts the warning.
+    """
+
+    def __init__(self, result: RunResult, folder: Path, diagnostics: Diagnostics) -> None:
+        self._result, self._diagnostics = result, diagnostics
+        self._folder: Path | None = folder
+        self._began = self._due = time.monotonic()
+
+    def frame(self, frame: EstimatedFrame) -> None:
+        """Write if it is due: after the first frame, and so that it takes little of the time."""
+        now = time.monotonic()
+        if self._folder is None or now < self._due:
+            return
+        folder, self._folder = self._folder, None
+        with warn_on_failure(self._diagnostics, "not_kept", "the run is not kept if it is killed"):
+            self._result.save_so_far(folder, now - self._began)
+            self._folder = folder
+        after = time.monotonic()
+        self._due = after + max(_SNAPSHOT_PERIOD_S, (after - now) / _SNAPSHOT_SHARE)
 
 
 class Viewer(Protocol):

@@ -23,12 +23,13 @@ from slam_graph.pipeline.observers import (
     Observers,
     Progress,
     Recorder,
+    Snapshots,
     Viewer,
     Viewing,
 )
 from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
-from slam_graph.pipeline.supervision import interrupts_between_frames, outcome
+from slam_graph.pipeline.supervision import finish, interrupts_between_frames, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
 from slam_graph.results import RunInput, RunResult
 
@@ -45,6 +46,7 @@ def run(
     known_map: SlamMap | None = None,
     *,
     graph_times: SequenceOf[int | float] = (),
+    so_far: Path | str | None = None,
     overrides: Iterable[str] | Mapping[str, Any] = (),
     **options: Any,
 ) -> RunResult:
@@ -65,6 +67,8 @@ def run(
         known_map: a map to locate every frame in, beside the estimate in the run's own world.
         graph_times: when to keep the factor graph of the back end, in seconds after the first frame
             or stamps in ns (int); `RunResult.graphs` has them.
+        so_far: folder to write the estimate so far to now and then, with the status `unfinished`:
+            it is left if the process is killed. Its files are replaced by `RunResult.save`.
         overrides: changes of the settings, as for `load_config`.
         options: top-level settings by name, as for `load_config`: `algorithm`, `duration_s`, …
 
@@ -86,6 +90,7 @@ def run(
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
         GraphKeeping(result, estimator, graph_times, diagnostics),
+        *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),
     ]
 
@@ -104,8 +109,7 @@ def run(
                     stage.frame(frame)
                 frame_done()
             estimation.finish()
-        for stage in stages:
-            stage.finish()
+        finish(stages, result)
     result.warnings = +sequence.diagnostics.counts
     return result
 

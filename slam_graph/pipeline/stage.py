@@ -110,11 +110,15 @@ def warn_on_failure(diagnostics: Diagnostics, kind: str, consequence: str) -> It
         diagnostics: counts the warning.
         kind: of the warning.
         consequence: begins the message: what the run lacks now.
+
+    Raises:
+        KeyboardInterrupt: if that ended the block; it is counted as well.
     """
     try:
         yield
     except KeyboardInterrupt:
         diagnostics.warn(kind, f"{consequence}: interrupted")
+        raise
     except Exception as error:
         if not isinstance(
             error, SlamGraphError | cv2.error | RuntimeError | np.linalg.LinAlgError | OSError

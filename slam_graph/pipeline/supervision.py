@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
@@ -21,6 +21,7 @@ from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import LimitsConfig
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry import NavState
+from slam_graph.pipeline.stage import Stage
 from slam_graph.results import RunResult
 
 _LONGEST_GAP_S = 0.5
@@ -168,6 +169,19 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
     level = logging.INFO if ending.status == "ok" else logging.ERROR
     done = f"{result.logs.frames} frames in {ending.wall_s:.1f} s"
     logger.log(level, "%s", ending.message or done)
+
+
+def finish(stages: Iterable[Stage], result: RunResult) -> None:
+    """Finish all stages; Ctrl-C ends the one at work, and those that come after are short then."""
+    waiting = deque(stages)
+    while waiting:
+        try:
+            while waiting:
+                waiting.popleft().finish()
+        except KeyboardInterrupt as interrupt:
+            ending = result.ending
+            ending.status, ending.error = "interrupted", interrupt
+            ending.message = "interrupted after the last frame"
 
 
 def _judge(result: RunResult, estimator: Estimator) -> None:

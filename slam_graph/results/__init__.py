@@ -16,18 +16,16 @@ __all__ = [
     "RunResult",
     "SavedRun",
     "export_map",
-    "find_map",
     "load_map",
     "load_result",
-    "refuse_to_replace",
     "save_map",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.results.localization_result import LocalizationLog
-    from slam_graph.results.map_output import export_map, find_map, load_map, save_map
+    from slam_graph.results.map_output import export_map, load_map, save_map
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
-    from slam_graph.results.result_files import ResultFolder, refuse_to_replace
+    from slam_graph.results.result_files import ResultFolder
     from slam_graph.results.run_logs import RunLogs
     from slam_graph.results.run_result import RunInput, RunResult
     from slam_graph.results.saved_run import SavedRun, load_result
@@ -38,7 +36,6 @@ else:
             "localization_result": ("LocalizationLog",),
             "map_output": (
                 "export_map",
-                "find_map",
                 "load_map",
                 "save_map",
             ),
@@ -46,10 +43,7 @@ else:
                 "BalResult",
                 "PoseGraphResult",
             ),
-            "result_files": (
-                "ResultFolder",
-                "refuse_to_replace",
-            ),
+            "result_files": ("ResultFolder",),
             "run_logs": ("RunLogs",),
             "run_result": (
                 "RunInput",

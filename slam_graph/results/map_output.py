@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,8 @@ import numpy as np
 from slam_graph import maps
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.results.result_files import LATEST, appearing, refuse_to_replace, write_text
+from slam_graph.files import Files
+from slam_graph.results.result_files import find_map, refuse_to_replace
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -93,7 +92,7 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
         *lines,
         "end_header",
     ]
-    with appearing(path) as partial:
+    with Files.appearing(path) as partial:
         partial.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
 
 
@@ -117,10 +116,6 @@ def read_ply(path: Path | str) -> FloatArray:
     return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
 
 
-MAP_NAME = "map.slam"
-"""Name of the map in the folder of a run."""
-
-
 def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
     """Write a map file. If writing fails, a file that was there before stays as it was.
 
@@ -134,7 +129,7 @@ def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:
     """
     path = Path(path)
     refuse_to_replace(path, force)
-    with _writable(path, "map "), appearing(path) as partial:
+    with Files.writing(path, "map "), Files.appearing(path) as partial:
         maps.write_map(partial, content)
 
 
@@ -149,23 +144,6 @@ def load_map(path: Path | str) -> SlamMap:
         DataError: if there is none, or it cannot be used.
     """
     return maps.read_map(find_map(path))
-
-
-def find_map(path: Path | str) -> Path:
-    """The map file that a path means (see `load_map`)."""
-    path = Path(path)
-    if not path.is_dir():
-        if not path.exists():
-            raise DataError(
-                f"{path}: no such file; name a map, or the folder of a run that saved one"
-            )
-        return path
-    for found in (path / MAP_NAME, path / LATEST / MAP_NAME):
-        if found.is_file():
-            return found
-    raise DataError(
-        f"{path}: no {MAP_NAME} in this folder; make one by `slam-graph run --save-map`"
-    )
 
 
 def export_map(
@@ -191,28 +169,12 @@ def export_map(
     for file in (*clouds, *tracks):
         refuse_to_replace(file, force)
     for file in clouds:
-        with _writable(file):
-            write_ply(file, content.points, content.poses.translations)
+        write_ply(file, content.points, content.poses.translations)
     for file, trajectory in zip(tracks, content.trajectories(), strict=False):
-        with _writable(file):
-            write_text(file, trajectory.tum_lines())
+        Files.write_text(file, trajectory.tum_lines())
     return [*clouds, *tracks]
 
 
 def _numbered(path: Path, count: int) -> list[Path]:
     """Paths of `count` files: the path itself if it is only one."""
     return [path.with_stem(f"{path.stem}_{n}") if count > 1 else path for n in range(count)]
-
-
-@contextmanager
-def _writable(path: Path, what: str = "") -> Iterator[None]:
-    """Say which file cannot be written.
-
-    Raises:
-        DataError: if the block raises an error of the system (a full disk, no permission).
-    """
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise DataError(f"{path}: {what}cannot be written ({reason})") from error

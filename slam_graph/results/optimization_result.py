@@ -17,10 +17,11 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment import BalPolicy, BalSolution
 from slam_graph.display import Displayed
+from slam_graph.files import Files
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
-from slam_graph.results.result_files import ResultFolder, appearing, write_text
+from slam_graph.results.result_files import ResultFolder
 
 
 @dataclass(eq=False, repr=False)
@@ -113,9 +114,9 @@ class BalResult(Displayed):
         """Write the whole problem with its estimates, compressed if the name ends with `.bz2`."""
         path = Path(path)
         if path.suffix != ".bz2":
-            write_text(path, self.solution.lines())
+            Files.write_text(path, self.solution.lines())
             return
-        with appearing(path) as partial:
+        with Files.appearing(path) as partial:
             partial.write_bytes(bz2.compress("".join(self.solution.lines()).encode("ascii")))
 
     def _facts(self) -> dict[str, object]:
@@ -219,7 +220,7 @@ class PoseGraphResult(Displayed):
 
     def save_problem(self, path: Path | str) -> None:
         """Write the graph with its estimates as a g2o file."""
-        write_text(Path(path), self.solution.g2o_lines())
+        Files.write_text(Path(path), self.solution.g2o_lines())
 
     def _edge_lines(self) -> Iterator[str]:
         """Edges as CSV: ids, χ² in GTSAM's convention, weight."""

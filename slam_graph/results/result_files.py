@@ -21,26 +21,11 @@ import numpy as np
 from slam_graph import datasets
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 
 LATEST = "latest"
 """Name of the link to the newest results."""
-
-
-@contextmanager
-def appearing(path: Path) -> Iterator[Path]:
-    """A path to write to, which becomes `path` when the block ends well and vanishes otherwise.
-
-    The content is on the disk before the name is: a crash leaves the old file or the new one.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        yield partial
-        with partial.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def refuse_to_replace(path: Path, force: bool) -> None:
@@ -75,10 +60,25 @@ def folder_name(name: str) -> str:
     return plain
 
 
-def write_text(path: Path, lines: Iterable[str]) -> None:
-    """Write lines (with their line ends) as a whole file."""
-    with appearing(path) as partial, partial.open("w", encoding="utf-8") as file:
-        file.writelines(lines)
+MAP_NAME = "map.slam"
+"""Name of the map in the folder of a run."""
+
+
+def find_map(path: Path | str) -> Path:
+    """The map file that a path means (see `load_map`)."""
+    path = Path(path)
+    if not path.is_dir():
+        if not path.exists():
+            raise DataError(
+                f"{path}: no such file; name a map, or the folder of a run that saved one"
+            )
+        return path
+    for found in (path / MAP_NAME, path / LATEST / MAP_NAME):
+        if found.is_file():
+            return found
+    raise DataError(
+        f"{path}: no {MAP_NAME} in this folder; make one by `slam-graph run --save-map`"
+    )
 
 
 class ResultFolder:
@@ -87,14 +87,20 @@ class ResultFolder:
     Args:
         folder: made if it is missing.
 
+    Raises:
+        DataError: if the folder or a file cannot be written.
+
     Attributes:
         folder: of all files.
         files: written so far, in order.
     """
 
+    find_map = staticmethod(find_map)
+    refuse_to_replace = staticmethod(refuse_to_replace)
+
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        Files.make_folder(self.folder)
         self.files: list[Path] = []
 
     @staticmethod
@@ -135,12 +141,12 @@ class ResultFolder:
     @contextmanager
     def appearing(self, name: str) -> Iterator[Path]:
         """A path to write the next file to, which appears when the block ends well."""
-        with appearing(self.path(name)) as partial:
+        with Files.appearing(self.path(name)) as partial:
             yield partial
 
     def text(self, name: str, lines: Iterable[str]) -> None:
         """Write lines (with their line ends)."""
-        write_text(self.path(name), lines)
+        Files.write_text(self.path(name), lines)
 
     def json(self, name: str, table: Mapping[str, Any]) -> None:
         """Write a table as JSON."""
@@ -165,7 +171,8 @@ def _new_folder(root: Path, dataset: str, now: datetime | None = None) -> Path:
                 continue
             return folder
     except OSError as error:
-        raise DataError(f"{root / dataset}: cannot make a folder: {error.strerror}") from error
+        reason = Files.refused(error)
+        raise DataError(f"{root / dataset}: cannot make a folder ({reason})") from error
     raise DataError(f"{root / dataset}: too many runs at {name}")
 
 
@@ -181,9 +188,14 @@ def _link_latest(folder: Path) -> Path:
     if link.exists() and not link.is_symlink():
         raise DataError(f"{link}: not a link; move it away, the newest results are in {folder}")
     partial = folder.parent / f".{LATEST}.{os.getpid()}.partial"
-    partial.unlink(missing_ok=True)
-    partial.symlink_to(folder.name)
-    os.replace(partial, link)
+    with Files.writing(link):
+        try:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(folder.name)
+            os.replace(partial, link)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
     return link
 
 

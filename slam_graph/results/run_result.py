@@ -21,8 +21,8 @@ from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
-from slam_graph.results.map_output import MAP_NAME, PointMap, save_map, write_ply
-from slam_graph.results.result_files import ResultFolder
+from slam_graph.results.map_output import PointMap, save_map, write_ply
+from slam_graph.results.result_files import MAP_NAME, ResultFolder
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.results.run_picture import (
     CAUSAL,
@@ -41,9 +41,10 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
 
-Status = Literal[
+_Ended = Literal[
     "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
 ]
+Status = Literal[_Ended, "unfinished"]
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
@@ -371,6 +372,12 @@ class RunResult(RunSummary):
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for
             save_map(self.slam_map, files.path(MAP_NAME), force=True)
         return files.files
+
+    def save_so_far(self, folder: Path | str, wall_s: float) -> None:
+        """Write the estimate of a run that goes on (`slam_graph/results/snapshot.py`)."""
+        from slam_graph.results.snapshot import save_so_far
+
+        save_so_far(self, Path(folder), wall_s)
 
     def _known_map(self) -> SlamMap | None:
         return self.slam_map

@@ -19,8 +19,8 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.results import result_files as names
 from slam_graph.results.frame_table import KEYFRAME, NEES
-from slam_graph.results.map_output import MAP_NAME, load_map, read_ply
-from slam_graph.results.result_files import LATEST
+from slam_graph.results.map_output import load_map, read_ply
+from slam_graph.results.result_files import LATEST, MAP_NAME
 from slam_graph.results.run_picture import (
     CAUSAL,
     SMOOTHED,

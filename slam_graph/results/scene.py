@@ -22,6 +22,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.results.scene_points import refined_points
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
@@ -258,9 +259,12 @@ def _frames(recording: Sequence) -> Iterator[CameraFrame]:
 
 
 def _write(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), image):
-        raise DataError(f"{path}: the image cannot be written")
+    Files.make_folder(path.parent)
+    good, data = cv2.imencode(path.suffix, image)
+    if not good:
+        raise DataError(f"{path}: the image cannot be encoded")
+    with Files.writing(path):  # `imwrite` does not say if the disk is full
+        path.write_bytes(data.tobytes())
 
 
 def _shades(image: np.ndarray, pixels: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam_graph.errors import DataError
-from slam_graph.results.result_files import appearing, write_text
+from slam_graph.files import Files
 from slam_graph.results.scene import COLMAP_OFFSET_PX, Scene
 from slam_graph.sensors import Camera, Rig
 
@@ -44,14 +44,14 @@ def write_colmap(folder: Path, scene: Scene) -> list[Path]:
     Raises:
         DataError: if COLMAP has no such camera model.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    Files.make_folder(folder)
     files = {
         "cameras.txt": _camera_lines(scene),
         "images.txt": _image_lines(scene),
         "points3D.txt": _point_lines(scene),
     }
     for name, lines in files.items():
-        write_text(folder / name, lines)
+        Files.write_text(folder / name, lines)
     return [folder / name for name in files]
 
 
@@ -66,7 +66,7 @@ def write_nerfstudio(folder: Path, scene: Scene, images: str = "images") -> list
     Raises:
         DataError: if nerfstudio has no such camera model, or the cameras have different ones.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    Files.make_folder(folder)
     models = {_model(mounted.camera) for mounted in scene.cameras}
     if len(models) > 1:
         raise DataError("nerfstudio takes one camera model for all cameras, and these have several")
@@ -84,7 +84,7 @@ def write_nerfstudio(folder: Path, scene: Scene, images: str = "images") -> list
         "ply_file_path": "points.ply",
         "frames": frames,
     }
-    write_text(folder / "transforms.json", [json.dumps(table, indent=1), "\n"])
+    Files.write_text(folder / "transforms.json", [json.dumps(table, indent=1), "\n"])
     _write_cloud(folder / "points.ply", scene)
     return [folder / "transforms.json", folder / "points.ply"]
 
@@ -184,5 +184,5 @@ def _write_cloud(path: Path, scene: Scene) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property float {axis}" for axis in "xyz"]
     header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    with appearing(path) as partial:
+    with Files.appearing(path) as partial:
         partial.write_bytes("\n".join([*header, "end_header\n"]).encode() + vertices.tobytes())

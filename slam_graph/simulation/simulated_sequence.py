@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -151,18 +151,17 @@ class SimulatedSequence(RecordedSequence):
             progress: called after every frame.
 
         Raises:
-            DataError: if the folder exists already.
+            DataError: if the folder exists already, or cannot be written.
         """
-        self._write(Path(path), progress if progress is not None else _ignore)
         settings = self.config.model_dump(mode="json")
-        (Path(path) / _SETTINGS_FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+        notes = {_SETTINGS_FILE: yaml.safe_dump(settings, sort_keys=False)}
         if self.flight.report is not None:
-            report = json.dumps(self.flight.report.as_dict(), indent=2)
-            (Path(path) / _PATH_FILE).write_text(report + "\n", encoding="utf-8")
+            notes[_PATH_FILE] = json.dumps(self.flight.report.as_dict(), indent=2) + "\n"
+        self._write(Path(path), notes, progress if progress is not None else _ignore)
 
     @abstractmethod
-    def _write(self, path: Path, progress: Progress) -> None:
-        """Write measurements, calibration and ground truth."""
+    def _write(self, path: Path, notes: Mapping[str, str], progress: Progress) -> None:
+        """Write measurements, calibration, ground truth and notes."""
 
 
 class SimulatedTracks(SimulatedSequence):
@@ -200,9 +199,9 @@ class SimulatedTracks(SimulatedSequence):
             if start_ns is None or frame.stamp_ns >= start_ns:
                 yield frame
 
-    def _write(self, path: Path, progress: Progress) -> None:
+    def _write(self, path: Path, notes: Mapping[str, str], progress: Progress) -> None:
         truth, start = self.groundtruth(), self.initial_state()
-        with TrackRecorder(path, self.rig, self.name, truth, start) as recorder:
+        with TrackRecorder(path, self.rig, self.name, truth, start, notes) as recorder:
             for packet in self.packets():
                 assert isinstance(packet.frame, FeatureFrame)
                 recorder.write(packet.imu, packet.frame)
@@ -246,9 +245,9 @@ class SimulatedImages(SimulatedSequence):
         for exposure_ns in wanted.tolist():
             yield self.renderer.frame(self.flight.motion, exposure_ns, self._offset_ns)
 
-    def _write(self, path: Path, progress: Progress) -> None:
+    def _write(self, path: Path, notes: Mapping[str, str], progress: Progress) -> None:
         truth, rate_hz = self.groundtruth(), self.config.rate_hz
-        with EurocWriter(path, self.rig, truth, "simulated", rate_hz) as writer:
+        with EurocWriter(path, self.rig, truth, "simulated", rate_hz, notes=notes) as writer:
             for packet in self.packets():
                 assert isinstance(packet.frame, CameraFrame)
                 writer.write_imu(packet.imu)

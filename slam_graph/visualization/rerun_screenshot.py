@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.visualization.rerun_stream import (
     DEFAULT_ADDRESS,
     free_port,
@@ -77,10 +78,8 @@ def save_screenshot(recording: Path, picture: Path, size: tuple[int, int] = (160
     smaller = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
     good, data = cv2.imencode(".png", smaller, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert good
-    try:
-        picture.write_bytes(data.tobytes())
-    except OSError as error:
-        raise DataError(f"{picture}: cannot be written ({error.strerror})") from error
+    with Files.appearing(picture) as partial:
+        partial.write_bytes(data.tobytes())
 
 
 def require_picture(picture: Path) -> None:

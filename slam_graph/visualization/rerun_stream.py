@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import socket
@@ -18,6 +19,7 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 
 RerunMode = Literal["save", "spawn", "connect", "serve"]
 
@@ -35,6 +37,12 @@ _ROWS_IN_FILES = 400
 """Rows that are sent together where nobody waits for them: one by one they cost more time."""
 
 _CONNECT_TIMEOUT_S = 3.0
+
+_FLUSH_S = 5.0
+"""A file that does not grow for so long while it is flushed cannot be written."""
+
+_QUIET = "warn,re_log_encoding=off,re_sdk=off"
+"""What Rerun logs on stderr: of files that cannot be written we tell ourselves."""
 
 
 class RerunStream:
@@ -59,8 +67,7 @@ class RerunStream:
     def __init__(
         self, mode: RerunMode, name: str, path: Path | None = None, address: str | None = None
     ) -> None:
-        import rerun
-
+        rerun = _rerun()
         self.rr: Any = rerun
         self.url: str | None = None
         self._closed = False
@@ -167,14 +174,49 @@ class RerunStream:
         if self._layout is not None:
             self._raw.send_blueprint(self._layout)
             self._layout = None
-        self._raw.flush()
+        self._flush()
         self._closed = True
         if self.url is not None:  # to disconnect would end it
             return
         self._raw.disconnect()
         if self._path is not None and self._partial is not None:
-            os.replace(self._partial, self._path)
+            with Files.writing(self._path):
+                os.replace(self._partial, self._path)
             self._partial = None
+
+    def _flush(self) -> None:
+        """Send what is left. Its file must grow: on a full disk Rerun waits for ever.
+
+        Raises:
+            DataError: if the file cannot be written.
+        """
+        if self._partial is None:
+            self._raw.flush()
+            return
+        size = -1
+        while True:
+            try:
+                self._raw.flush(timeout_sec=_FLUSH_S)
+                return
+            except (RuntimeError, ValueError) as error:
+                before, size = size, self._partial.stat().st_size
+                if size == before:
+                    self._abandon()
+                    raise DataError(
+                        f"{self._path}: cannot be written; is the disk full?"
+                    ) from error
+
+    def _abandon(self) -> None:
+        """Leave a stream whose file cannot be written as it is, for good.
+
+        Rerun would wait for ever for the thread that wrote it, when the stream is disconnected or
+        collected, and at the end of the process.
+        """
+        self._closed = True
+        if self._partial is not None:
+            self._partial.unlink(missing_ok=True)
+        self.rr.unregister_shutdown()
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._raw))
 
     def discard(self) -> None:
         """End without what was sent: no file appears. A stream that is closed stays as it is."""
@@ -234,6 +276,19 @@ class RerunStream:
             first = str(error).splitlines()[0]
             raise DataError(f"cannot serve to browsers ({first}); use --rerun save") from error
         self.url = f"http://localhost:{port}/?url={source.replace('+', '%2B')}"
+
+
+def _rerun() -> Any:
+    """The module `rerun`; what it logs is settled when it is first imported."""
+    given = os.environ.get("RUST_LOG")
+    if given is None:
+        os.environ["RUST_LOG"] = _QUIET
+    try:
+        import rerun
+    finally:
+        if given is None:
+            del os.environ["RUST_LOG"]
+    return rerun
 
 
 def has_display() -> bool:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import defaultdict, deque
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.sensors import CameraFrame, FeatureFrame
 
 Picture = NDArray[np.uint8]
@@ -90,6 +92,7 @@ class TrackPictures:
         self._picture, self._middle_ns, self._video = picture, middle_ns, video
         self._saved = False
         self._writer: cv2.VideoWriter | None = None
+        self._filmed = 0
 
     def __enter__(self) -> Self:
         return self
@@ -100,8 +103,18 @@ class TrackPictures:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._writer is not None:
-            self._writer.release()
+        if self._writer is None or self._video is None:
+            return
+        self._writer.release()
+        try:
+            if kind is not None:
+                return
+            if _frames_in(self._partial) != self._filmed:  # OpenCV does not say if a disk is full
+                raise DataError(f"{self._video}: cannot be written; is the disk full?")
+            with Files.writing(self._video):
+                self._partial.replace(self._video)
+        finally:
+            shutil.rmtree(self._partial.parent, ignore_errors=True)
 
     def show(self, frame: CameraFrame, features: FeatureFrame) -> None:
         """Draw the next frame.
@@ -119,13 +132,24 @@ class TrackPictures:
     def _film(self, path: Path, drawn: Picture) -> None:
         """Append a picture to the video."""
         if self._writer is None:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            self._partial = Files.partial_folder(path) / path.name
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (drawn.shape[1], drawn.shape[0])
-            self._writer = cv2.VideoWriter(str(path), code, _FRAMES_PER_S, size)
+            self._writer = cv2.VideoWriter(str(self._partial), code, _FRAMES_PER_S, size)
             if not self._writer.isOpened():
+                shutil.rmtree(self._partial.parent, ignore_errors=True)
+                self._writer = None
                 raise DataError(f"{path}: cannot be written as a video; use .mp4")
         self._writer.write(drawn)
+        self._filmed += 1
+
+
+def _frames_in(path: Path) -> int:
+    """How many frames a video says that it has; 0 if it cannot be read."""
+    video = cv2.VideoCapture(str(path))
+    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
+    video.release()
+    return count
 
 
 def _save(path: Path, picture: Picture) -> None:
@@ -134,14 +158,12 @@ def _save(path: Path, picture: Picture) -> None:
     Raises:
         DataError: if it cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    Files.make_folder(path.parent)
     good, data = cv2.imencode(".png", picture)
     if not good:
         raise DataError(f"{path}: the picture cannot be encoded")
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}") from error
+    with Files.appearing(path) as partial:
+        partial.write_bytes(data.tobytes())
 
 
 def _padded(picture: Picture, height: int) -> Picture:

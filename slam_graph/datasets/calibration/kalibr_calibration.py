@@ -11,7 +11,6 @@ same file under ``imu0``, so that one file describes the rig.
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from slam_graph.datasets.calibration.euroc_calibration import (
     with_shutter,
 )
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.sensors import ImuNoise, Rig, RigCamera
 
 _IMU_KEY = "imu0"
@@ -150,11 +150,12 @@ def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise 
 
 
 def write_kalibr(rig: Rig, path: str | Path) -> None:
-    """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(kalibr_text(rig))
-    partial.replace(path)
+    """Write a rig so that `read_kalibr` gives it back to 1e-12; whole or not at all.
+
+    Raises:
+        DataError: if it cannot be written.
+    """
+    Files.write_text(Path(path), [kalibr_text(rig)])
 
 
 def kalibr_text(rig: Rig) -> str:

@@ -8,10 +8,9 @@ A folder appears when it is complete; an interrupted one leaves nothing behind.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from tempfile import mkdtemp
 from types import TracebackType
 from typing import Self, TextIO
 
@@ -25,6 +24,7 @@ from slam_graph.datasets.calibration.euroc_calibration import camera_entry, shut
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import CameraFrame, ImuData, ImuNoise, Rig, RigCamera
 
@@ -61,6 +61,7 @@ class EurocWriter:
         rate_hz: of the cameras.
         force: replace an existing EuRoC folder, which is kept until the new one is complete.
         with_imu: whether there will be samples of an IMU.
+        notes: texts to store with it, by the names of their files.
 
     Raises:
         DataError: if the folder exists already, or cannot be written.
@@ -75,11 +76,13 @@ class EurocWriter:
         rate_hz: float,
         force: bool = False,
         with_imu: bool = True,
+        notes: Mapping[str, str] | None = None,
     ) -> None:
         self.refuse_existing(path, force)
         self._with_imu = with_imu
         self._path, self._rig, self._truth = path, rig, truth
         self._comment, self._rate_hz = comment, rate_hz
+        self._notes = dict(notes or {})
         self._files = ExitStack()
 
     @staticmethod
@@ -97,11 +100,17 @@ class EurocWriter:
             raise DataError(f"{path}: {what}; remove it or write to another folder")
 
     def __enter__(self) -> Self:
+        self._folder = Files.partial_folder(self._path)
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = Path(mkdtemp(prefix=f".{self._path.name[:40]}.", dir=self._path.parent))
-        except OSError as error:
-            raise DataError(f"{self._path}: cannot be written ({error.strerror})") from None
+            with Files.writing(self._path):
+                self._begin()
+        except BaseException as error:
+            self.__exit__(type(error), error, None)
+            raise
+        return self
+
+    def _begin(self) -> None:
+        """Write what is known before the first measurement."""
         mav0 = self._folder / "mav0"
         self._indices = [
             self._open(mav0 / f"cam{k}", _CAMERA_COLUMNS, _camera_values(mounted, self._rate_hz))
@@ -117,7 +126,6 @@ class EurocWriter:
             columns = ",".join(_TRUTH_COLUMNS.split(",")[: rows.shape[1] + 1])
             file = self._open(mav0 / _TRUTH_FOLDER, columns, {})
             _write_rows(file, self._truth.stamps_ns, rows)
-        return self
 
     def __exit__(
         self,
@@ -125,18 +133,25 @@ class EurocWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._files.close()
         try:
-            if kind is None:
-                write_kalibr(self._rig, self._folder / CALIBRATION)
-                self._folder.chmod(0o755)
-                self._appear()
+            with Files.writing(self._path):  # what is buffered is written when a file is closed
+                self._files.close()
+                if kind is None:
+                    write_kalibr(self._rig, self._folder / CALIBRATION)
+                    for name, text in self._notes.items():
+                        (self._folder / name).write_text(text, encoding="utf-8")
+                    self._folder.chmod(0o755)
+                    self._appear()
+        except DataError:
+            if kind is None:  # else the first error is the one to tell
+                raise
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def write_imu(self, imu: ImuData) -> None:
         """The next samples."""
-        _write_rows(self._imu, imu.stamps_ns, np.column_stack([imu.gyro, imu.accel]))
+        with Files.writing(self._path):
+            _write_rows(self._imu, imu.stamps_ns, np.column_stack([imu.gyro, imu.accel]))
 
     def write_frame(self, frame: CameraFrame) -> None:
         """The next frame; a camera without an image is left out of it."""
@@ -144,9 +159,12 @@ class EurocWriter:
         for index, folder, image in zip(self._indices, self._images, frame.images, strict=True):
             if image is None:
                 continue
-            if not cv2.imwrite(str(folder / name), image):
-                raise DataError(f"{folder / name}: cannot be written; is the disk full?")
-            index.write(f"{frame.stamp_ns},{name}\n")
+            good, data = cv2.imencode(".png", image)
+            if not good:
+                raise DataError(f"{self._path}: the image at {frame.stamp_ns} cannot be encoded")
+            with Files.writing(self._path):  # `imwrite` does not say if the disk is full
+                (folder / name).write_bytes(data.tobytes())
+                index.write(f"{frame.stamp_ns},{name}\n")
 
     @staticmethod
     def convert(

@@ -20,6 +20,9 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import Camera
 
+_LARGEST = 1e6
+"""Pixels, metres and focal lengths are smaller."""
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFile:
@@ -32,14 +35,18 @@ class CalibrationFile:
         """(count,) numbers of a line.
 
         Raises:
-            DataError: if the line is missing or has another number of numbers.
+            DataError: if the line is missing, has another number of numbers, or one that is not
+                finite or too large.
         """
         if key not in self.values:
             raise DataError(f"{self.path}: missing line '{key}:'")
         if len(self.values[key]) != count:
             got = len(self.values[key])
             raise DataError(f"{self.path}: line '{key}:' has {got} numbers instead of {count}")
-        return np.array(self.values[key])
+        numbers = np.array(self.values[key])
+        if not (np.abs(numbers) < _LARGEST).all():  # nor NaN
+            raise DataError(f"{self.path}: line '{key}:' has numbers that cannot be true")
+        return numbers
 
     def pose(self) -> gtsam.Pose3:
         """The transformation in the lines ``R`` and ``T``: p_to = R p_from + T."""
@@ -69,18 +76,26 @@ def read_calibration(path: Path) -> CalibrationFile:
     return CalibrationFile(path, values)
 
 
-def rectified_camera(projection: FloatArray, width: int, height: int) -> tuple[Camera, gtsam.Pose3]:
+def rectified_camera(
+    projection: FloatArray, width: int, height: int, where: str
+) -> tuple[Camera, gtsam.Pose3]:
     """A rectified camera from its projection matrix.
 
     Args:
         projection: (3, 4) K [I | t], which projects from the frame of the rectified camera 0.
         width: of the rectified images in pixels.
         height: of the rectified images in pixels.
+        where: the matrix stands, for the error.
 
     Returns:
         The camera, and camera_T_camera0.
+
+    Raises:
+        DataError: if there is no such camera.
     """
     K = projection[:, :3]
+    if min(width, height, K[0, 0], K[1, 1], K[2, 2]) <= 0 or np.any(np.tril(K, -1)):
+        raise DataError(f"{where}: not the projection of a rectified camera with a size")
     camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "none", (), width, height)
     return camera, gtsam.Pose3(gtsam.Rot3(), np.linalg.solve(K, projection[:, 3]))
 
@@ -100,10 +115,12 @@ def read_dates(path: Path) -> NDArray[np.int64]:
             try:
                 seconds = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
                 nanoseconds = int(fraction[:9].ljust(9, "0"))
-            except ValueError:
+                stamp_ns = int(seconds.timestamp()) * 10**9 + nanoseconds
+                np.int64(stamp_ns)  # it ends in 2262
+            except (ValueError, OverflowError):
                 text = line.strip()[:60]
                 raise DataError(f"{rows.where(k)}: '{text}' is not a date and time") from None
-            stamps.append(int(seconds.timestamp()) * 10**9 + nanoseconds)
+            stamps.append(stamp_ns)
     if not stamps:
         raise DataError(f"{path}: no time stamps in this file")
     return np.array(stamps, np.int64)

@@ -118,7 +118,9 @@ def _read_rig(path: Path, streams: list[FileImages]) -> Rig:
             raise DataError(first.message)
         height, width = first.shape
         projection = file.numbers(f"P{k}", 12).reshape(3, 4)
-        camera, camera_T_camera0 = rectified_camera(projection, width, height)
+        camera, camera_T_camera0 = rectified_camera(
+            projection, width, height, f"{file.path}: line 'P{k}:'"
+        )
         mounted.append(RigCamera(camera, camera_T_camera0.inverse(), 0.0, stream.name))
     if not mounted[0].body_T_camera.equals(gtsam.Pose3(), 1e-6):
         raise DataError(f"{file.path}: P0 is expected to be the reference camera")

@@ -261,7 +261,8 @@ def _read_rig(day: Path, count: int, noise: ImuNoise) -> Rig:
     mounted = []
     for name in GREY[:count]:
         projection = between.numbers(f"P_rect_{name}", 12).reshape(3, 4)
-        camera, camera_T_rectified = rectified_camera(projection, *_size(between, f"S_rect_{name}"))
+        size, where = _size(between, f"S_rect_{name}"), f"{between.path}: line 'P_rect_{name}:'"
+        camera, camera_T_rectified = rectified_camera(projection, *size, where)
         body_T_camera = camera_T_rectified.compose(rectified_T_imu).inverse()
         mounted.append(RigCamera(camera, body_T_camera, 0.0, f"image_{name}"))
     return Rig(tuple(mounted), noise)

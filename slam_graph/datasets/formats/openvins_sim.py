@@ -116,7 +116,7 @@ def _read_start(path: Path) -> NavState:
         velocity=states.velocities[0],
         gyro_bias=states.gyro_biases[0],
         accel_bias=states.accel_biases[0],
-        covariance=_prior_covariance(path.read_text(encoding="utf-8")),
+        covariance=_prior_covariance(path.read_text(encoding="utf-8", errors="replace")),
     )
 
 

@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from tempfile import mkdtemp
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
 
@@ -34,9 +35,10 @@ class TrackRecorder:
         name: of the recording; that of the folder if None.
         groundtruth: true trajectory to store with it.
         initial_state: known state at the start to store with it.
+        notes: texts to store with it, by the names of their files.
 
     Raises:
-        DataError: if the folder exists already.
+        DataError: if the folder exists already, or cannot be written (a full disk, no permission).
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class TrackRecorder:
         name: str | None = None,
         groundtruth: Trajectory | None = None,
         initial_state: NavState | None = None,
+        notes: Mapping[str, str] | None = None,
     ) -> None:
         path = Path(path)
         if path.exists():
@@ -55,18 +58,23 @@ class TrackRecorder:
         self.name = name if name is not None else path.name
         self._groundtruth = groundtruth
         self._initial_state = initial_state
+        self._notes = dict(notes or {})
         self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
         self._latest_ns: int | None = None
         self._descriptor_bytes: int | None = None
         self._record = layout.frame_record(len(rig.cameras))
 
     def __enter__(self) -> Self:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._folder = Path(mkdtemp(prefix=f".{self.path.name[:40]}.", dir=self.path.parent))
+        self._folder = Files.partial_folder(self.path)
         self._files = ExitStack()
-        self._frames = self._open(layout.FRAMES)
-        self._features = self._open(layout.FEATURES)
-        self._imu = self._open(layout.IMU)
+        try:
+            with Files.writing(self.path):
+                self._frames = self._open(layout.FRAMES)
+                self._features = self._open(layout.FEATURES)
+                self._imu = self._open(layout.IMU)
+        except BaseException as error:
+            self.__exit__(type(error), error, None)
+            raise
         return self
 
     def __exit__(
@@ -75,10 +83,14 @@ class TrackRecorder:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._files.close()
         try:
-            if kind is None:
-                self._finish()
+            with Files.writing(self.path):  # what is buffered is written when a file is closed
+                self._files.close()
+                if kind is None:
+                    self._finish()
+        except DataError:
+            if kind is None:  # else the first error is the one to tell
+                raise
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -90,7 +102,8 @@ class TrackRecorder:
             frame: the features found at a time later than that of the frame before.
 
         Raises:
-            DataError: if the frame is not later, or has another number of cameras than the rig.
+            DataError: if the frame is not later, has another number of cameras than the rig, or
+                cannot be written.
         """
         if len(frame.cameras) != len(self.rig.cameras):
             raise DataError(
@@ -102,6 +115,10 @@ class TrackRecorder:
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
+        with Files.writing(self.path):
+            self._append(imu, frame)
+
+    def _append(self, imu: ImuData, frame: FeatureFrame) -> None:
         self._write_descriptors(frame.cameras[0])
         self._latest_ns = frame.stamp_ns
         samples = np.empty(len(imu), layout.IMU_RECORD)
@@ -153,6 +170,8 @@ class TrackRecorder:
         if self._initial_state is not None:
             layout.save_state(self._folder / layout.INITIAL_STATE, self._initial_state)
         (self._folder / layout.META).write_text(yaml.safe_dump(meta, sort_keys=False))
+        for name, text in self._notes.items():
+            (self._folder / name).write_text(text, encoding="utf-8")
         self._folder.chmod(0o755)
         self._folder.rename(self.path)
 

@@ -7,15 +7,21 @@ from __future__ import annotations
 import bz2
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any
+from os import fstat
+from types import SimpleNamespace
+from typing import Any, BinaryIO, Self
 
 import lz4.frame
 from rosbags.rosbag1 import reader as ros1
+from rosbags.rosbag2 import reader as ros2
 from rosbags.rosbag2 import storage_mcap as mcap
 
 _RATIO = 50
 _LEAST = 2**26
-"""A chunk may unpack to so many times its size, and so many bytes more. Chunks have 1 to 10 MB."""
+"""A chunk may unpack to so many times its size, and so many bytes more. Chunks have 1 to 10 MB.
+So may a whole file of ROS 2 (`.db3.zstd`), which is unpacked to the disk."""
+
+zstd: Any = ros2.zstd  # type: ignore[attr-defined]
 
 
 @cache
@@ -24,7 +30,43 @@ def bound_unpacking() -> None:
     ros1.decompressors["bz2"] = partial(_unpacked, bz2.BZ2Decompressor)
     ros1.decompressors["lz4"] = partial(_unpacked, lz4.frame.LZ4FrameDecompressor)
     mcap.DECOMPRESSORS["lz4"] = _of_size(lz4.frame.LZ4FrameDecompressor)
-    mcap.DECOMPRESSORS["zstd"] = _of_size(mcap.zstd.ZstdDecompressor)  # type: ignore[attr-defined]
+    mcap.DECOMPRESSORS["zstd"] = _of_size(zstd.ZstdDecompressor)
+    bounded = SimpleNamespace(
+        open=_BoundedFile, decompress=partial(_unpacked, zstd.ZstdDecompressor)
+    )
+    setattr(ros2, "zstd", bounded)  # noqa: B010 - mypy takes it for a module
+
+
+class _BoundedFile:
+    """A compressed file that is read up to the bound; a context manager.
+
+    Args:
+        file: with the compressed content.
+        mode: to read bytes.
+    """
+
+    def __init__(self, file: BinaryIO, mode: str) -> None:
+        self._packed = fstat(file.fileno()).st_size
+        self._left = _RATIO * self._packed + _LEAST
+        self._file = zstd.open(file, mode)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, size: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            ValueError: if they are more than the bound.
+        """
+        part = bytes(self._file.read(size))
+        self._left -= len(part)
+        if self._left < 0:
+            raise ValueError(f"a file of {self._packed} bytes unpacks to more than its bound")
+        return part
 
 
 def _of_size(unpacker: Callable[[], Any]) -> Callable[[bytes, int], bytes]:

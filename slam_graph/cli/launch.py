@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Starts the command line: Ctrl-C before and after the work ends it without a word.
+
+Nothing has been written then, or all of it. In between `slam_graph.cli.main` decides.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType
+
+_INTERRUPTED = 130
+
+
+def _leave(signum: int, frame: FrameType | None) -> None:
+    os._exit(_INTERRUPTED)  # an exception could not be raised in the middle of an import
+
+
+def main() -> None:
+    """Import the commands, and run the one that is asked for."""
+    heard = signal.getsignal(signal.SIGINT) != signal.SIG_IGN  # of a job in the background
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if heard or number == signal.SIGTERM:
+            signal.signal(number, _leave)
+    from slam_graph.cli.main import run_command
+
+    if heard:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    code = run_command()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # all is written: what ends now is the interpreter
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()
