@@ -87,8 +87,9 @@ class Recovery:
         """
         if not self._recent or not self._estimator.initialized:
             return
-        known_ns = [self._recent[-1].stamp_ns, *imu.stamps_ns.tolist(), stamp_ns]
-        blind_s = float(np.max(np.diff(np.sort(known_ns)))) * 1e-9
+        last_ns, stamps = self._recent[-1].stamp_ns, imu.stamps_ns
+        between = stamps[(stamps > last_ns) & (stamps < stamp_ns)]  # they may lead beyond the frame
+        blind_s = float(np.max(np.diff([last_ns, *between.tolist(), stamp_ns]))) * 1e-9
         if blind_s > _LONGEST_BLIND_S:
             message = f"lost at frame {stamp_ns}: nothing was recorded for {blind_s:.1f} s"
             raise DivergenceError(message)
