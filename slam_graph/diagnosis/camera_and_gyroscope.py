@@ -116,7 +116,8 @@ def _replace_imu(now: CameraAndGyroscope, gyro_map: FloatArray) -> None:
 def _unit(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> Turning:
     """Correct the unit of the gyroscope."""
     factor = turning.factor
-    if _SAME_RATE[0] < factor < _SAME_RATE[1] or turning.misfit > _FITS:
+    same = _SAME_RATE[0] < factor < _SAME_RATE[1]
+    if same or factor <= 0.0 or turning.misfit > _FITS:
         return turning
     what = f"the gyroscope turns {factor:.3g} times as fast as the camera"
     fix = f"divide the angular rates by {factor:.4g} to have rad/s"
@@ -182,8 +183,9 @@ def _solved(
 def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Findings of a fit; what is wrong is corrected in the rig."""
     sigma = dict(zip(UNKNOWNS, fit.sigmas.tolist(), strict=True))
-    turned = _judge_mounting(now, fit, max(sigma["rx"], sigma["ry"], sigma["rz"]))
-    readout = _judge_readout(now, fit, sigma["readout"])
+    before = len(now.findings)
+    _judge_mounting(now, fit, max(sigma["rx"], sigma["ry"], sigma["rz"]))
+    _judge_readout(now, fit, sigma["readout"])
     camera = now.rig.cameras[0]
     change_s = fit.values.offset_s - camera.clock_offset_s
     if abs(change_s) > max(_OFFSET_S, _SIGMAS * sigma["offset"]):
@@ -204,20 +206,22 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
             )
         )
     _judge_focal(now, fit, sigma["focal"])
-    if not (turned or readout):
+    if len(now.findings) == before:
         text = (
-            f"camera and gyroscope agree: clocks to {1e3 * abs(change_s):.1f} ms, focal length to "
-            f"{abs(fit.values.focal - 1):.1%}, epipolar distances of {fit.noise_px:.2f} px"
+            "camera and gyroscope agree: clocks differ by "
+            f"{1e3 * change_s:.1f} ± {1e3 * sigma['offset']:.1f} ms, the focal length by "
+            f"{fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; epipolar distances are "
+            f"{fit.noise_px:.2f} px"
         )
         now.findings.append(Finding("camera_and_gyroscope", "info", text))
 
 
-def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> bool:
+def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
     """Whether the calibrated rotation is wrong; it is corrected then."""
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
     away = float(Rotation.from_matrix(R.T @ fit.values.body_R_camera).magnitude())
     if away < max(_TURN_RAD, _SIGMAS * sigma):
-        return False
+        return
     named = explained(fit.values.body_R_camera, R)
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < _TURNED_RAD:
         named = Explanation("other", "", 0.0, np.eye(3))
@@ -229,7 +233,6 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> 
         pose = pose.inverse() if named.kind == "inverse" else gtsam.Pose3(turn, np.zeros(3)) * pose
         cameras.append(replace(mounted, body_T_camera=pose))
     now.rig = Rig(tuple(cameras), now.rig.imu)
-    return True
 
 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
@@ -248,12 +251,12 @@ def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: flo
     return Finding.measured("mounting", severity, what, fix, away / sigma, values)  # type: ignore[arg-type]
 
 
-def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> bool:
+def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
     """Whether rows are exposed one after the other, and the calibration does not say so."""
     camera = now.rig.cameras[0]
     change = fit.values.readout_s - camera.readout_s
     if abs(change) < max(_READOUT_S, _SIGMAS * sigma):
-        return False
+        return
     value = fit.values.readout_s
     what = (
         f"the shutter rolls: rows are read in {1e3 * value:.1f} ± {1e3 * sigma:.1f} ms, and the "
@@ -266,7 +269,6 @@ def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> b
     )
     cameras = tuple(replace(c, readout_s=value, rolling_shutter=True) for c in now.rig.cameras)
     now.rig = Rig(cameras, now.rig.imu)
-    return True
 
 
 def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -20,9 +20,8 @@ from slam_graph.diagnosis.stereo_geometry import check_stereo
 from slam_graph.diagnosis.stereo_matching import StereoMatches
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
-_FEWEST_SAMPLES = 50
-_SUGGESTED = 1_000_000_000
-"""A guess from a run looks at tracks of at least this long."""
+_FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
+"""Samples and frames that a comparison needs at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +117,7 @@ def _judged(material: Material) -> list[Finding]:
     counts = [len(f.cameras[0]) for part in material.parts for f in part.frames if f.cameras]
     found += check_tracks(counts)
     parts = [_in_si(part, factor) for part in material.parts]
-    parts = [part for part in parts if len(part.imu) >= _FEWEST_SAMPLES and len(part.frames) > 1]
+    parts = [part for part in parts if len(part.imu) >= _FEWEST_SAMPLES and len(part.frames) > _FEWEST_FRAMES]
     if not parts:
         return found + check_stereo(material.stereo, material.rig)
     now = compare(material.rig, parts)
@@ -131,6 +130,11 @@ def _judged(material: Material) -> list[Finding]:
 
 
 def _in_si(part: Part, factor: float) -> Part:
+    """A part with forces in m/s², samples that are finite, and the frames that they cover."""
     imu = part.imu
     good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
-    return replace(part, imu=ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good]))
+    imu = ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good])
+    if not len(imu):
+        return Part([], imu)
+    first_ns, last_ns = imu.stamps_ns[0], imu.stamps_ns[-1]
+    return Part([f for f in part.frames if first_ns <= f.stamp_ns <= last_ns], imu)

@@ -17,14 +17,16 @@ from slam_graph.diagnosis.rotation_fit import RotationFit
 from slam_graph.sensors import FeatureFrame, Rig
 
 _WINDOW_S, _SPACING_S = 3.0, 0.14
-_WINDOWS = 5
+_WINDOWS = 6
 """Most windows: those with the liveliest motion."""
 _FEWEST_FEATURES = 10
-_LEAST_VARIATION = 0.35
+_LEAST_VARIATION = 0.25
 """Standard deviation of the specific force in the world, m/s², of a window that shows something."""
+_QUICK = 3
+"""Windows by which all axes are compared at first."""
 _COMPARED = 4
 """So many of the best axes are compared by a full solution."""
-_CLEARER = 1.35
+_CLEARER = 1.12
 """Residuals with the axes as they are must be so many times those with others …"""
 _BEHIND = 0.2
 """… or at most such a share of the observations in front of the camera."""
@@ -90,10 +92,8 @@ def _thinned(frames: list[FeatureFrame]) -> list[FeatureFrame]:
 def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     """How the accelerometer's axes should be read (3, 3), and a finding if not as they are."""
     nominal = [window.solve(np.eye(3)) for window in windows]
-    candidates = [
-        sign * P for d in (1, -1) for P in signed_permutations(d) for sign in (1.0,)
-    ]
-    quick = {k: _score(windows, P, 0) for k, P in enumerate(candidates)}
+    candidates = [P for handed in (1, -1) for P in signed_permutations(handed)]
+    quick = {k: _score(windows[:_QUICK], P, 0) for k, P in enumerate(candidates)}
     best = sorted(quick, key=lambda k: quick[k])[:_COMPARED]
     scores = [(_score(windows, candidates[k], 8), k) for k in best]
     score, k = min(scores)

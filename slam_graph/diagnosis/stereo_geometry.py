@@ -195,9 +195,9 @@ def _cause(
     distances = [pair.judged(relative, float(k))[0] for k in _FOCAL_STEPS]
     k = int(np.argmin(distances))
     if not _worse(distances[k], best_px) and abs(_FOCAL_STEPS[k] - 1.0) > 0.02:
-        focal = pair._rig.cameras[1].camera.fx * _FOCAL_STEPS[k]
-        what = f"the focal length of cam1 is not {_FOCAL_STEPS[k] ** -1:.2f} times {focal:.1f} px"
-        return f"{what} but that", f"set fx of cam1 to about {focal:.1f} px, fy likewise"
+        factor = float(_FOCAL_STEPS[k])
+        what = f"the focal length of cam1 is {1 / factor:.2f} times what fits cam0"
+        return what, f"multiply fx and fy of cam1 by {factor:.2f}, or calibrate the lens again"
     if best is None:
         return "no geometry fits the matches", "calibrate the cameras again"
     turn = (best.rotation().inverse() * relative.rotation()).matrix()

@@ -139,7 +139,7 @@ def _best(
             else:
                 turn = Q
             along = np.sum(weights[:, None] * two * (one @ turn.T))
-            factor = float(along / max(np.sum(weights[:, None] * one**2), 1e-12))
+            factor = max(float(along / max(np.sum(weights[:, None] * one**2), 1e-12)), 0.0)
             rest = np.linalg.norm(two - factor * one @ turn.T, axis=1)
             scale = max(float(np.median(rest)), 1e-9)
             weights = 1.0 / (1.0 + (rest / (1.5 * scale)) ** 2)
