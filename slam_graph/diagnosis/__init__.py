@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a recording? Findings about sensors, calibration, clocks and images.
 
-    import slam_graph as sg
-    from slam_graph.diagnosis import Diagnosis
+import slam_graph as sg
+from slam_graph.diagnosis import Diagnosis
 
-    for finding in Diagnosis.of(sg.open_dataset("demo")).faults:
-        print(finding.what, finding.fix)
+for finding in Diagnosis.of(sg.open_dataset("demo")).faults:
+    print(finding.what, finding.fix)
 """
 
 from typing import TYPE_CHECKING

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.diagnosis.frame_pairs import FramePair, frame_pairs
 from slam_graph.diagnosis.gathering import Part
 from slam_graph.diagnosis.gyroscope import Gyroscope
@@ -26,7 +26,11 @@ from slam_graph.sensors import ImuData, Rig
 _SAME_RATE = (0.55, 1.8)
 """Camera and gyroscope turn equally fast within these; focal lengths may be wrong, too."""
 _DEGREES = 57.29578
-_RATE_UNITS = {"degrees/s": _DEGREES, "mrad/s": 1e3, "rad/s where degrees/s were expected": 1 / _DEGREES}
+_RATE_UNITS = {
+    "degrees/s": _DEGREES,
+    "mrad/s": 1e3,
+    "rad/s where degrees/s were expected": 1 / _DEGREES,
+}
 _UNIT_RATIO = 1.5
 """A factor on the rate is of a unit if it is so near."""
 _BETTER = 2.0
@@ -123,7 +127,10 @@ def _unit(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> 
     fix = f"divide the angular rates by {factor:.4g} to have rad/s"
     for unit, ratio in _RATE_UNITS.items():
         if 1 / _UNIT_RATIO < factor / ratio < _UNIT_RATIO:
-            what, fix = f"{what}: its unit is {unit}", f"multiply the angular rates by {1 / ratio:g}"
+            what, fix = (
+                f"{what}: its unit is {unit}",
+                f"multiply the angular rates by {1 / ratio:g}",
+            )
             factor = ratio
     values = {"factor": turning.factor}
     sigmas = 1.0 / max(turning.misfit, 1e-3) * np.sqrt(len(pairs))
@@ -191,18 +198,24 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     if abs(change_s) > max(_OFFSET_S, _SIGMAS * sigma["offset"]):
         value = camera.time_offset_s + change_s
         what = (
-            f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± {1e3 * sigma['offset']:.1f}"
-            f" ms, and the calibration says {1e3 * camera.time_offset_s:.1f} ms"
+            f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± "
+            f"{1e3 * sigma['offset']:.1f} ms, "
+            f"and the calibration says {1e3 * camera.time_offset_s:.1f} ms"
         )
         fix = (
             f"timeshift_cam_imu: {value:.4f} in the calibration, or "
             "--set backend.calibration.time_offset=true"
         )
-        severity = "error" if abs(change_s) > _BAD_OFFSET_S else "warning"
+        severity = graded(abs(change_s) > _BAD_OFFSET_S)
         values = {"time_offset_s": value, "sigma_s": sigma["offset"]}
         now.findings.append(
             Finding.measured(
-                "time_offset", severity, what, fix, abs(change_s) / sigma["offset"], values  # type: ignore[arg-type]
+                "time_offset",
+                severity,
+                what,
+                fix,
+                abs(change_s) / sigma["offset"],
+                values,
             )
         )
     _judge_focal(now, fit, sigma["focal"])
@@ -238,7 +251,9 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
     degrees = np.rad2deg(away)
     values = {"degrees": degrees, "explanation": named.kind, "body_R_camera": R.tolist()}
-    what = f"the camera is turned by {degrees:.1f}° ± {np.rad2deg(sigma):.1f}° against its calibration"
+    what = (
+        f"the camera is turned by {degrees:.1f}° ± {np.rad2deg(sigma):.1f}° against its calibration"
+    )
     rows = " ".join(np.array2string(R.T, precision=4, separator=", ").split())
     fix = f"T_cam_imu: unknown in the calibration, or its rotation: {rows}"
     if named.kind == "inverse":
@@ -247,8 +262,8 @@ def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: flo
     elif named.kind == "axes":
         what = f"{what}: {named.what}"
         fix = f"write the IMU's (x, y, z) as {axes_text(named.axes)}, or {fix}"
-    severity = "error" if away > _BAD_TURN_RAD else "warning"
-    return Finding.measured("mounting", severity, what, fix, away / sigma, values)  # type: ignore[arg-type]
+    severity = graded(away > _BAD_TURN_RAD)
+    return Finding.measured("mounting", severity, what, fix, away / sigma, values)
 
 
 def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
@@ -279,14 +294,17 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
         return
     camera = now.rig.cameras[0].camera
     what = (
-        f"the calibrated focal length is {1 / factor:.3f} ± {sigma:.3f} times the one that fits the "
-        "gyroscope"
+        f"the calibrated focal length is {1 / factor:.3f} ± {sigma:.3f} times the one that fits "
+        "the gyroscope"
     )
-    fix = f"fx: {camera.fx * factor:.1f}, fy: {camera.fy * factor:.1f} of cam0; calibrate the lens again"
-    severity = "error" if change > _BAD_FOCAL else "warning"
+    fix = (
+        f"fx: {camera.fx * factor:.1f}, fy: {camera.fy * factor:.1f} of cam0; "
+        "or calibrate the lens again"
+    )
+    severity = graded(change > _BAD_FOCAL)
     values = {"factor": 1 / factor, "fx": camera.fx * factor}
     now.findings.append(
-        Finding.measured("focal_length", severity, what, fix, change / sigma, values)  # type: ignore[arg-type]
+        Finding.measured("focal_length", severity, what, fix, change / sigma, values)
     )
     now.rig = scaled_lenses(now.rig, factor)
 

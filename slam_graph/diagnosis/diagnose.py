@@ -117,7 +117,11 @@ def _judged(material: Material) -> list[Finding]:
     counts = [len(f.cameras[0]) for part in material.parts for f in part.frames if f.cameras]
     found += check_tracks(counts)
     parts = [_in_si(part, factor) for part in material.parts]
-    parts = [part for part in parts if len(part.imu) >= _FEWEST_SAMPLES and len(part.frames) > _FEWEST_FRAMES]
+    parts = [
+        part
+        for part in parts
+        if len(part.imu) >= _FEWEST_SAMPLES and len(part.frames) > _FEWEST_FRAMES
+    ]
     if not parts:
         return found + check_stereo(material.stereo, material.rig)
     now = compare(material.rig, parts)

@@ -52,6 +52,11 @@ class Finding:
         return Finding(kind, severity, what, fix, sureness(sigmas), sigmas, values or {})
 
 
+def graded(bad: bool) -> Severity:
+    """An error if it is bad, else a warning."""
+    return "error" if bad else "warning"
+
+
 def sureness(sigmas: float) -> Sureness:
     """How sure a difference of so many standard deviations is."""
     if sigmas >= _CERTAIN_SIGMAS:

@@ -7,12 +7,12 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.diagnosis.image_quality import ImageFigures, ImageSurvey
 
 _PAUSE_PERIODS, _JITTER, _PAUSED = 3.0, 0.25, 0.05
-"""A pause is so many periods; stamps may scatter by such a part of one; and pauses that take up such
-a share of the time are a warning."""
+"""A pause is so many periods; stamps may scatter by such a part of one; and pauses that take up
+such a share of the time are a warning."""
 _BLANK_STD = 4.0
 """Standard deviation of the grey levels of a blank image."""
 _BRIGHT, _BRIGHT_MEAN = 0.3, 200.0
@@ -72,12 +72,10 @@ def check_images(survey: ImageSurvey) -> list[Finding]:
             bad = [f for f in figures if seen(f)]
             share = len(bad) / total
             if share > _SOME and len(bad) > 1:
-                severity = "error" if share > _MANY else "warning"
+                severity = graded(share > _MANY)
                 text = f"{share:.0%} of the images of camera {c} {what}, first at {bad[0].stamp_ns}"
                 values = {"camera": c, "share": share}
-                found.append(
-                    Finding(kind, severity, text, fix, values=values)  # type: ignore[arg-type]
-                )
+                found.append(Finding(kind, severity, text, fix, values=values))
     return found
 
 
@@ -86,7 +84,7 @@ def _missing(camera: int, missing: int, total: int) -> list[Finding]:
         return []
     text = f"camera {camera} has no usable image in {missing / total:.0%} of the frames"
     fix = "look for lost or damaged files: `slam-graph data check --images`"
-    return [Finding("images_missing", "error" if missing > _MANY * total else "warning", text, fix)]
+    return [Finding("images_missing", graded(missing > _MANY * total), text, fix)]
 
 
 def _blank(f: ImageFigures) -> bool:

@@ -46,7 +46,9 @@ class FramePair:
     turn: FloatArray | None
 
 
-def frame_pairs(parts: list[Part], gyroscopes: list[Gyroscope], camera: RigCamera) -> list[FramePair]:
+def frame_pairs(
+    parts: list[Part], gyroscopes: list[Gyroscope], camera: RigCamera
+) -> list[FramePair]:
     """Pairs that follow one another, over all parts; where there are many, every n-th."""
     chosen = []
     for number, part in enumerate(parts):

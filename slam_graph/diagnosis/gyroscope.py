@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The integrated gyroscope of a part of a recording: orientation and inertial motion at any time."""
+"""The integrated gyroscope of a part of a recording: its orientation at any time."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors import ImuData
 
 
@@ -37,9 +37,9 @@ class Gyroscope:
             R[k + 1] = R[k] @ step
         self.R = R
 
-    def seconds(self, stamps_ns: FloatArray) -> FloatArray:
+    def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Times (...) of stamps (...) on the clock of the IMU."""
-        return np.asarray((np.asarray(stamps_ns) - self.start_ns) * 1e-9)
+        return np.asarray((stamps_ns - self.start_ns) * 1e-9)
 
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (K, 3, 3) at times (K,)."""

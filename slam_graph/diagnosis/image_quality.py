@@ -76,7 +76,7 @@ def _figures(stamp_ns: int, image: NDArray[np.uint8], repeated: bool) -> ImageFi
     share = counts / image.size
     levels = np.arange(256)
     mean = float(share @ levels)
-    std = float(np.sqrt(max(share @ (levels - mean) ** 2, 0.0)))
+    std = float(np.sqrt(np.sum(share * (levels - mean) ** 2)))
     bright, dark = float(share[_SATURATED:].sum()), float(share[: _BLACK + 1].sum())
     return ImageFigures(stamp_ns, mean, std, bright, dark, _blur(image), repeated)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.sensors import ImuData, ImuNoise
 
 GRAVITY = 9.81
@@ -38,12 +38,16 @@ def check_units(imu: ImuData) -> tuple[list[Finding], float]:
     if _fits(force, GRAVITY) and mean > _WITHOUT_GRAVITY * force:
         return _scale(mean, values), 1.0
     if mean < _WITHOUT_GRAVITY * force or force < 0.05:
-        what = f"the accelerometer does not feel gravity: {mean:.2g} in the mean, {force:.2g} in all"
+        what = (
+            f"the accelerometer does not feel gravity: {mean:.2g} in the mean, {force:.2g} in all"
+        )
         fix = "record the specific force, with gravity (not the driver's linear acceleration)"
         return [Finding("accelerometer_gravity", "error", what, fix, values=values)], 1.0
     for unit, factor in _UNITS.items():
         if _fits(force * factor, GRAVITY):
-            what = f"the accelerometer measures {force:.4g} where gravity is 9.81: its unit is {unit}"
+            what = (
+                f"the accelerometer measures {force:.4g} where gravity is 9.81: its unit is {unit}"
+            )
             fix = f"multiply the accelerations by {factor:g} to have m/s²"
             return [Finding("accelerometer_unit", "error", what, fix, values=values)], factor
     factor = GRAVITY / force
@@ -73,10 +77,12 @@ def check_sampling(imu: ImuData, noise: ImuNoise, frames: list[IntArray]) -> lis
     inside = (stamps >= imu.stamps_ns[0]) & (stamps <= imu.stamps_ns[-1])
     if len(stamps) and np.mean(inside) < _COVERED:
         apart = (int(stamps[0]) - int(imu.stamps_ns[0])) * 1e-9
-        what = f"the IMU covers {np.mean(inside):.0%} of the frames; they begin {apart:.3f} s after it"
+        what = (
+            f"the IMU covers {np.mean(inside):.0%} of the frames; they begin {apart:.3f} s after it"
+        )
         fix = "bring both to one clock: correct the stamps, or timeshift_cam_imu in the calibration"
-        severity = "error" if np.mean(inside) < 0.5 else "warning"
-        found.append(Finding("clocks_apart", severity, what, fix))  # type: ignore[arg-type]
+        severity = graded(np.mean(inside) < 0.5)
+        found.append(Finding("clocks_apart", severity, what, fix))
     steps = np.diff(imu.stamps_ns).astype(np.float64)
     period = float(np.median(steps))
     rate = 1e9 / period

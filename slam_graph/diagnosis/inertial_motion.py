@@ -97,7 +97,9 @@ class Window:
             shape = values.shape
             flat = values.reshape(len(times), -1, 1)
             speed = np.concatenate([0 * flat[:1], np.cumsum(0.5 * (flat[1:] + flat[:-1]) * dt, 0)])
-            place = np.concatenate([0 * flat[:1], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * dt, 0)])
+            place = np.concatenate(
+                [0 * flat[:1], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * dt, 0)]
+            )
             at = [np.interp(t, times, column) for column in place[:, :, 0].T]
             return np.stack(at, axis=-1).reshape(len(t), *shape[1:])
 

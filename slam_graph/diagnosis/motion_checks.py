@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope
-from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.diagnosis.inertial_motion import Window, WindowSolution
 from slam_graph.diagnosis.mountings import axes_text, signed_permutations
 from slam_graph.diagnosis.rotation_fit import RotationFit
@@ -156,5 +156,5 @@ def _baseline(solutions: list[WindowSolution], rig: Rig) -> list[Finding]:
         f"a baseline of {length * factor:.4f} m: multiply the translation of T_cn_cnm1 of cam1 by "
         f"{factor:.3f}"
     )
-    severity = "error" if change > _BAD_BASELINE else "warning"
-    return [Finding.measured("baseline", severity, what, fix, change / sigma, values)]  # type: ignore[arg-type]
+    severity = graded(change > _BAD_BASELINE)
+    return [Finding.measured("baseline", severity, what, fix, change / sigma, values)]

@@ -96,7 +96,8 @@ class RotationProblem:
         """Take pairs of one or several parts."""
         self._mounted, self._gyroscopes = camera, gyroscopes
         most = max(len(pair.first) for pair in pairs)
-        self._pixels = np.zeros((2, len(pairs), most, 2)) + (camera.camera.cx, camera.camera.cy)
+        centre = np.array([camera.camera.cx, camera.camera.cy])
+        self._pixels = np.tile(centre, (2, len(pairs), most, 1))
         self._there = np.zeros((len(pairs), most), bool)
         for p, pair in enumerate(pairs):
             self._pixels[0, p, : len(pair.first)] = pair.first
@@ -159,7 +160,7 @@ class RotationProblem:
         return t
 
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Epipolar distances (P, N) in pixels, and their derivatives (P, N, 2) by the directions."""
+        """Epipolar distances (P, N), pixels, and their derivatives (P, N, 2) by the directions."""
         one, two = self._turned(at)
         normals = np.cross(one, two)
         e, sigma = _residuals(one, two, normals, t)
@@ -236,7 +237,7 @@ def _least(normals: FloatArray, weights: FloatArray) -> FloatArray:
 def _residuals(
     one: FloatArray, two: FloatArray, normals: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """t · (f₁ × R f₂) (P, N), and its standard deviation for unit noise of both bearings."""
+    """The t · (f₁ × R f₂) (P, N), and its deviation for unit noise of both bearings."""
     e = np.einsum("pni,pi->pn", normals, t)
     along = np.einsum("pni,pi->pn", one, t) ** 2 + np.einsum("pni,pi->pn", two, t) ** 2
     return e, np.sqrt(np.maximum(2.0 - along, 0.02))

@@ -20,8 +20,8 @@ _FEWEST, _MOST = 60, 1500
 """Matches that are needed, and that are used."""
 _RANSAC_PX, _CONFIDENCE = 1.0, 0.9999
 _WORSE, _WORSE_PX = 2.0, 0.8
-"""A calibration is wrong if its epipolar distances are so many times those of the best geometry, and
-so much larger."""
+"""A calibration is wrong if its epipolar distances are so many times those of the best geometry,
+and so much larger."""
 _AHEAD = 0.75
 """At least so many of the near points must be in front of both cameras."""
 _NEAR_PX = 3.0

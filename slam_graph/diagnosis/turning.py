@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The coarse comparison of camera and gyroscope: unit, axes and clock, whatever they are.
 
-The rotation vectors of the camera, φ_c, and the integral of the angular rate over the same time, φ_g,
-obey φ_g = s Q φ_c + b Δt: a unit s, an orthogonal matrix Q and a bias b. The best Q of either
+The rotation vectors of the camera, φ_c, and the integrals of the angular rate over the same times,
+φ_g, obey φ_g = s Q φ_c + b Δt: a unit s, an orthogonal matrix Q and a bias b. The best Q of either
 handedness follows from a singular value decomposition, for every time offset of a grid.
 """
 
