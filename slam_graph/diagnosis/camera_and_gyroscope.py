@@ -40,7 +40,8 @@ _FITS, _NOTHING_FITS = 0.3, 0.5
 _TURNED_RAD = np.deg2rad(20.0)
 """A mounting that is farther off is looked for coarsely first."""
 _SIGMAS = 6.0
-"""A difference is a finding from so many standard deviations on, and if it is larger than these:"""
+"""A difference is a finding from so many standard deviations on, and if it is larger than these,
+which grow with the square of the noise in pixels above 1 px, as the bias by the noise does:"""
 _OFFSET_S, _BAD_OFFSET_S = 5e-3, 1.5e-2
 _FOCAL, _BAD_FOCAL = 0.04, 0.07
 _TURN_RAD, _BAD_TURN_RAD = np.deg2rad(2.5), np.deg2rad(6.0)
@@ -195,7 +196,7 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     _judge_readout(now, fit, sigma["readout"])
     camera = now.rig.cameras[0]
     change_s = fit.values.offset_s - camera.clock_offset_s
-    if abs(change_s) > max(_OFFSET_S, _SIGMAS * sigma["offset"]):
+    if abs(change_s) > max(_OFFSET_S * _noisier(fit), _SIGMAS * sigma["offset"]):
         value = camera.time_offset_s + change_s
         what = (
             f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± "
@@ -233,7 +234,7 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> 
     """Whether the calibrated rotation is wrong; it is corrected then."""
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
     away = float(Rotation.from_matrix(R.T @ fit.values.body_R_camera).magnitude())
-    if away < max(_TURN_RAD, _SIGMAS * sigma):
+    if away < max(_TURN_RAD * _noisier(fit), _SIGMAS * sigma):
         return
     named = explained(fit.values.body_R_camera, R)
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < _TURNED_RAD:
@@ -270,7 +271,7 @@ def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> N
     """Whether rows are exposed one after the other, and the calibration does not say so."""
     camera = now.rig.cameras[0]
     change = fit.values.readout_s - camera.readout_s
-    if abs(change) < max(_READOUT_S, _SIGMAS * sigma):
+    if abs(change) < max(_READOUT_S * _noisier(fit), _SIGMAS * sigma):
         return
     value = fit.values.readout_s
     what = (
@@ -290,7 +291,7 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
     """Whether the focal length is wrong; that of all cameras is corrected then."""
     factor = fit.values.focal
     change = abs(float(np.log(factor)))
-    if change < max(_FOCAL, _SIGMAS * sigma):
+    if change < max(_FOCAL * _noisier(fit), _SIGMAS * sigma):
         return
     camera = now.rig.cameras[0].camera
     what = (
@@ -307,6 +308,11 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
         Finding.measured("focal_length", severity, what, fix, change / sigma, values)
     )
     now.rig = scaled_lenses(now.rig, factor)
+
+
+def _noisier(fit: RotationFit) -> float:
+    """A factor on what counts as a difference."""
+    return max(1.0, fit.noise_px**2)
 
 
 def scaled_lenses(rig: Rig, factor: float) -> Rig:

@@ -87,12 +87,12 @@ def _missing(camera: int, missing: int, total: int) -> list[Finding]:
     return [Finding("images_missing", graded(missing > _MANY * total), text, fix)]
 
 
-def _blank(f: ImageFigures) -> bool:
-    return f.std < _BLANK_STD
-
-
 def _overexposed(f: ImageFigures) -> bool:
-    return not _blank(f) and f.bright > _BRIGHT and f.mean > _BRIGHT_MEAN
+    return f.bright > _BRIGHT and f.mean > _BRIGHT_MEAN
+
+
+def _blank(f: ImageFigures) -> bool:
+    return f.std < _BLANK_STD and not _overexposed(f)
 
 
 def _dark(f: ImageFigures) -> bool:

@@ -60,11 +60,10 @@ def frame_pairs(
                 chosen.append((number, seen[k], seen[second]))
             k = max(second, k + 1)
     stride = -(-len(chosen) // _PAIRS)
-    pairs, guess = [], None
-    for number, one, two in chosen[:: max(stride, 1)]:
-        pair = _pair(number, one, two, gyroscopes[number], camera, guess)
-        pairs.append(pair)
-    return pairs
+    return [
+        _pair(number, one, two, gyroscopes[number], camera)
+        for number, one, two in chosen[:: max(stride, 1)]
+    ]
 
 
 def _partner(frames: list[FeatureFrame], first: int) -> int:
@@ -85,11 +84,11 @@ def _pair(
     two: FeatureFrame,
     gyroscope: Gyroscope,
     mounted: RigCamera,
-    guess: FloatArray | None,
 ) -> FramePair:
+    """The common features of two frames, thinned to a bounded number."""
     a, b = one.cameras[0], two.cameras[0]
     _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, guess)
+    found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
     turn = None if found is None else Rotation.from_matrix(found.R).as_rotvec()
     times = gyroscope.seconds(np.array([one.stamp_ns, two.stamp_ns]))
     step = max(1, len(i) // _FEATURES)
