@@ -11,7 +11,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope
 from slam_graph.diagnosis.finding import Finding, graded
-from slam_graph.diagnosis.inertial_motion import Window, WindowSolution
+from slam_graph.diagnosis.motion_window import Window, WindowSolution
 from slam_graph.diagnosis.mountings import axes_text, signed_permutations
 from slam_graph.diagnosis.rotation_fit import RotationFit
 from slam_graph.sensors import FeatureFrame, Rig
@@ -102,16 +102,16 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     if np.allclose(P, np.eye(3)) or usual < _CLEARER * score:
         return np.eye(3), []
     values = {"axes": axes_text(P), "residual_px": score, "residual_as_it_is_px": usual}
-    kind = "accelerometer_axes"
+    found = "accelerometer_axes"
     if np.allclose(P, -np.eye(3)):
-        kind, what = "accelerometer_sign", "the accelerometer has the opposite sign"
+        found, what = "accelerometer_sign", "the accelerometer has the opposite sign"
         fix = "negate the accelerations: at rest they must point up, +9.81"
     else:
         what = f"the accelerometer's axes should be read as {axes_text(P)}"
         fix = f"write the accelerations (x, y, z) as {axes_text(P)}"
     what = f"{what}: features are off by {usual:.2f} px in the mean, and then by {score:.2f} px"
     sigmas = (usual / score - 1.0) * np.sqrt(100.0 * len(windows))
-    return P, [Finding.measured(kind, "error", what, fix, float(sigmas), values)]
+    return P, [Finding.measured(found, "error", what, fix, float(sigmas), values)]
 
 
 def _score(windows: list[Window], P: FloatArray, steps: int) -> float:
