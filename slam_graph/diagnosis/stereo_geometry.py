@@ -98,7 +98,8 @@ class StereoPair:
 
 
 def _bearings(camera: Camera, pixels: FloatArray) -> FloatArray:
-    m = camera.undistort(pixels)
+    with np.errstate(all="ignore"):  # beyond a wide lens that is not the right one
+        m = np.nan_to_num(camera.undistort(pixels), posinf=0.0, neginf=0.0)
     rays = np.column_stack([m, np.ones(len(m))])
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
