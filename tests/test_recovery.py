@@ -94,6 +94,13 @@ def test_time_between_segments_is_not_covered(blind: RunResult, tmp_path: Path) 
     assert sum(int(row["states"]) for row in rows) == len(stamps)
 
 
+@pytest.mark.parametrize("fault", ["imu_missing:at_s=6,duration_s=1.5", "frames_dropped:at_s=6"])
+def test_one_sensor_alone_goes_on_without_the_other(fault: str) -> None:
+    result = flown(fault)
+    assert result.status == "ok"
+    assert len(result.segments) == 1
+
+
 @pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])
 def test_every_engine_starts_again(algorithm: str) -> None:
     result = flown("all_missing:at_s=6,duration_s=2", algorithm=algorithm)

@@ -27,6 +27,7 @@ __all__ = [
     "adjust_worlds",
     "levenberg_marquardt",
     "triangulate_frames",
+    "visual_rotation",
 ]
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     )
     from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
+    from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.policies import AlgorithmConfig
     from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_worlds
     from slam_graph.backend.smoothing.frame_log import FrameLog
@@ -69,6 +71,7 @@ else:
             ),
             "cost.triangulation": ("triangulate_frames",),
             "estimator": ("Estimator",),
+            "initialization.visual_rotation": ("visual_rotation",),
             "policies": ("AlgorithmConfig",),
             "smoothing.final_adjustment": (
                 "FinalBa",

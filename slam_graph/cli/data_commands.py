@@ -25,6 +25,7 @@ from slam_graph.cli.options import (
 
 if TYPE_CHECKING:
     from slam_graph.datasets import Sequence
+    from slam_graph.diagnosis import Diagnosis
 
 app = typer.Typer(
     help="Show, check and convert recordings.", no_args_is_help=True, rich_markup_mode="rich"
@@ -62,19 +63,40 @@ def check(
     images: Annotated[bool, typer.Option("--images", help="Also read every image.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Read a recording and report faults in it; the exit code is 1 if it is unusable."""
+    """Read a recording and report faults in it; the exit code is 1 if it is unusable.
+
+    With --images also what slam-graph doctor finds without tracks: units, exposure, sharpness.
+    """
     from slam_graph.datasets import check_sequence
+    from slam_graph.diagnosis import Diagnosis
 
     sequence = open_recording(data, format_, calibration, groundtruth, sources)
-    findings = check_sequence(sequence, read_images=images)
-    errors = sum(finding.severity == "error" for finding in findings)
+    findings = [asdict(finding) for finding in check_sequence(sequence, read_images=images)]
+    if images:
+        findings = _joined(findings, Diagnosis.quick(sequence))
+    errors = sum(finding["severity"] == "error" for finding in findings)
     if as_json:
-        echo_json({"errors": errors, "findings": [asdict(finding) for finding in findings]})
+        echo_json({"errors": errors, "findings": findings})
     else:
-        echo_table((finding.severity, finding.where, finding.what) for finding in findings)
+        echo_table((found["severity"], found["where"], found["what"]) for found in findings)
         typer.echo(f"{sequence.info().name}: {'unusable' if errors else 'ok'}")
     if errors:
         raise typer.Exit(1)
+
+
+_ALSO_CHECKED = {"imu_rate", "imu_gaps", "imu_missing", "frame_pauses", "frames_missing"}
+"""Kinds of findings of a diagnosis that the check of a recording has, too."""
+
+
+def _joined(findings: list[dict[str, Any]], diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """The findings of the check and the faults of a diagnosis, errors first."""
+    further = [
+        {"severity": f.severity, "what": f"{f.what}; {f.fix}", "where": f.kind}
+        for f in diagnosis.faults
+        if f.kind not in _ALSO_CHECKED
+    ]
+    order = ("error", "warning", "info")
+    return sorted([*findings, *further], key=lambda found: order.index(found["severity"]))
 
 
 @app.command()

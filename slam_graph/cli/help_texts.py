@@ -18,7 +18,7 @@ _PANELS = {
     _RUN: ("run", "batch", "localize", "map"),
     _MEASURE: ("ape", "rpe", "compare", "view", "export"),
     _SOLVE: ("optimize",),
-    _DATA: ("simulate", "data", "frontend", "config"),
+    _DATA: ("doctor", "simulate", "data", "frontend", "config"),
 }
 """Commands in the help of the program, by the title of their panel."""
 
@@ -64,6 +64,10 @@ EXAMPLES = {
     "optimize": (
         "slam-graph optimize sphere2500.g2o",
         "slam-graph optimize problem-16-22106-pre.txt.bz2",
+    ),
+    "doctor": (
+        "slam-graph doctor path/to/MH_01_easy",
+        "slam-graph doctor flight.bag --calibration camchain-imucam.yaml --json",
     ),
     "simulate": (
         "slam-graph simulate flight --duration 30",

@@ -22,6 +22,7 @@ from slam_graph.cli import (
     batch,
     compare,
     data_commands,
+    doctor,
     evaluate,
     export,
     frontend,
@@ -97,6 +98,7 @@ app.command("rpe")(evaluate.rpe)
 app.command("export")(export.export)
 app.command("compare")(compare.compare)
 app.command("optimize")(optimize.optimize)
+app.command("doctor")(doctor.doctor)
 app.command("simulate")(simulate.simulate)
 app.command("view")(view.view)
 app.add_typer(frontend.app, name="frontend")

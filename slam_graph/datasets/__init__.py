@@ -24,14 +24,12 @@ __all__ = [
     "dataset_from_arrays",
     "kalibr_text",
     "open_dataset",
-    "pose_from_matrix",
     "read_groundtruth",
     "read_kalibr",
     "rig_from_kalibr",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
     from slam_graph.datasets.calibration.kalibr_calibration import (
         kalibr_text,
         read_kalibr,
@@ -50,7 +48,6 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "calibration.calibration_yaml": ("pose_from_matrix",),
             "calibration.kalibr_calibration": ("kalibr_text", "read_kalibr", "rig_from_kalibr"),
             "data_checks": ("check_sequence",),
             "dataset_registry": ("DATASETS", "Format", "open_dataset"),

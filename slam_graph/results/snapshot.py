@@ -36,6 +36,7 @@ def save_so_far(result: RunResult, folder: Path, wall_s: float) -> None:
     files.text(names.RIG, [kalibr_text(now.rig)])
     files.text(names.TRAJECTORY, now.trajectory.tum_lines())
     files.text(names.STATES, names.state_lines(now.history))
+    files.text(names.SEGMENTS, now.segments.csv_lines(now.trajectory))
     if now.groundtruth is not None:
         files.text(names.GROUNDTRUTH, now.groundtruth.tum_lines())
     write_ply(files.path(names.POINTS), now.points)

@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets import pose_from_matrix, read_kalibr
+from slam_graph.datasets import read_kalibr
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera
@@ -127,7 +127,8 @@ def euroc_rig() -> Rig:
 
 
 def _pose(rows: tuple[tuple[float, ...], ...]) -> gtsam.Pose3:
-    return pose_from_matrix(np.array(rows), "body_T_camera")
+    matrix = np.array(rows)
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3])
 
 
 def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:

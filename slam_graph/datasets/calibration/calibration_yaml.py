@@ -19,6 +19,9 @@ from slam_graph.settings import ConfigTree
 _ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 
+MAX_OFFSET_S = 1e8
+"""Largest offset between clocks, s: three years, as of a clock that was never set."""
+
 
 @dataclass(frozen=True, slots=True)
 class YamlValue:
@@ -74,6 +77,13 @@ class YamlValue:
             raise DataError(f"{self.where}: '{self.text()[:60]}' is not a number") from None
         if not np.isfinite(value):
             raise DataError(f"{self.where}: '{self.text()[:60]}' is not a finite number")
+        return value
+
+    def seconds(self) -> float:
+        """A time offset, in s; one beyond `MAX_OFFSET_S` is refused."""
+        value = self.number()
+        if abs(value) > MAX_OFFSET_S:
+            raise DataError(f"{self.where}: {value:g} s cannot be the offset of two clocks")
         return value
 
     def elements(self) -> list[YamlValue]:

@@ -103,7 +103,7 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) 
     mounted = RigCamera(
         read_camera(entry),
         body_T_camera,
-        0.0 if shift is None else shift.number(),
+        0.0 if shift is None else shift.seconds(),
         entry.key if name is None else name.text(),
         rotation_known=known,
     )

@@ -64,7 +64,7 @@ def _read_rig(path: Path) -> Rig:
     """
     content = read_yaml(path)
     offset = content.get("cam_imu_time_offset_s")
-    offset_s = 0.0 if offset is None else offset.number()
+    offset_s = 0.0 if offset is None else offset.seconds()
     cameras = []
     for entry in content.require("cameras").elements():
         name = f"cam{entry.require('id').text()}"

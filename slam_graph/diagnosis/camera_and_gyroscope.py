@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What camera and gyroscope say of one another, step by step: unit, axes, mounting, and the rest.
+
+Each step corrects what it has found, so that the next one sees only its own faults.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray
+from slam_graph.diagnosis.finding import Finding, graded
+from slam_graph.diagnosis.frame_pairs import FramePair, frame_pairs
+from slam_graph.diagnosis.gathering import Part
+from slam_graph.diagnosis.gyroscope import Gyroscope
+from slam_graph.diagnosis.mountings import Explanation, axes_text, explained
+from slam_graph.diagnosis.rotation_fit import UNKNOWNS, Kinematics, RotationFit, RotationProblem
+from slam_graph.diagnosis.turning import Turning, coarse_turning
+from slam_graph.sensors import ImuData, Rig
+
+_SAME_RATE = (0.55, 1.8)
+"""Camera and gyroscope turn equally fast within these; focal lengths may be wrong, too."""
+_DEGREES = 57.29578
+_RATE_UNITS = {
+    "degrees/s": _DEGREES,
+    "mrad/s": 1e3,
+    "rad/s where degrees/s were expected": 1 / _DEGREES,
+}
+_UNIT_RATIO = 1.5
+"""A factor on the rate is of a unit if it is so near."""
+_BETTER = 2.0
+"""Another mounting or handedness must have a misfit smaller by this factor …"""
+_FITS, _NOTHING_FITS = 0.3, 0.5
+"""… and below this to be taken; beyond this nothing fits."""
+_TURNED_RAD = np.deg2rad(20.0)
+"""A mounting that is farther off is looked for coarsely first."""
+_SIGMAS = 6.0
+"""A difference is a finding from so many standard deviations on, and if it is larger than these,
+which grow with the square of the noise in pixels above 1 px, as the bias by the noise does:"""
+_OFFSET_S, _BAD_OFFSET_S = 5e-3, 1.5e-2
+_FOCAL, _BAD_FOCAL = 0.04, 0.07
+_TURN_RAD, _BAD_TURN_RAD = np.deg2rad(2.5), np.deg2rad(6.0)
+_READOUT_S = 8e-3
+_NAMED_RAD = np.deg2rad(4.0)
+"""So near a named explanation must come to a mounting that was found."""
+_FEWEST_PAIRS = 10
+_FOCAL_STARTS = (1.0, 0.77, 1.3)
+_GOOD_PX = 1.5
+"""A fit with this noise needs no other start."""
+
+
+@dataclass(eq=False)
+class CameraAndGyroscope:
+    """The state of the comparison.
+
+    Attributes:
+        rig: with what was found so far corrected.
+        parts: with the IMU corrected likewise.
+        gyroscopes: of the parts.
+        findings: so far.
+        fit: of clock, mounting, focal length and bias; None if the camera turns too little.
+    """
+
+    rig: Rig
+    parts: list[Part]
+    gyroscopes: list[Gyroscope]
+    findings: list[Finding] = field(default_factory=list)
+    fit: RotationFit | None = None
+
+
+def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
+    """Compare the first camera with the gyroscope.
+
+    Args:
+        rig: the calibration.
+        parts: with features of the first camera and at least two IMU samples each.
+    """
+    now = CameraAndGyroscope(rig, parts, [Gyroscope(part.imu) for part in parts])
+    camera = rig.cameras[0]
+    pairs = frame_pairs(now.parts, now.gyroscopes, camera)
+    turning = _turning(now, pairs)
+    if turning is None or len(pairs) < _FEWEST_PAIRS:
+        text = "the camera turns too little to check clock, mounting and focal length"
+        now.findings.append(Finding("turns_too_little", "info", text, "record livelier motion"))
+        return now
+    turning = _unit(now, pairs, turning)
+    turning = _handedness(now, pairs, turning)
+    start = _coarse_mounting(now, turning)
+    now.fit = _solved(now, pairs, start)
+    if now.fit is None or turning.misfit > _NOTHING_FITS:
+        now.fit = None
+        what = "camera and gyroscope do not turn alike under any mounting"
+        fix = "compare the clocks (more than 0.2 s?); mask moving objects; check the matches"
+        now.findings.append(Finding("not_alike", "warning", what, fix, "likely"))
+        return now
+    _judge(now, now.fit)
+    return now
+
+
+def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:
+    camera = now.rig.cameras[0]
+    R = camera.body_T_camera.rotation().matrix()
+    return coarse_turning(pairs, now.gyroscopes, R, camera.clock_offset_s)
+
+
+def _replace_imu(now: CameraAndGyroscope, gyro_map: FloatArray) -> None:
+    """Map the angular rates of all parts by a matrix (3, 3)."""
+
+    def mapped(imu: ImuData) -> ImuData:
+        return ImuData(imu.stamps_ns, imu.gyro @ gyro_map.T, imu.accel)
+
+    now.parts = [replace(part, imu=mapped(part.imu)) for part in now.parts]
+    now.gyroscopes = [Gyroscope(part.imu) for part in now.parts]
+
+
+def _unit(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> Turning:
+    """Correct the unit of the gyroscope."""
+    factor = turning.factor
+    same = _SAME_RATE[0] < factor < _SAME_RATE[1]
+    if same or factor <= 0.0 or turning.misfit > _FITS:
+        return turning
+    what = f"the gyroscope turns {factor:.3g} times as fast as the camera"
+    fix = f"divide the angular rates by {factor:.4g} to have rad/s"
+    for unit, ratio in _RATE_UNITS.items():
+        if 1 / _UNIT_RATIO < factor / ratio < _UNIT_RATIO:
+            what, fix = (
+                f"{what}: its unit is {unit}",
+                f"multiply the angular rates by {1 / ratio:g}",
+            )
+            factor = ratio
+    values = {"factor": turning.factor}
+    sigmas = 1.0 / max(turning.misfit, 1e-3) * np.sqrt(len(pairs))
+    now.findings.append(Finding.measured("gyroscope_unit", "error", what, fix, sigmas, values))
+    _replace_imu(now, np.eye(3) / factor)
+    return _turning(now, pairs) or turning
+
+
+def _handedness(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> Turning:
+    """Correct a gyroscope that turns the other way round."""
+    mirrored = np.linalg.det(turning.Q) < 0
+    clear = _BETTER * turning.misfit < min(turning.misfit_other, turning.misfit_calibrated)
+    if not mirrored or not clear or turning.misfit > _FITS:
+        return turning
+    found = explained(turning.Q, now.rig.cameras[0].body_T_camera.rotation().matrix())
+    what = f"the gyroscope is left-handed: its axes should be read as {axes_text(found.axes)}"
+    fix = f"write the angular rates (x, y, z) as {axes_text(found.axes)}"
+    sigmas = turning.misfit_other / max(turning.misfit, 1e-3) * np.sqrt(len(pairs))
+    values = {"axes": axes_text(found.axes), "misfit": turning.misfit}
+    now.findings.append(Finding.measured("gyroscope_axes", "error", what, fix, sigmas, values))
+    _replace_imu(now, found.axes)
+    return _turning(now, pairs) or turning
+
+
+def _coarse_mounting(now: CameraAndGyroscope, turning: Turning) -> Kinematics:
+    """Where the fit starts: at the calibrated mounting, unless another one is clearly better."""
+    camera = now.rig.cameras[0]
+    R, offset_s = camera.body_T_camera.rotation().matrix(), camera.clock_offset_s
+    Q = turning.Q
+    if np.linalg.det(Q) > 0:
+        away = Rotation.from_matrix(R.T @ Q).magnitude()
+        if away > _TURNED_RAD and _BETTER * turning.misfit < turning.misfit_calibrated:
+            R = Q
+    if abs(turning.offset_s - offset_s) > 0.02:
+        offset_s = turning.offset_s
+    return Kinematics(offset_s, 1.0, camera.readout_s, R, np.zeros(3))
+
+
+def _solved(
+    now: CameraAndGyroscope, pairs: list[FramePair], start: Kinematics
+) -> RotationFit | None:
+    """The best fit from several focal lengths."""
+    problem = RotationProblem(pairs, now.gyroscopes, now.rig.cameras[0])
+    best: RotationFit | None = None
+    for focal in _FOCAL_STARTS:
+        try:
+            fit = problem.solve(replace(start, focal=focal))
+        except np.linalg.LinAlgError:
+            continue
+        if best is None or fit.noise_px < 0.9 * best.noise_px:
+            best = fit
+        if best.noise_px < _GOOD_PX:
+            break
+    return best
+
+
+def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
+    """Findings of a fit; what is wrong is corrected in the rig."""
+    sigma = dict(zip(UNKNOWNS, fit.sigmas.tolist(), strict=True))
+    before = len(now.findings)
+    _judge_mounting(now, fit, max(sigma["rx"], sigma["ry"], sigma["rz"]))
+    _judge_readout(now, fit, sigma["readout"])
+    camera = now.rig.cameras[0]
+    change_s = fit.values.offset_s - camera.clock_offset_s
+    if abs(change_s) > max(_OFFSET_S * _noisier(fit), _SIGMAS * sigma["offset"]):
+        value = camera.time_offset_s + change_s
+        what = (
+            f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± "
+            f"{1e3 * sigma['offset']:.1f} ms, "
+            f"and the calibration says {1e3 * camera.time_offset_s:.1f} ms"
+        )
+        fix = (
+            f"timeshift_cam_imu: {value:.4f} in the calibration, or "
+            "--set backend.calibration.time_offset=true"
+        )
+        severity = graded(abs(change_s) > _BAD_OFFSET_S)
+        values = {"time_offset_s": value, "sigma_s": sigma["offset"]}
+        now.findings.append(
+            Finding.measured(
+                "time_offset",
+                severity,
+                what,
+                fix,
+                abs(change_s) / sigma["offset"],
+                values,
+            )
+        )
+    _judge_focal(now, fit, sigma["focal"])
+    if len(now.findings) == before:
+        text = (
+            "camera and gyroscope agree: clocks differ by "
+            f"{1e3 * change_s:.1f} ± {1e3 * sigma['offset']:.1f} ms, the focal length by "
+            f"{fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; epipolar distances are "
+            f"{fit.noise_px:.2f} px"
+        )
+        now.findings.append(Finding("camera_and_gyroscope", "info", text))
+
+
+def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
+    """Whether the calibrated rotation is wrong; it is corrected then."""
+    R = now.rig.cameras[0].body_T_camera.rotation().matrix()
+    away = float(Rotation.from_matrix(R.T @ fit.values.body_R_camera).magnitude())
+    if away < max(_TURN_RAD * _noisier(fit), _SIGMAS * sigma):
+        return
+    named = explained(fit.values.body_R_camera, R)
+    if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < _TURNED_RAD:
+        named = Explanation("other", "", 0.0, np.eye(3))
+    now.findings.append(_mounting_finding(named, fit.values.body_R_camera, away, sigma))
+    turn = gtsam.Rot3(fit.values.body_R_camera @ R.T)
+    cameras = []
+    for mounted in now.rig.cameras:
+        pose = mounted.body_T_camera
+        pose = pose.inverse() if named.kind == "inverse" else gtsam.Pose3(turn, np.zeros(3)) * pose
+        cameras.append(replace(mounted, body_T_camera=pose))
+    now.rig = Rig(tuple(cameras), now.rig.imu)
+
+
+def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
+    degrees = np.rad2deg(away)
+    values = {"degrees": degrees, "explanation": named.kind, "body_R_camera": R.tolist()}
+    what = (
+        f"the camera is turned by {degrees:.1f}° ± {np.rad2deg(sigma):.1f}° against its calibration"
+    )
+    rows = " ".join(np.array2string(R.T, precision=4, separator=", ").split())
+    fix = f"T_cam_imu: unknown in the calibration, or its rotation: {rows}"
+    if named.kind == "inverse":
+        what = f"{what}: {named.what}"
+        fix = "give T_cam_imu (from IMU to camera) in a Kalibr file, T_BS (its inverse) in EuRoC's"
+    elif named.kind == "axes":
+        what = f"{what}: {named.what}"
+        fix = f"write the IMU's (x, y, z) as {axes_text(named.axes)}, or {fix}"
+    severity = graded(away > _BAD_TURN_RAD)
+    return Finding.measured("mounting", severity, what, fix, away / sigma, values)
+
+
+def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
+    """Whether rows are exposed one after the other, and the calibration does not say so."""
+    camera = now.rig.cameras[0]
+    change = fit.values.readout_s - camera.readout_s
+    if abs(change) < max(_READOUT_S * _noisier(fit), _SIGMAS * sigma):
+        return
+    value = fit.values.readout_s
+    what = (
+        f"the shutter rolls: rows are read in {1e3 * value:.1f} ± {1e3 * sigma:.1f} ms, and the "
+        f"calibration says {1e3 * camera.readout_s:.1f} ms"
+    )
+    fix = f"readout_time: {value:.4f} of the camera in the calibration"
+    values = {"readout_s": value}
+    now.findings.append(
+        Finding.measured("rolling_shutter", "warning", what, fix, abs(change) / sigma, values)
+    )
+    cameras = tuple(replace(c, readout_s=value, rolling_shutter=True) for c in now.rig.cameras)
+    now.rig = Rig(cameras, now.rig.imu)
+
+
+def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
+    """Whether the focal length is wrong; that of all cameras is corrected then."""
+    factor = fit.values.focal
+    change = abs(float(np.log(factor)))
+    if change < max(_FOCAL * _noisier(fit), _SIGMAS * sigma):
+        return
+    camera = now.rig.cameras[0].camera
+    what = (
+        f"the calibrated focal length is {1 / factor:.3f} ± {sigma:.3f} times the one that fits "
+        "the gyroscope"
+    )
+    fix = (
+        f"fx: {camera.fx * factor:.1f}, fy: {camera.fy * factor:.1f} of cam0; "
+        "or calibrate the lens again"
+    )
+    severity = graded(change > _BAD_FOCAL)
+    values = {"factor": 1 / factor, "fx": camera.fx * factor}
+    now.findings.append(
+        Finding.measured("focal_length", severity, what, fix, change / sigma, values)
+    )
+    now.rig = scaled_lenses(now.rig, factor)
+
+
+def _noisier(fit: RotationFit) -> float:
+    """A factor on what counts as a difference."""
+    return max(1.0, fit.noise_px**2)
+
+
+def scaled_lenses(rig: Rig, factor: float) -> Rig:
+    """The rig with a factor on all focal lengths."""
+    cameras = []
+    for mounted in rig.cameras:
+        lens = mounted.camera
+        lens = replace(lens, fx=lens.fx * factor, fy=lens.fy * factor)
+        cameras.append(replace(mounted, camera=lens))
+    return Rig(tuple(cameras), rig.imu)

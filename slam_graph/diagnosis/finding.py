@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A finding of a diagnosis: what was found, how sure, how bad, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+Severity = Literal["error", "warning", "info"]
+_SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
+
+Sureness = Literal["certain", "likely", "hint"]
+_CERTAIN_SIGMAS, _LIKELY_SIGMAS = 10.0, 5.0
+"""From so many standard deviations on a finding is certain, or likely."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was found.
+
+    Attributes:
+        kind: name of the check, for programs, e.g. ``time_offset``.
+        severity: ``error`` for what makes a result worthless, ``warning`` for what makes it worse,
+            ``info`` for a fact.
+        what: in words, with the figures.
+        fix: the line of the calibration, the setting or the option that mends it, with its value.
+        sure: ``certain``, ``likely`` or ``hint``.
+        sigmas: distance from what was expected in standard deviations; None where it was counted.
+        values: the figures by name.
+    """
+
+    kind: str
+    severity: Severity
+    what: str
+    fix: str = ""
+    sure: Sureness = "certain"
+    sigmas: float | None = None
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    @staticmethod
+    def measured(
+        kind: str,
+        severity: Severity,
+        what: str,
+        fix: str,
+        sigmas: float,
+        values: Mapping[str, object] | None = None,
+    ) -> Finding:
+        """A finding whose sureness follows from its distance in standard deviations."""
+        return Finding(kind, severity, what, fix, sureness(sigmas), sigmas, values or {})
+
+
+def graded(bad: bool) -> Severity:
+    """An error if it is bad, else a warning."""
+    return "error" if bad else "warning"
+
+
+def sureness(sigmas: float) -> Sureness:
+    """How sure a difference of so many standard deviations is."""
+    if sigmas >= _CERTAIN_SIGMAS:
+        return "certain"
+    return "likely" if sigmas >= _LIKELY_SIGMAS else "hint"
+
+
+def in_order(findings: list[Finding]) -> list[Finding]:
+    """Errors first; within a severity in the order in which they were found."""
+    return sorted(findings, key=lambda finding: _SEVERITIES.index(finding.severity))

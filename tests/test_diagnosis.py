@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A sound recording has no faults; one that is made up is found, and found first."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import slam_graph as sg
+from slam_graph.arrays import FloatArray
+from slam_graph.cli.main import app
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
+from slam_graph.datasets.faults.injection import inject
+from slam_graph.datasets.memory_sequence import dataset_from_arrays
+from slam_graph.datasets.sequence import RecordedSequence
+from slam_graph.diagnosis import Diagnosis
+from slam_graph.sensors.measurements import FeatureFrame, ImuData
+from slam_graph.sensors.rig import Rig, RigCamera
+
+Recorded = tuple[Rig, list[FeatureFrame], ImuData]
+Poses = Callable[[list[gtsam.Pose3]], list[gtsam.Pose3]]
+
+TURN_5 = gtsam.Pose3(gtsam.Rot3.Rx(np.deg2rad(5.0)), np.zeros(3))
+
+
+def taken(recording: RecordedSequence) -> Recorded:
+    """A recording of tracks, in memory."""
+    frames = [frame for frame in recording.frames() if isinstance(frame, FeatureFrame)]
+    return recording.rig, frames, recording.imu()
+
+
+@pytest.fixture(scope="module")
+def real_tracks() -> Recorded:
+    """Real tracks and IMU of one camera: 14 s of the demo, after its start."""
+    rig, frames, imu = taken(sg.open_dataset("demo"))
+    begin_ns = frames[0].stamp_ns + 12_000_000_000
+    return rig, [f for f in frames if 0 <= f.stamp_ns - begin_ns <= 14_000_000_000], imu
+
+
+@pytest.fixture(scope="module")
+def stereo_tracks() -> Recorded:
+    """Tracks of two cameras in livelier motion, simulated."""
+    return taken(sg.simulate(trajectory="random", duration_s=10, seed=3))
+
+
+def judged(
+    recorded: Recorded,
+    rig: Rig | None = None,
+    gyro: FloatArray | None = None,
+    accel: FloatArray | None = None,
+) -> Diagnosis:
+    """The diagnosis with another calibration, or with rates and forces mapped by (3, 3)."""
+    calibrated, frames, imu = recorded
+    eye = np.eye(3)
+    mapped = ImuData(
+        imu.stamps_ns,
+        imu.gyro @ (eye if gyro is None else gyro).T,
+        imu.accel @ (eye if accel is None else accel).T,
+    )
+    return Diagnosis.of_tracks(
+        rig or calibrated, [normalized_by(rig or calibrated, frame) for frame in frames], mapped
+    )
+
+
+def normalized_by(rig: Rig, frame: FeatureFrame) -> FeatureFrame:
+    """A frame as it is read with a calibration: its pixels are what was recorded."""
+    cameras = (
+        replace(seen, normalized=mounted.camera.undistort(seen.pixels))
+        for seen, mounted in zip(frame.cameras, rig.cameras, strict=True)
+    )
+    return FeatureFrame(frame.stamp_ns, tuple(cameras))
+
+
+def first(diagnosis: Diagnosis, kind: str) -> dict[str, object]:
+    """The figures of the first finding, which must be a fault of this kind."""
+    assert diagnosis.faults, [finding.what for finding in diagnosis.findings]
+    found = diagnosis.faults[0]
+    assert found.kind == kind, found.what
+    assert found.fix
+    assert found.what in diagnosis.best_guess()
+    return dict(found.values)
+
+
+def changed(rig: Rig, change: Callable[[RigCamera], RigCamera]) -> Rig:
+    return Rig(tuple(change(mounted) for mounted in rig.cameras), rig.imu)
+
+
+def posed(rig: Rig, change: Poses) -> Rig:
+    poses = change([mounted.body_T_camera for mounted in rig.cameras])
+    cameras = zip(rig.cameras, poses, strict=True)
+    return Rig(tuple(replace(c, body_T_camera=pose) for c, pose in cameras), rig.imu)
+
+
+def magnified(mounted: RigCamera, factor: float) -> RigCamera:
+    lens = mounted.camera
+    return replace(mounted, camera=replace(lens, fx=lens.fx * factor, fy=lens.fy * factor))
+
+
+def test_sound_tracks_have_no_faults(real_tracks: Recorded, stereo_tracks: Recorded) -> None:
+    for recorded in (real_tracks, stereo_tracks):
+        diagnosis = judged(recorded)
+        assert not diagnosis.faults, diagnosis.best_guess()
+        assert any(finding.kind == "camera_and_gyroscope" for finding in diagnosis.findings)
+    assert any(finding.kind == "scale" for finding in diagnosis.findings)
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind"),
+    [(1 / 9.81, "accelerometer_unit"), (1e3, "accelerometer_unit"), (-1.0, "accelerometer_sign")],
+)
+def test_forces_in_another_unit_or_sign(real_tracks: Recorded, unit: float, kind: str) -> None:
+    first(judged(real_tracks, accel=unit * np.eye(3)), kind)
+
+
+def test_forces_without_gravity(real_tracks: Recorded) -> None:
+    rig, frames, imu = real_tracks
+    linear = ImuData(imu.stamps_ns, imu.gyro, imu.accel - np.mean(imu.accel, axis=0))
+    first(Diagnosis.of_tracks(rig, frames, linear), "accelerometer_gravity")
+
+
+def test_rates_in_degrees(real_tracks: Recorded) -> None:
+    values = first(judged(real_tracks, gyro=np.rad2deg(1.0) * np.eye(3)), "gyroscope_unit")
+    assert values["factor"] == pytest.approx(57.3, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("axes", "text"),
+    [(np.diag([1.0, -1.0, 1.0]), "(x, -y, z)"), (np.eye(3)[[1, 0, 2]], "(y, x, z)")],
+)
+def test_left_handed_gyroscope(real_tracks: Recorded, axes: FloatArray, text: str) -> None:
+    assert first(judged(real_tracks, gyro=axes), "gyroscope_axes")["axes"] == text
+
+
+def test_axes_of_the_accelerometer(real_tracks: Recorded) -> None:
+    swapped = np.eye(3)[[1, 0, 2]]
+    assert first(judged(real_tracks, accel=swapped), "accelerometer_axes")["axes"] == "(y, x, z)"
+
+
+def test_mounting(real_tracks: Recorded) -> None:
+    rig = real_tracks[0]
+    inverse = posed(rig, lambda poses: [pose.inverse() for pose in poses])
+    assert first(judged(real_tracks, inverse), "mounting")["explanation"] == "inverse"
+    turned = posed(rig, lambda poses: [pose * TURN_5 for pose in poses])
+    values = first(judged(real_tracks, turned), "mounting")
+    assert values["explanation"] == "other"
+    assert values["degrees"] == pytest.approx(5.0, abs=1.0)
+
+
+def test_axes_of_the_whole_imu(real_tracks: Recorded) -> None:
+    quarter = gtsam.Rot3.Rz(np.pi / 2).matrix()
+    values = first(judged(real_tracks, gyro=quarter, accel=quarter), "mounting")
+    assert values["explanation"] == "axes"
+
+
+@pytest.mark.parametrize("offset_s", [0.05, -0.05, 0.012])
+def test_time_offset_is_found_to_milliseconds(real_tracks: Recorded, offset_s: float) -> None:
+    rig = changed(real_tracks[0], lambda c: replace(c, time_offset_s=c.time_offset_s + offset_s))
+    diagnosis = judged(real_tracks, rig)
+    assert abs(float(str(first(diagnosis, "time_offset")["time_offset_s"]))) < 2e-3
+    assert "backend.calibration.time_offset=true" in diagnosis.best_guess()
+
+
+@pytest.mark.parametrize("factor", [1.1, 1.3, 0.9])
+def test_focal_length(stereo_tracks: Recorded, factor: float) -> None:
+    rig = changed(stereo_tracks[0], lambda c: magnified(c, factor))
+    assert first(judged(stereo_tracks, rig), "focal_length")["factor"] == pytest.approx(
+        factor, rel=0.03
+    )
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_baseline(stereo_tracks: Recorded, factor: float) -> None:
+    def longer(poses: list[gtsam.Pose3]) -> list[gtsam.Pose3]:
+        relative = poses[0].between(poses[1])
+        moved = gtsam.Pose3(relative.rotation(), factor * relative.translation())
+        return [poses[0], poses[0] * moved]
+
+    values = first(judged(stereo_tracks, posed(stereo_tracks[0], longer)), "baseline")
+    assert values["factor"] == pytest.approx(factor, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda poses: poses[::-1], "the poses of the cameras are exchanged"),
+        (lambda poses: [poses[0], poses[1].inverse()], "the pose of cam1 is inverted"),
+        (lambda poses: [poses[0], poses[1] * TURN_5], "off by 5."),
+    ],
+)
+def test_stereo_geometry(stereo_tracks: Recorded, change: Poses, said: str) -> None:
+    diagnosis = judged(stereo_tracks, posed(stereo_tracks[0], change))
+    first(diagnosis, "stereo_geometry")
+    assert said in diagnosis.best_guess()
+
+
+def test_focal_length_of_the_second_camera(stereo_tracks: Recorded) -> None:
+    one, two = stereo_tracks[0].cameras
+    diagnosis = judged(stereo_tracks, Rig((one, magnified(two, 1.1)), stereo_tracks[0].imu))
+    first(diagnosis, "stereo_geometry")
+    assert "focal length of cam1" in diagnosis.best_guess()
+
+
+def test_shutter_that_rolls() -> None:
+    flight = sg.simulate(
+        trajectory="random", duration_s=10, seed=3, shutter_readout_s=0.03, cameras=1
+    )
+    recorded = taken(flight)
+    assert not judged(recorded).faults
+    still = changed(recorded[0], lambda c: replace(c, readout_s=0.0, rolling_shutter=False))
+    values = first(judged(recorded, still), "rolling_shutter")
+    assert values["readout_s"] == pytest.approx(0.03, abs=0.005)
+
+
+def test_clocks_that_do_not_belong_together(real_tracks: Recorded) -> None:
+    rig, frames, imu = real_tracks
+    later = ImuData(imu.stamps_ns + 100_000_000_000, imu.gyro, imu.accel)
+    diagnosis = Diagnosis.of_tracks(rig, frames, later)
+    assert [finding.kind for finding in diagnosis.errors] == ["clocks_apart"]
+
+
+def test_what_stands_still_has_no_faults() -> None:
+    """Nor has what has no frames or samples at all a traceback."""
+    resting = taken(sg.simulate(duration_s=4, flight={"hover_s": 10.0}))
+    diagnosis = judged(resting)
+    assert not diagnosis.faults, diagnosis.best_guess()
+    assert any(finding.kind == "turns_too_little" for finding in diagnosis.findings)
+    nothing = Diagnosis.of_tracks(resting[0], [], ImuData.empty())
+    assert nothing.errors
+
+
+@pytest.fixture(scope="module")
+def rendered() -> RecordedSequence:
+    """A second of rendered stereo images, in memory."""
+    flight = sg.simulate(kind="images", duration_s=1.0, rate_hz=10, flight={"hover_s": 0.0})
+    frames = list(flight.frames())
+    imu = flight.imu()
+    return dataset_from_arrays(
+        flight.rig,
+        imu_stamps_ns=imu.stamps_ns,
+        gyro=imu.gyro,
+        accel=imu.accel,
+        image_stamps_ns=np.array([frame.stamp_ns for frame in frames]),
+        images=[[frame.images[c] for frame in frames] for c in range(2)],  # type: ignore[union-attr]
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [
+        ("image_blank:at_s=0.2,duration_s=0.6", "image_blank"),
+        ("image_overexposed:at_s=0.2,duration_s=0.6", "image_overexposed"),
+        ("image_blurred:at_s=0.2,duration_s=0.6", "image_blurred"),
+        ("image_frozen:at_s=0.2,duration_s=0.6", "image_repeated"),
+        ("camera_lost:camera=1,at_s=0.2,duration_s=0.6", "images_missing"),
+    ],
+)
+def test_images(rendered: RecordedSequence, fault: str, kind: str) -> None:
+    sound = Diagnosis.quick(rendered)
+    assert not sound.faults, sound.best_guess()
+    first(Diagnosis.quick(inject(rendered, [fault])), kind)
+
+
+def test_command_names_the_fault_and_its_exit_code_says_so(tmp_path: Path) -> None:
+    flight = sg.simulate(trajectory="random", duration_s=8, seed=4, cameras=1)
+    flight.save(tmp_path / "flight")
+    sound = CliRunner().invoke(app, ["doctor", str(tmp_path / "flight")])
+    assert sound.exit_code == 0, sound.stdout
+    assert "nothing wrong was found" in sound.stdout
+    wrong = changed(flight.rig, lambda c: replace(c, time_offset_s=0.05))
+    write_kalibr(wrong, tmp_path / "chain.yaml")
+    words = ["doctor", str(tmp_path / "flight"), "--calibration", str(tmp_path / "chain.yaml")]
+    found = CliRunner().invoke(app, [*words, "--json"])
+    assert found.exit_code == 1
+    table = json.loads(found.stdout)
+    assert table["errors"] == 1
+    assert table["findings"][0]["kind"] == "time_offset"
+
+
+def test_real_images_have_no_faults(data_dir: Path) -> None:
+    for name in ("euroc/V1_01_easy_static_2s", "euroc/MH_01_easy_17s"):
+        diagnosis = Diagnosis.of(sg.open_dataset(data_dir / name))
+        assert not diagnosis.faults, diagnosis.best_guess()
+    kinds = {finding.kind for finding in diagnosis.findings}
+    assert {"camera_and_gyroscope", "stereo", "scale"} <= kinds
+
+
+def test_doubled_baseline_of_real_images(data_dir: Path) -> None:
+    recording = sg.open_dataset(data_dir / "euroc/MH_01_easy_17s")
+    one, two = recording.rig.cameras
+    relative = one.body_T_camera.between(two.body_T_camera)
+    moved = gtsam.Pose3(relative.rotation(), 2.0 * relative.translation())
+    far = replace(two, body_T_camera=one.body_T_camera * moved)
+    recording.rig = Rig((one, far), recording.rig.imu)
+    assert first(Diagnosis.of(recording), "baseline")["factor"] == pytest.approx(2.0, rel=0.1)
