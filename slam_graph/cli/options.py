@@ -177,6 +177,8 @@ Progress = Annotated[
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
+SUSPECT = 4
+"""Exit code of a run that came to its end, but may be wrong."""
 
 
 def sources_from(texts: list[str] | None) -> dict[str, str]:

@@ -22,6 +22,7 @@ from slam_graph.cli.console import (
 from slam_graph.cli.loading import loading
 from slam_graph.cli.options import (
     INTERRUPTED,
+    SUSPECT,
     Algorithm,
     Calibration,
     Cameras,
@@ -286,6 +287,9 @@ def report(result: RunResult, folder: Path, files: list[Path], as_json: bool) ->
     if result.status == "interrupted":
         typer.echo(f"{result.message}; what was done so far is written", err=True)
         raise typer.Exit(INTERRUPTED)
+    if result.status == "suspect":
+        typer.echo(f"error: {result.message}", err=True)
+        raise typer.Exit(SUSPECT)
     result.check()
 
 

@@ -167,7 +167,7 @@ def _series(tasks: list[RunTask], algorithm: str) -> list[Series]:
 
 def _is_whole(task: RunTask) -> bool:
     result = read_result(task.result)
-    return result is not None and result["metrics"]["status"] in ("ok", "low_coverage")
+    return result is not None and result["metrics"]["status"] in ("ok", "suspect", "low_coverage")
 
 
 def _curves(

@@ -31,6 +31,7 @@ from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
 from slam_graph.pipeline.supervision import finish, interrupts_between_frames, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
+from slam_graph.pipeline.verdict import Verdict
 from slam_graph.results import RunInput, RunResult
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def run(
         Observers(progress, recorder or NullRecorder()),
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
+        Verdict(result, diagnostics),
         GraphKeeping(result, estimator, graph_times, diagnostics),
         *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),

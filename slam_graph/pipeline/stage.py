@@ -24,7 +24,7 @@ from slam_graph.frontend import Feedback
 from slam_graph.geometry import NavState
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
-COMPLETED = ("ok", "low_coverage")
+COMPLETED = ("ok", "suspect", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
 
 _MESSAGE_LENGTH = 200

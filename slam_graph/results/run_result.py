@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _Ended = Literal[
     "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
 ]
-Status = Literal[_Ended, "unfinished"]
+Status = Literal[_Ended, "suspect", "unfinished"]
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
