@@ -49,7 +49,10 @@ def with_longer_lenses(rig: Rig) -> Rig:
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("wrong", "named"),
-    [(with_double_baseline, "calibrated baseline is"), (with_longer_lenses, "calibrated focal length is")],
+    [
+        (with_double_baseline, "calibrated baseline is"),
+        (with_longer_lenses, "calibrated focal length is"),
+    ],
 )
 def test_a_wrong_calibration_is_suspect(
     wrong: Callable[[Rig], Rig], named: str, data_dir: Path, tmp_path: Path
