@@ -218,7 +218,7 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
     monkeypatch.setattr(Picture, "png", lambda picture: empty)
     for module in (dataset_registry, eqvio):
         monkeypatch.setattr(module, "wheel_tracks", lambda: demo)
-    monkeypatch.setattr(executors, "_start", lambda text: text)
+    monkeypatch.setattr(executors, "_TaskProcess", lambda text: text)
     monkeypatch.setattr(executors, "_wait", do)
     monkeypatch.setattr(RerunStream, "_spawn", to_memory)
     monkeypatch.setattr(RerunRecording, "open", staticmethod(lambda recording: None))

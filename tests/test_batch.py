@@ -216,11 +216,15 @@ def test_all_processes_are_told_before_one_is_waited_for(
 ) -> None:
     numbers = itertools.count()
 
-    def start(_: str) -> subprocess.Popen[str]:
-        arguments = [sys.executable, "-c", WAITS_FOR_OTHERS, str(tmp_path), str(next(numbers)), "3"]
-        return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+    class Process(subprocess.Popen[str]):
+        def __init__(self, _: str) -> None:
+            waits = [sys.executable, "-c", WAITS_FOR_OTHERS, str(tmp_path), str(next(numbers)), "3"]
+            super().__init__(waits, stderr=subprocess.PIPE, text=True)
 
-    monkeypatch.setattr(executors, "_start", start)
+        def release(self) -> None:
+            """Nothing is held."""
+
+    monkeypatch.setattr(executors, "_TaskProcess", Process)
 
     def began() -> bool:
         return len(list(tmp_path.glob("*.began"))) == 3

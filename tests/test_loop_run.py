@@ -150,7 +150,8 @@ def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatc
 
         monkeypatch.setattr("slam_graph.pipeline.mapping.close_loops", fail)
         result = run(sequence, load_config(None, ["loop_closure.enabled=true"]))
-        assert result.status == "ok"
+        interrupted = isinstance(error, KeyboardInterrupt)
+        assert result.status == ("interrupted" if interrupted else "ok")
         assert len(result.trajectory) > 10
         assert result.loops is None
         assert result.warnings["loop_closure_failed"] >= 1

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +16,7 @@ from slam_graph.cli.console import ProgressBar, echo_json, echo_table
 from slam_graph.cli.options import ConfigFile, Json, Overrides
 
 if TYPE_CHECKING:
-    from slam_graph.simulation import SimulatedSequence
+    from slam_graph.datasets import SequenceInfo
 
 Kind = Literal["tracks", "images"]
 
@@ -109,13 +110,24 @@ def simulate(
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
         sequence.save(output, None if bar is None else lambda t: bar.advance(t, True))
-    _report(sequence, output, as_json)
+    report = sequence.flight.report
+    path = {} if report is None else {"path": report.as_dict()}
+    _report(sequence.info(), path, {} if report is None else report.lines(), output, as_json)
 
 
-def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:
-    info, report = sequence.info(), sequence.flight.report
-    if as_json:
-        path = {} if report is None else {"path": report.as_dict()}
+def _report(
+    info: SequenceInfo, path: Mapping[str, Any], lines: Mapping[str, str], output: Path, json: bool
+) -> None:
+    """Print what was simulated.
+
+    Args:
+        info: the recording.
+        path: what is known of a recorded path that was flown, as it is printed by `--json`.
+        lines: the same in words.
+        output: where the recording is.
+        json: whether to print JSON.
+    """
+    if json:
         echo_json({"folder": str(output), **asdict(info), **path})
         return
     rows = {
@@ -124,6 +136,4 @@ def _report(sequence: SimulatedSequence, output: Path, as_json: bool) -> None:
         "duration": f"{(info.end_ns - info.start_ns) * 1e-9:.2f} s",
         "IMU": f"{info.imu_samples} samples",
     }
-    if report is not None:
-        rows |= report.lines()
-    echo_table(rows.items())
+    echo_table((rows | dict(lines)).items())

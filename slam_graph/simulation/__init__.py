@@ -12,20 +12,17 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "SimulatedSequence",
     "SimulationConfig",
     "simulate",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.simulation.simulated_sequence import SimulatedSequence
     from slam_graph.simulation.simulation_config import SimulationConfig
     from slam_graph.simulation.simulator import simulate
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "simulated_sequence": ("SimulatedSequence",),
             "simulation_config": ("SimulationConfig",),
             "simulator": ("simulate",),
         },
