@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
-from benchmarks.faults import ALGORITHMS as FAULT_ALGORITHMS
-from benchmarks.faults import FAULTS, fault_key
 from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
@@ -250,24 +248,6 @@ def held_out(figures: Figures) -> Iterator[str]:
         yield line(f"`{name}`", *cells[:-1], f"{cells[-1]} / {figures.all(nees, 1, ', ')}")
 
 
-def faults(figures: Figures) -> Iterator[str]:
-    """What becomes of a run with a fault: segments, their error, and the time to the next one."""
-    yield line("fault", *(f"`{name}`" for name in FAULT_ALGORITHMS))
-    yield "|---" * (1 + len(FAULT_ALGORITHMS)) + "|"
-    for fault in FAULTS:
-        yield line(fault, *(_survival(figures, fault, name) for name in FAULT_ALGORITHMS))
-
-
-def _survival(figures: Figures, fault: str, algorithm: str) -> str:
-    """One cell: the error of the worst segment, and how the run went on."""
-    run = f"faults.{fault_key(fault)}.{algorithm}"
-    cell = f"× {figures(f'{run}.segment_ratio', 1)}"
-    if figures(f"{run}.segments", 0) != "1":
-        cell += f", {figures(f'{run}.segments', 0)} segments"
-        cell += f", {figures(f'{run}.recovered_in', 1)} s"
-    return cell if figures(f"{run}.completed", 0) == "1" else f"{cell}, ends"
-
-
 def line(*cells: str, width: int = 0) -> str:
     """A line of a table, filled up with empty cells; an empty one is a single blank."""
     filled = (*cells, *("" for _ in range(width - len(cells))))
@@ -285,6 +265,5 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "peers": peers,
     "kernels": kernels,
     "growth": growth,
-    "faults": faults,
 }
 """By the name in the marker of a document."""

@@ -73,6 +73,7 @@ def appearing(path: Path) -> Iterator[Path]:
             yield path
         return
     partial = _hidden(path)
+    _remove_remains_of(path)
     try:
         with writing(path):
             yield partial
@@ -141,13 +142,30 @@ def remove_remains(folder: Path) -> None:
         folder: of the files; folders in it are not searched.
     """
     for path in folder.glob(".*.partial"):
-        found = _PARTIAL.match(path.name)
-        if not found or found["host"] != _host() or _lives(int(found["pid"])):
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            _forget(path)
+        _remove_if_left(path)
+
+
+def _remove_remains_of(path: Path) -> None:
+    """Remove what killed processes of this machine left of a file that is written again."""
+    try:
+        left = [
+            found for found in path.parent.glob(".*.partial") if partial_name(found) == path.name
+        ]
+    except OSError:  # the folder is not there: whoever writes into it says so
+        return
+    for partial in left:
+        _remove_if_left(partial)
+
+
+def _remove_if_left(path: Path) -> None:
+    """Remove a hidden file or folder if the process of this machine that wrote it is gone."""
+    found = _PARTIAL.match(path.name)
+    if not found or found["host"] != _host() or _lives(int(found["pid"])):
+        return
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        _forget(path)
 
 
 def _hidden(path: Path) -> Path:

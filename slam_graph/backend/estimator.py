@@ -149,6 +149,7 @@ class Estimator:
         self._before, self.joint = before, None
         if self._held is not None:
             self._held.clear()
+        self._check.forget()
         self._begin(self._context.imu)
 
     def add_imu(self, imu: ImuData) -> None:

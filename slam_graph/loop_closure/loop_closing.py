@@ -80,11 +80,16 @@ class LoopClosures:
             Rotation.from_matrix(mixed.rotations).as_quat(),
         )
 
-    def across(self, begin_ns: int) -> int:
-        """How many accepted loop closures join what is before a time with what is after it."""
+    def across(self, begin_ns: int, end_ns: int) -> int:
+        """How many accepted loop closures join what is before a segment with the segment.
+
+        Args:
+            begin_ns: time of its first state.
+            end_ns: time of its last state.
+        """
         kept = (self.loops[k] for k in np.flatnonzero(self.accepted))
         times = [[self.keyframes[k].stamp_ns for k in (loop.first, loop.second)] for loop in kept]
-        return sum(min(pair) < begin_ns <= max(pair) for pair in times)
+        return sum(min(pair) < begin_ns <= max(pair) <= end_ns for pair in times)
 
     def csv_lines(self) -> Iterator[str]:
         """The loop closures that passed verification, as CSV."""

@@ -145,6 +145,7 @@ class Estimation:
         except DivergenceError as error:
             self._recovery.begin_segment(error)
             self._start = KnownStart()
+            self._result.start_was_given &= len(self._result.segments) > 0
             state, lost = None, True
         tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.report.timings.items()})
         ids, points = estimator.landmarks()
@@ -204,7 +205,8 @@ class Estimation:
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
-            result.start_was_given &= estimator.start_is_given
+            if len(result.segments) < 2:
+                result.start_was_given &= estimator.start_is_given
         if state is not None:
             check_sane(state, result.config.limits)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)

@@ -138,7 +138,7 @@ class LoopClosing(Stage):
                 result.segments.later,
             )
             for segment in result.segments.later:
-                segment.loops = closures.across(segment.begin_ns)
+                segment.loops = closures.across(segment.begin_ns, segment.end_ns)
             logger.info(
                 "loop closure: %d keyframes, %d loop closures, %d accepted, %.1f s in all",
                 len(self._keyframes.found),

@@ -106,9 +106,9 @@ class Recovery:
         result = self._result
         if not result.config.limits.recovery:
             raise lost
-        self._forget_bad_states(self._agreement.agreed_until())
+        good_ns = self._forget_bad_states(self._agreement.agreed_until())
         before = self._recent[-1] if self._recent else None
-        lasted_s = result.segments.end(None if before is None else before.stamp_ns, str(lost))
+        lasted_s = result.segments.end(good_ns, str(lost))
         end_ns = result.segments[-1].end_ns if len(result.segments) else None
         result.forget_states(None if end_ns is None else end_ns + 1)
         self._short = self._short + 1 if lasted_s < _SHORT_S else 0
@@ -118,11 +118,16 @@ class Recovery:
         self._estimator.begin_segment(before)
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
 
-    def _forget_bad_states(self, good_ns: int | None) -> None:
-        """Forget the states of the present segment after a time, or all of them."""
+    def _forget_bad_states(self, good_ns: int | None) -> int | None:
+        """Forget the states of the present segment after a time, or all of them.
+
+        Returns:
+            Until when its states are good; None if none is.
+        """
         segments = self._result.segments
         if not segments.goes_on:
-            return
+            return None
         last_ns = segments[-1].begin_ns - 1 if good_ns is None else good_ns - _MARGIN_NS
         while self._recent and self._recent[-1].stamp_ns > last_ns:
             self._recent.pop()
+        return None if good_ns is None else last_ns

@@ -74,11 +74,16 @@ class Smoothing(Stage):
     def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
         calibrated = result.logs.calibration.latest
-        groups = result.segments.worlds()
+        segments = result.segments
+        parts: list[tuple[int, int | None]] = [
+            (group[0].begin_ns, group[-1].end_ns) for group in segments.worlds()
+        ]
+        if segments.goes_on:  # the last one has the rest of the recording
+            parts[-1] = parts[-1][0], None
         result.final_ba = backend.adjust_worlds(
             log,
             result.trajectory,
-            [(group[0].begin_ns, group[-1].end_ns) for group in groups],
+            parts,
             result.causal_rig if calibrated is None else calibrated.rig,
             result.config.backend,
             result.config.final_ba,

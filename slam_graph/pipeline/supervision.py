@@ -21,7 +21,7 @@ from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import LimitsConfig
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.stage import Stage
+from slam_graph.pipeline.stage import COMPLETED, Stage
 from slam_graph.results import RunResult
 
 _LONGEST_GAP_S = 0.5
@@ -99,6 +99,7 @@ class Agreement:
         self._tests: deque[_Test] = deque()
         self._tested_s = 0.0
         self._last_ns: int | None = None
+        self._earlier_ns: int | None = None  # of the newest test that is not kept any more
 
     def check(self, stamp_ns: int, innovations: Innovations) -> None:
         """Add the tests of the next frame.
@@ -115,7 +116,7 @@ class Agreement:
         self._tests.append(new)
         begin_s = self._tested_s - self._limits.disagreement_s
         while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._limits.disagreement_s:
-            self._tests.popleft()
+            self._earlier_ns = self._tests.popleft().stamp_ns
         if self._tests[0].tested_s > begin_s:
             return
         late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
@@ -143,7 +144,7 @@ class Agreement:
             ratio += rejected * lost + (tests[k].tested - rejected) * kept
             if ratio >= highest:
                 highest, first = ratio, k
-        return tests[first - 1].stamp_ns if first else None
+        return tests[first - 1].stamp_ns if first else self._earlier_ns
 
 
 @contextmanager
@@ -180,8 +181,9 @@ def finish(stages: Iterable[Stage], result: RunResult) -> None:
                 waiting.popleft().finish()
         except KeyboardInterrupt as interrupt:
             ending = result.ending
-            ending.status, ending.error = "interrupted", interrupt
-            ending.message = "interrupted after the last frame"
+            if ending.status in COMPLETED:  # what went wrong before says more
+                ending.status, ending.error = "interrupted", interrupt
+                ending.message = "interrupted after the last frame"
 
 
 def _judge(result: RunResult, estimator: Estimator) -> None:

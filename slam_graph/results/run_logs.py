@@ -120,6 +120,7 @@ class CalibrationLog:
     def __init__(self) -> None:
         self.latest: CalibrationEstimate | None = None
         self._rows: list[tuple[int, list[float]]] = []
+        self._estimates: list[CalibrationEstimate] = []
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -127,15 +128,16 @@ class CalibrationLog:
     def append(self, estimate: CalibrationEstimate) -> None:
         """Add the estimate at the next frame."""
         self.latest = estimate
+        self._estimates.append(estimate)
         parameters = estimate.parameters()
         values = [parameter.value for parameter in parameters]
         self._rows.append((estimate.stamp_ns, values + [p.sigma for p in parameters]))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the estimates at and after a time; where none is left, the last one too."""
-        del self._rows[bisect_left(self._rows, stamp_ns, key=lambda row: row[0]) :]
-        if not self._rows:
-            self.latest = None
+        kept = bisect_left(self._estimates, stamp_ns, key=lambda estimate: estimate.stamp_ns)
+        del self._rows[kept:], self._estimates[kept:]
+        self.latest = self._estimates[-1] if kept else None
 
     def table(self) -> dict[str, dict[str, Any]] | None:
         """The last estimate: start, value and standard deviation of each parameter by its name."""

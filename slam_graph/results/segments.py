@@ -24,6 +24,9 @@ _COLUMNS = (
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "loops", "ended_by"),
 )
 
+_UNKNOWN = np.diag([1000.0**2] * 3 + [np.pi**2])
+"""Covariance of a place of which nothing is known: m², rad²."""
+
 
 @dataclass(eq=False)
 class Segment:
@@ -106,7 +109,8 @@ class Segments:
         """
         if not self.goes_on:
             by: JoinedBy = "start" if not self._all else "imu" if joined else "none"
-            known = np.zeros((4, 4)) if joint is None else joint
+            known = _UNKNOWN if joint is None else joint
+            known = np.zeros((4, 4)) if by == "start" else known
             self._all.append(Segment(stamp_ns, stamp_ns, by, known))
         self._all[-1].end_ns = stamp_ns
 

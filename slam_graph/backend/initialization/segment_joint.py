@@ -64,8 +64,10 @@ def place(window: Window, before: NavState, context: EngineContext) -> tuple[Win
         context: shared with the engine; it has the IMU samples from that state on.
     """
     start = window.current(window.prior)
-    predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
-    measured = context.imu.covers(before.stamp_ns)
+    measured = context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
+    predicted = before
+    if measured:
+        predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
     joint = SegmentJoint(before, predicted, measured and not contradict(start, predicted))
     return moved(window, level_motion(start.world_T_body, predicted.world_T_body)), joint
 

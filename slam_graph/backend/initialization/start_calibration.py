@@ -105,6 +105,12 @@ class StartCalibration:
         self.done = not config.initialization.check_calibration and self.mounted
         self.waiting_for = "rotation about two axes, to find how the camera is mounted"
 
+    def forget(self) -> None:
+        """Forget all frames: those that follow do not continue them."""
+        self._frames.clear()
+        self._turns.clear()
+        self.recent.clear()
+
     def add(self, frame: FeatureFrame, imu: ImuBuffer, started: bool) -> FoundCalibration | None:
         """Take the next frame.
 
@@ -117,9 +123,7 @@ class StartCalibration:
             A calibration that the old one contradicts; None as long as there is none.
         """
         if self.done:
-            self._frames.clear()
-            self._turns.clear()
-            self.recent.clear()
+            self.forget()
             return None
         self.recent.append(frame)
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:

@@ -80,7 +80,7 @@ class FinalBa:
 def adjust_worlds(
     log: FrameLog,
     causal: Trajectory,
-    worlds: Sequence[tuple[int, int]],
+    worlds: Sequence[tuple[int, int | None]],
     rig: Rig,
     backend: BackendConfig,
     config: FinalBaConfig,
@@ -91,8 +91,8 @@ def adjust_worlds(
     Args:
         log: all frames.
         causal: as for `adjust_recording`.
-        worlds: times of the first and the last state of each part, in the order of time. Frames
-            before the first part belong to it, and those after the last one to that.
+        worlds: times of the first and the last state of each part, in the order of time; None for
+            the end of the recording. Frames before the first part belong to it.
         rig: as for `adjust_recording`.
         backend: noise and triangulation.
         config: settings.
@@ -100,13 +100,21 @@ def adjust_worlds(
     """
     parts: list[FinalBa] = []
     for number, (begin_ns, end_ns) in enumerate(worlds):
-        inside = (causal.stamps_ns >= begin_ns) & (causal.stamps_ns <= end_ns)
+        inside = causal.stamps_ns >= begin_ns
+        if end_ns is not None:
+            inside &= causal.stamps_ns <= end_ns
         offset_ns = round(rig.pose_offset_s * 1e9)
         part = log.part(
             None if number == 0 else begin_ns - offset_ns,
-            None if number == len(worlds) - 1 else end_ns - offset_ns,
+            None if end_ns is None else end_ns - offset_ns,
         )
-        found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+        try:
+            found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+        except EstimationError as error:
+            if len(worlds) == 1:
+                raise
+            logger.warning("part %d of the recording is not smoothed: %s", number, error)
+            continue
         if found is not None:
             parts.append(found)
     if len(parts) < 2:
