@@ -171,6 +171,17 @@ def test_images_agreed_until_the_rejections_began() -> None:
     assert until == 39 * step_ns
 
 
+def test_agreement_is_remembered_however_slowly_it_is_lost() -> None:
+    """A share between good and lost over a long time: what was good before it stays known."""
+    agreement, step_ns = Agreement(LimitsConfig()), 10**8
+    for k in range(1200):
+        rejected = 0 if k < 1000 else 4
+        agreement.check(k * step_ns, Innovations(tested=10, rejected=rejected))
+    until = agreement.agreed_until()
+    assert until is not None
+    assert until > 900 * step_ns
+
+
 def test_a_window_in_a_moved_world_knows_the_same() -> None:
     rng = np.random.default_rng(0)
     state, zero = State(), np.zeros(3)
