@@ -33,6 +33,11 @@ def main() -> None:
     code = run_command()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # all is written: what ends now is the interpreter
+    if code == _INTERRUPTED:
+        # Python kills itself with SIGINT at its end where `exec` of a text was interrupted, as in
+        # the import of a data class, although the interrupt was handled; the code would be lost
+        sys.stderr.flush()
+        os._exit(_INTERRUPTED)
     sys.exit(code)
 
 
