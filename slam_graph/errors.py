@@ -25,7 +25,7 @@ class SlamGraphError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __str__(self) -> str:
-        line = " ".join(super().__str__().splitlines())  # it may quote a file of a stranger
+        line = " ".join(super().__str__().splitlines())  # it may quote a file from anywhere
         return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} …"
 
 

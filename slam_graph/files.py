@@ -68,7 +68,11 @@ def appearing(path: Path) -> Iterator[Path]:
     Raises:
         DataError: if it cannot be written.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
+    with writing(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        device = path.exists() and not path.is_file()
+    if device:
         with writing(path):
             yield path
         return

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Signals: what may not be cut in two, SIGTERM as Ctrl-C, and processes that outlive nobody."""
+"""Signals: work that Ctrl-C must not cut, SIGTERM as Ctrl-C, processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -18,11 +18,50 @@ _GRACE_S = 10.0
 """Time for a process to end after Ctrl-C before it is killed."""
 
 
+class Deferred:
+    """A handler of SIGINT that only notes the first signal; a second one takes effect at once.
+
+    Attributes:
+        heard: whether there was a signal.
+    """
+
+    def __init__(self) -> None:
+        self.heard = False
+        self._before: signal._HANDLER | None = None
+
+    def __call__(self, signum: int, frame: FrameType | None) -> None:
+        """Note a signal."""
+        if self.heard:
+            raise KeyboardInterrupt
+        self.heard = True
+
+    def install(self) -> None:
+        """Take the place of the handler; not where SIGINT is ignored, as in a background job.
+
+        Outside the main thread, which alone gets signals, this changes nothing.
+        """
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+            self._before = signal.signal(signal.SIGINT, self)
+
+    def restore(self) -> None:
+        """Give the place back."""
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def check(self) -> None:
+        """Let a signal that was noted take effect.
+
+        Raises:
+            KeyboardInterrupt: if there was one.
+        """
+        if self.heard:
+            raise KeyboardInterrupt
+
+
 @contextmanager
 def completed() -> Iterator[Callable[[], None]]:
     """Let Ctrl-C wait until the block has ended; a second one takes effect at once.
-
-    Outside the main thread, which alone gets signals, this changes nothing.
 
     Yields:
         A function to call where the part of the block begins that is to be completed.
@@ -30,27 +69,30 @@ def completed() -> Iterator[Callable[[], None]]:
     Raises:
         KeyboardInterrupt: at the end, if there was a Ctrl-C meanwhile.
     """
-    pending = False
-    before = None
-
-    def note(signum: int, frame: FrameType | None) -> None:
-        nonlocal pending
-        if pending:
-            raise KeyboardInterrupt
-        pending = True
-
-    def begin() -> None:
-        nonlocal before
-        if threading.current_thread() is threading.main_thread():
-            before = signal.signal(signal.SIGINT, note)
-
+    deferred = Deferred()
     try:
-        yield begin
+        yield deferred.install
     finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
-    if pending:
-        raise KeyboardInterrupt
+        deferred.restore()
+    deferred.check()
+
+
+@contextmanager
+def between_steps() -> Iterator[Callable[[], None]]:
+    """Let Ctrl-C take effect between two steps, so that no step is left half done.
+
+    A second one takes effect at once.
+
+    Yields:
+        A function to call after each step; it raises KeyboardInterrupt after a Ctrl-C.
+    """
+    deferred = Deferred()
+    deferred.install()
+    try:
+        yield deferred.check
+        deferred.check()
+    finally:
+        deferred.restore()
 
 
 def terminate_like_interrupt() -> None:
@@ -89,6 +131,7 @@ def end_with(pipe: int) -> None:
 class Interrupts:
     """What is done about signals."""
 
+    between_steps = staticmethod(between_steps)
     completed = staticmethod(completed)
     end_with = staticmethod(end_with)
     terminate_like_interrupt = staticmethod(terminate_like_interrupt)

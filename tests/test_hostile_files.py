@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of strangers: names in them are never paths, and what is wrong is one line of ours."""
+"""Untrusted files: names in them are never paths, and what is wrong is one line of ours."""
 
 import bz2
 import shutil

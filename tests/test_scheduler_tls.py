@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A Dask scheduler that asks for TLS: the files are passed on, and without them nobody gets in."""
+"""A Dask scheduler that asks for TLS: with the files there is a connection, without them none."""
 
 import json
 import shutil
@@ -83,7 +83,7 @@ def test_a_task_is_done_by_tls(scheduler: str, files: dict[str, Path], tmp_path:
     assert wanted.is_done()
 
 
-def test_without_the_files_nobody_gets_in(scheduler: str, tmp_path: Path) -> None:
+def test_without_the_files_there_is_no_connection(scheduler: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no Dask scheduler answers at 'tls://"):
         next(DaskCluster(scheduler).do([task(tmp_path)]))
 

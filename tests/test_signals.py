@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Signals at any moment: a valid result that says how it ended, and nobody is left behind."""
+"""Signals at any moment: a valid result that says how it ended, and no process is left."""
 
 import os
 import signal

@@ -197,7 +197,7 @@ def _do_in_process(task: str) -> str | None:
 
 
 class _TaskProcess(subprocess.Popen[str]):
-    """The process of a task; Ctrl-C in the terminal does not reach it, and it outlives nobody.
+    """The process of a task, which ends with this one; Ctrl-C in the terminal does not reach it.
 
     Args:
         task: as JSON.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map files: a zip archive with `map.json` and arrays in NumPy's format (docs/maps.md).
 
-Files may come from strangers. Nothing in a file is executed, and members are stored uncompressed,
+Files may be untrusted. Nothing in a file is executed, and members are stored uncompressed,
 so that no array is larger than the file; type and shape of an array are checked before it is read,
 and its values afterwards (`_check_map`).
 """
@@ -107,7 +107,7 @@ def write_map(path: str | Path, content: SlamMap) -> None:
 
 
 def read_map(path: str | Path) -> SlamMap:
-    """Read a map file, which may come from a stranger.
+    """Read a map file, which may be untrusted.
 
     Raises:
         DataError: if it is no map, of a newer version, damaged, or inconsistent.

@@ -14,6 +14,7 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import Sequence, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
+from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline.estimation import Estimation
 from slam_graph.pipeline.observers import (
     GraphKeeping,
@@ -29,7 +30,7 @@ from slam_graph.pipeline.observers import (
 )
 from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import Stage
-from slam_graph.pipeline.supervision import finish, interrupts_between_frames, outcome
+from slam_graph.pipeline.supervision import finish, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
 from slam_graph.pipeline.verdict import Verdict
 from slam_graph.results import RunInput, RunResult
@@ -99,7 +100,7 @@ def run(
     with ExitStack() as resources:
         with (
             outcome(result, estimator),
-            interrupts_between_frames() as frame_done,
+            Interrupts.between_steps() as frame_done,
             closing(tracking.run()) as packets,
         ):
             for stage in stages:

@@ -6,14 +6,11 @@ from __future__ import annotations
 
 import logging
 import math
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import FrameType
 
 import numpy as np
 
@@ -204,36 +201,3 @@ def _judge(result: RunResult, estimator: Estimator) -> None:
             f"the estimate covers {result.coverage:.1%} of the {result.input.recorded_s:.1f} s "
             f"asked for, less than min_coverage = {asked:.1%}"
         )
-
-
-@contextmanager
-def interrupts_between_frames() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C take effect between two frames, so that no frame is left half noted.
-
-    A second Ctrl-C takes effect at once. Outside the main thread, which alone gets signals, this
-    changes nothing.
-
-    Yields:
-        A function to call after each frame; it raises KeyboardInterrupt after a Ctrl-C.
-    """
-    pending = False
-
-    def note(signum: int, frame: FrameType | None) -> None:
-        nonlocal pending
-        if pending:
-            raise KeyboardInterrupt
-        pending = True
-
-    def frame_done() -> None:
-        if pending:
-            raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield frame_done
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield frame_done
-        frame_done()
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The one reader of YAML files: of those of strangers, too.
+"""The one reader of YAML files, untrusted ones among them.
 
 It is PyYAML's safe loader with bounds: on the depth of the nesting (its composer is recursive), on
 what aliases repeat (ten lines of aliases of aliases make 10⁹ values), and on the digits of whole
