@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Signals: work that Ctrl-C must not cut, SIGTERM as Ctrl-C, processes that end with their parent."""
+"""Signals: work that Ctrl-C must not cut, SIGTERM as Ctrl-C, children that end with us."""
 
 from __future__ import annotations
 
