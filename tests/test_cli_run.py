@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,7 @@ def test_an_interrupted_run_keeps_what_was_done(tmp_path: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
     ) as process:
         deadline = time.monotonic() + HANG_S
         while not list(tmp_path.glob("results/*/*")) and time.monotonic() < deadline:
