@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.recordings import is_held_out
-from slam_graph.datasets import dataset_from_arrays
-from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets import RecordedSequence, dataset_from_arrays
 from slam_graph.sensors import FeatureFrame, ImuData
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
@@ -59,7 +58,7 @@ def flown_by_camera(
     )
 
 
-def without_start(sequence: SimulatedSequence) -> Sequence:
+def without_start(sequence: SimulatedSequence) -> RecordedSequence:
     """The recording without the state that comes with it."""
     packets = list(sequence.packets())
     imu = ImuData.concatenate([packet.imu for packet in packets])

@@ -102,6 +102,26 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     return now
 
 
+def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
+    """The same for a calibration that is right or nearly so: a tenth of the time.
+
+    Unit and axes of the gyroscope are taken as they are, and the fit starts as calibrated.
+    """
+    now = CameraAndGyroscope(rig, parts, [Gyroscope(part.imu) for part in parts])
+    camera = rig.cameras[0]
+    pairs = frame_pairs(now.parts, now.gyroscopes, camera, turns=False)
+    if len(pairs) < _FEWEST_PAIRS:
+        return now
+    R = camera.body_T_camera.rotation().matrix()
+    start = Kinematics(camera.clock_offset_s, 1.0, camera.readout_s, R, np.zeros(3))
+    try:
+        now.fit = RotationProblem(pairs, now.gyroscopes, camera).solve(start)
+    except np.linalg.LinAlgError:
+        return now
+    _judge(now, now.fit)
+    return now
+
+
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:
     camera = now.rig.cameras[0]
     R = camera.body_T_camera.rotation().matrix()

@@ -35,7 +35,7 @@ class FramePair:
         first_s, second_s: times on the camera's clock, since the start of the part's gyroscope.
         first, second: (N, 2) pixels.
         turn: (3,) rotation vector of first_R_second of the camera by the calibrated lens; None
-            where the features do not show it.
+            where the features do not show it, or it is not asked for.
     """
 
     part: int
@@ -47,9 +47,16 @@ class FramePair:
 
 
 def frame_pairs(
-    parts: list[Part], gyroscopes: list[Gyroscope], camera: RigCamera
+    parts: list[Part], gyroscopes: list[Gyroscope], camera: RigCamera, turns: bool = True
 ) -> list[FramePair]:
-    """Pairs that follow one another, over all parts; where there are many, every n-th."""
+    """Pairs that follow one another, over all parts; where there are many, every n-th.
+
+    Args:
+        parts: with frames.
+        gyroscopes: of the parts.
+        camera: the first one.
+        turns: whether to look how the camera turns by the features alone, which takes most time.
+    """
     chosen = []
     for number, part in enumerate(parts):
         seen = [f for f in part.frames if f.cameras and len(f.cameras[0]) >= _FEWEST]
@@ -61,7 +68,7 @@ def frame_pairs(
             k = max(second, k + 1)
     stride = -(-len(chosen) // _PAIRS)
     return [
-        _pair(number, one, two, gyroscopes[number], camera)
+        _pair(number, one, two, gyroscopes[number], camera if turns else None)
         for number, one, two in chosen[:: max(stride, 1)]
     ]
 
@@ -83,12 +90,14 @@ def _pair(
     one: FeatureFrame,
     two: FeatureFrame,
     gyroscope: Gyroscope,
-    mounted: RigCamera,
+    mounted: RigCamera | None,
 ) -> FramePair:
-    """The common features of two frames, thinned to a bounded number."""
+    """The common features of two frames, thinned to a bounded number; a camera to see turns by."""
     a, b = one.cameras[0], two.cameras[0]
     _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
+    found = None
+    if mounted is not None:
+        found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
     turn = None if found is None else Rotation.from_matrix(found.R).as_rotvec()
     times = gyroscope.seconds(np.array([one.stamp_ns, two.stamp_ns]))
     step = max(1, len(i) // _FEATURES)

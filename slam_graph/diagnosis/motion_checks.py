@@ -16,9 +16,12 @@ from slam_graph.diagnosis.mountings import axes_text, signed_permutations
 from slam_graph.diagnosis.rotation_fit import RotationFit
 from slam_graph.sensors import FeatureFrame, Rig
 
-_WINDOW_S, _SPACING_S = 3.0, 0.14
-_WINDOWS = 6
-"""Most windows: those with the liveliest motion."""
+_SPACING_S = 0.14
+_WINDOW_S, _WINDOWS = 3.0, 6
+"""Length of the windows that show axes, and most of them: those with the liveliest motion."""
+_SHORT_S, _SHORT_WINDOWS = 1.5, 16
+"""The same of those that show the baseline: rotations are of the gyroscope alone, whose errors grow
+with time, and bend the scale of a window of 3 s by a tenth."""
 _FEWEST_FEATURES = 10
 _LEAST_VARIATION = 0.25
 """Standard deviation of the specific force in the world, m/s², of a window that shows something."""
@@ -30,45 +33,57 @@ _CLEARER = 1.12
 """Residuals with the axes as they are must be so many times those with others …"""
 _BEHIND = 0.2
 """… or at most such a share of the observations in front of the camera."""
-_BASELINE, _BAD_BASELINE = 0.18, 0.3
+_BASELINE, _BAD_BASELINE = 0.1, 0.3
 """Logarithms of wrong baselines that are a warning, and an error."""
 _BASELINE_SIGMAS = 6.0
+_FEWEST_WINDOWS = 3
 _LEAST_SIGMA = 0.025
 """No window knows the baseline better."""
 _UNSURE = 0.15
 """A window that knows the baseline less well is left out."""
 
 
-def check_motion(now: CameraAndGyroscope, fit: RotationFit, stereo: bool) -> list[Finding]:
+def check_motion(
+    now: CameraAndGyroscope, fit: RotationFit, stereo: bool, axes_known: bool = False
+) -> list[Finding]:
     """The findings.
 
     Args:
         now: what camera and gyroscope say, with the rig corrected.
         fit: of both.
         stereo: whether the second camera is to be used.
+        axes_known: whether the accelerometer's axes are not looked at.
     """
     rig = now.rig if stereo else now.rig.select(1)
-    windows = _windows(now, fit, rig)
+    windows = _windows(now, fit, rig, _SHORT_S)[:_SHORT_WINDOWS]
+    axes, found = np.eye(3), list[Finding]()
+    if not axes_known:
+        long = _windows(now, fit, rig, _WINDOW_S)[:_WINDOWS]
+        axes, found = _axes(long) if long else (axes, found)
     if not windows:
         text = "too little motion to check the accelerometer's axes and the scale"
-        return [Finding("moves_too_little", "info", text, "record livelier motion")]
-    axes, found = _axes(windows)
+        return [*found, Finding("moves_too_little", "info", text, "record livelier motion")]
+    if len(rig.cameras) < 2:
+        return found
     solutions = [s for window in windows if (s := window.solve(axes)) is not None]
     return found + _baseline(solutions, rig)
 
 
-def _windows(now: CameraAndGyroscope, fit: RotationFit, rig: Rig) -> list[Window]:
+def _windows(
+    now: CameraAndGyroscope, fit: RotationFit, rig: Rig, length_s: float
+) -> list[Window]:
+    """Windows that show something, the liveliest first."""
     found: list[Window] = []
     for part, gyroscope in zip(now.parts, now.gyroscopes, strict=True):
         frames = _thinned([_seen(frame, rig) for frame in part.frames if frame.cameras])
         end_s = gyroscope.t[-1] - abs(fit.values.offset_s) - 0.05
         frames = [f for f in frames if gyroscope.seconds(np.array(f.stamp_ns)) < end_s]
-        count = round(_WINDOW_S / _SPACING_S)
+        count = round(length_s / _SPACING_S)
         for k in range(0, len(frames) - count + 1, count):
             window = Window(frames[k : k + count], gyroscope, rig, fit.values)
             if window.features >= _FEWEST_FEATURES and window.variation > _LEAST_VARIATION:
                 found.append(window)
-    return sorted(found, key=lambda w: -w.variation)[:_WINDOWS]
+    return sorted(found, key=lambda w: -w.variation)
 
 
 def _seen(frame: FeatureFrame, rig: Rig) -> FeatureFrame:
@@ -134,7 +149,7 @@ def _baseline(solutions: list[WindowSolution], rig: Rig) -> list[Finding]:
         for s in solutions
         if s.baseline > 0.0 and s.baseline_sigma < _UNSURE * s.baseline
     ]
-    if len(rig.cameras) < 2 or len(factors) < 2:
+    if len(factors) < _FEWEST_WINDOWS:
         return []
     logs = np.log([f for f, _ in factors])
     factor = float(np.exp(np.median(logs)))

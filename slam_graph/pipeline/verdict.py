@@ -1,36 +1,109 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a run: what its first seconds say about sensors and calibration.
+"""The verdict on a run: what its first seconds say about calibration, units and clocks.
 
-A run with a wrong calibration may come to its end, with errors that nothing in it shows. So a run
-that failed, or was not smooth, is followed by a diagnosis of the tracks around its start. If that
-finds an error in what the run was given, the run is `suspect`, whatever it has estimated.
+A run with a wrong calibration may come to its end, with errors that nothing in it shows. So every
+run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
+or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
+is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Iterable
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import EstimationError
+from slam_graph.errors import DataError, EstimationError
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame, ImuData, Rig
+from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
-_KEPT_NS, _AFTER_START_NS = 10_000_000_000, 8_000_000_000
-"""So much of the recording is looked at, most of it after the start: that takes 2 s of work."""
+if TYPE_CHECKING:
+    from slam_graph.diagnosis import Diagnosis
+    from slam_graph.diagnosis.finding import Finding
+
+_KEPT_NS = 24_000_000_000
+"""So much of the recording is looked at: what came after the start, as far as it goes."""
+_SPACING_NS = 90_000_000
+"""Time between frames that are kept."""
+_PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
+"""Images of two cameras that are kept, and the time between them."""
+_FIRST_LOOK_NS = 5_000_000_000
+"""A run that has waited so long for its first state is looked at, and again after twice that."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
 _MAX_REJECTED = 0.05
 """The same for the share of features that the gate rejects. Of good recordings it is 2 to 4 %."""
+_FEWEST_SHARED = 0.25
+"""The same for the share of features that the second camera sees, where it sees any: half of them
+and more where cameras are mounted side by side."""
 
 logger = logging.getLogger(__name__)
 
 
+class _Memory:
+    """What is kept of a recording: features, IMU samples and a few pairs of images."""
+
+    def __init__(self, pairs: bool) -> None:
+        """Begin with nothing; `pairs` says whether images of two cameras are of use."""
+        self._frames: deque[tuple[FeatureFrame, ImuData]] = deque()
+        self._since: list[ImuData] = []
+        self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def frames(self) -> list[FeatureFrame]:
+        """Features of the frames that are kept."""
+        return [features for features, _ in self._frames]
+
+    @property
+    def imu(self) -> ImuData:
+        """All samples between them."""
+        return ImuData.concatenate([samples for _, samples in self._frames])
+
+    @property
+    def pairs(self) -> list[CameraFrame]:
+        """Images of the first two cameras."""
+        return list(self._pairs or ())
+
+    @property
+    def shared(self) -> float:
+        """Share of the features of the first camera that the second one sees, the median."""
+        seen = [frame.cameras for frame in self.frames if len(frame.cameras) > 1]
+        shares = [np.isin(c[0].ids, c[1].ids).mean() for c in seen if len(c[0])]
+        return float(np.median(shares)) if shares else 0.0
+
+    def add(self, frame: EstimatedFrame) -> None:
+        """Keep a frame, if the last one was long enough ago, and forget old ones."""
+        stamp_ns, frames = frame.features.stamp_ns, self._frames
+        self._since.append(frame.imu)
+        if frames and stamp_ns - frames[-1][0].stamp_ns < _SPACING_NS:
+            return
+        frames.append((frame.features, ImuData.concatenate(self._since)))
+        self._since = []
+        while frames[0][0].stamp_ns < stamp_ns - _KEPT_NS:
+            frames.popleft()
+        images, pairs = frame.packet.frame, self._pairs
+        if pairs is None or not isinstance(images, CameraFrame):
+            return
+        if pairs and stamp_ns - pairs[-1].stamp_ns < _PAIRS_APART_NS:
+            return
+        first, second = images.images[:2]
+        if first is not None and second is not None:
+            pairs.append(images)
+
+
 class Verdict(Stage):
-    """Keeps the frames around the start of a run, and judges by them whether it can be trusted.
+    """Keeps frames around the start of a run, and judges by them whether it can be trusted.
 
     Args:
         result: of the run; its status and message say the verdict.
@@ -39,44 +112,88 @@ class Verdict(Stage):
 
     def __init__(self, result: RunResult, diagnostics: Diagnostics) -> None:
         self._result, self._diagnostics = result, diagnostics
-        self._kept: deque[tuple[FeatureFrame, ImuData]] = deque()
+        self._kept = _Memory(len(result.input.rig.cameras) > 1)
         self._started_ns: int | None = None
+        self._first_ns: int | None = None
+        config = result.config
+        refusing = config.limits.refuse_wrong_setup
+        refusing &= config.backend.initialization.check_calibration
+        self._look_ns = _FIRST_LOOK_NS if refusing else None
 
     def frame(self, frame: EstimatedFrame) -> None:
-        """Keep a frame, unless there are enough after the start."""
+        """Keep a frame, unless there are enough after the start.
+
+        Raises:
+            DataError: if the run waits for its first state, and what it was given is certainly
+                wrong.
+        """
         stamp_ns = frame.features.stamp_ns
         if frame.restarted or not frame.initialized:
             self._started_ns = None
         elif self._started_ns is None:
             self._started_ns = stamp_ns
-        elif stamp_ns > self._started_ns + _AFTER_START_NS:
+        elif stamp_ns > self._started_ns + _KEPT_NS:
             return
-        self._kept.append((frame.features, frame.imu))
-        while self._kept[0][0].stamp_ns < stamp_ns - _KEPT_NS:
-            self._kept.popleft()
+        self._kept.add(frame)
+        if frame.initialized:
+            self._look_ns = None  # there is an estimate to go by
+        elif self._look_ns is not None:
+            self._watch_start(stamp_ns, frame.corrected_rig or self._result.input.rig)
 
     def finish(self) -> None:
         """Say what is wrong, if the run failed or is doubtful, and something shows."""
         status = self._result.status
         failed = status in _FAILED
-        if not self._kept or not (failed or (status in COMPLETED and self._is_doubtful())):
+        if not len(self._kept) or not (failed or status in COMPLETED):
             return
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            self._judge(failed)
+            if failed or self._is_doubtful():
+                self._judge(failed)
+
+    def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
+        """Look now and then what keeps a run from starting.
+
+        Raises:
+            DataError: if what the run was given is certainly wrong.
+        """
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        if self._look_ns is None or stamp_ns - self._first_ns < self._look_ns:
+            return
+        self._look_ns *= 2
+        causes = ""
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
+            causes = self._certain_causes(rig)
+        if causes:
+            waited_s = (stamp_ns - self._first_ns) * 1e-9
+            raise DataError(f"no start in {waited_s:.1f} s: {causes}; see `slam-graph doctor`")
+
+    def _certain_causes(self, rig: Rig) -> str:
+        """What is certainly wrong with the set-up and neither estimated nor corrected in a start."""
+        if not rig.cameras[0].rotation_known:
+            return ""
+        calibration = self._result.config.backend.calibration
+        estimated = {
+            "time_offset": True,  # a start corrects it
+            "mounting": calibration.extrinsics,
+            "focal_length": calibration.intrinsics,
+        }
+        return _in_words(
+            finding
+            for finding in self._diagnosed(rig).setup_faults
+            if finding.severity == "error"
+            and finding.sure == "certain"
+            and not estimated.get(finding.kind, False)
+        )
 
     def _judge(self, failed: bool) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with."""
-        from slam_graph.diagnosis import Diagnosis  # runs that end well do not need it
-
-        frames = [frame for frame, _ in self._kept]
-        imu = ImuData.concatenate([samples for _, samples in self._kept])
-        rig = self._result.input.rig if failed else self._final_rig()
-        found = Diagnosis.of_tracks(rig, frames, imu)
+        found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
         ending, guess = self._result.ending, found.best_guess()
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
-        elif found.errors:
-            likely = "; or ".join(finding.what for finding in found.errors[:2])
+        elif found.setup_faults and not failed:
+            likely = _in_words(found.setup_faults)
             ending.status = "suspect"
             ending.message = f"the estimate may be wrong: {likely}; see `slam-graph doctor`"
         else:
@@ -84,13 +201,31 @@ class Verdict(Stage):
         ending.error = EstimationError(ending.message)
         logger.error("%s", ending.message)
 
+    def _diagnosed(self, rig: Rig) -> Diagnosis:
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
+        kept = self._kept
+        return Diagnosis.of_tracks(rig, kept.frames, kept.imu, kept.pairs)
+
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
         latest = self._result.logs.calibration.latest
         return self._result.causal_rig if latest is None else latest.rig
 
     def _is_doubtful(self) -> bool:
-        """Whether something happened that a good recording hardly ever shows."""
+        """Whether something shows that a good recording hardly ever shows."""
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
         counts, tested = self._diagnostics.counts, self._result.logs.innovations.columns()
         rejected = float(tested["rejected"].sum()) / max(float(tested["tested"].sum()), 1.0)
-        return rejected > _MAX_REJECTED or any(counts[kind] for kind in _DOUBTS)
+        if rejected > _MAX_REJECTED or any(counts[kind] for kind in _DOUBTS):
+            return True
+        kept = self._kept
+        if kept.pairs and kept.shared < _FEWEST_SHARED:
+            return True
+        return bool(Diagnosis.nearby(self._final_rig(), kept.frames, kept.imu).setup_faults)
+
+
+def _in_words(findings: Iterable[Finding]) -> str:
+    """The two likeliest causes."""
+    return "; or ".join(finding.what for finding in islice(findings, 2))
