@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
+from benchmarks.faults import ALGORITHMS as FAULTY
+from benchmarks.faults import FAULTS, fault_key
 from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
@@ -248,6 +250,34 @@ def held_out(figures: Figures) -> Iterator[str]:
         yield line(f"`{name}`", *cells[:-1], f"{cells[-1]} / {figures.all(nees, 1, ', ')}")
 
 
+def faults(figures: Figures) -> Iterator[str]:
+    """What becomes of runs with a fault; algorithms that were not measured yet are left out."""
+    names = [name for name in FAULTY if figures.has(f"faults.none.{name}.error")]
+    yield "| fault | " + " | ".join(f"`{name}`" for name in names) + " |"
+    yield "|---|" + "---|" * len(names)
+    yield line("none [m]", *(figures(f"faults.none.{name}.error", 4) for name in names))
+    for fault in FAULTS:
+        yield line(fault, *(_survived(figures, f"faults.{fault_key(fault)}.{n}") for n in names))
+
+
+def _survived(figures: Figures, run: str) -> str:
+    """How a run with a fault ended."""
+    segments, recovered = figures(f"{run}.segments", 0), figures(f"{run}.recovered_in", 1)
+    text = f"{figures(f'{run}.segment_ratio', 1)} ×"
+    if segments != "1":
+        text += f", {segments} segments, {recovered} s"
+    return text if figures(f"{run}.completed", 0) == "1" else f"{text}, not `ok`"
+
+
+def verdict(figures: Figures) -> Iterator[str]:
+    """False alarms and missed runs, held out apart."""
+    yield "| | false alarms | missed |"
+    yield "|---|---:|---:|"
+    for part, label in (("chosen_on", "thresholds were chosen on"), ("held_out", "held out")):
+        alarms = 100 * float(figures(f"verdict.{part}.false_alarms", 4))
+        yield line(label, f"{alarms:.1f} %", figures(f"verdict.{part}.missed", 0))
+
+
 def line(*cells: str, width: int = 0) -> str:
     """A line of a table, filled up with empty cells; an empty one is a single blank."""
     filled = (*cells, *("" for _ in range(width - len(cells))))
@@ -265,5 +295,7 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "peers": peers,
     "kernels": kernels,
     "growth": growth,
+    "faults": faults,
+    "verdict": verdict,
 }
 """By the name in the marker of a document."""

@@ -36,6 +36,7 @@ from benchmarks import (
     starts,
     stream_rates,
     time_offset,
+    verdict,
     wheel,
     wide_lenses,
 )
@@ -59,6 +60,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **time_offset.BENCHMARKS,
     **wide_lenses.BENCHMARKS,
     **faults.BENCHMARKS,
+    **verdict.BENCHMARKS,
     **final_ba.BENCHMARKS,
     **cost_over_time.BENCHMARKS,
     **growth.BENCHMARKS,

@@ -11,12 +11,12 @@ is off by more than 3°. Both errors are those after alignment in yaw and positi
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.flights import KIND, flown_by_camera, in_parallel, without_start
+from benchmarks.flights import FLIGHTS, KIND, flown_by_camera, in_parallel, without_start
 from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED, is_held_out
 from benchmarks.running import Errors, Run
@@ -32,18 +32,9 @@ IMAGES = "euroc/MH_01_easy_17s"
 TRACKS = "openvins_sim/euroc_V1_01"
 TRUTH = "euroc_inertial/V1_01_easy"
 """Of the demo."""
-FLIGHTS = (
-    TRUTH,
-    "euroc_inertial/V1_02_medium",
-    "euroc_inertial/V2_01_easy",
-    "tumvi_inertial/room1",
-    "euroc_inertial/V2_02_medium",
-    "euroc_inertial/MH_04_difficult",
-    "tumvi_inertial/room3",
-)
 SEEDS = 2
 """Seeds of a flight."""
-PATHS, PATH_SEEDS = ("figure8", "random"), 3
+PATHS, PATH_SEEDS = ("figure8", "random"), 1
 """Generated flights, and their seeds."""
 CLIPS_AT_S = (0.0, 40.0, 80.0)
 """Where clips of the simulated recording begin."""
@@ -125,10 +116,20 @@ class Judged:
     errors: Errors
     frames: int
 
-    def wrong_beside(self, clean: Judged) -> bool:
-        """Whether its error is too large beside that of the run that is right."""
-        worse = self.errors.position_m > WORSE * clean.errors.position_m
-        return worse or self.errors.orientation_deg > TURNED_DEG
+    def harmed_beside(self, clean: Judged) -> bool:
+        """Whether there is no estimate, or one whose error is too large beside the right one's."""
+        within = self.errors.position_m <= WORSE * clean.errors.position_m
+        return not (within and self.errors.orientation_deg <= TURNED_DEG)  # NaN is neither
+
+    @property
+    def is_named(self) -> bool:
+        """Whether a cause is named."""
+        return "slam-graph doctor" in self.message
+
+    def described(self, trial: Trial) -> str:
+        """Name and errors of a trial."""
+        errors = self.errors
+        return f"{trial.name}: {errors.position_m:.3f} m, {errors.orientation_deg:.1f}°"
 
 
 def judge(data: Path, trial: Trial) -> Judged:
@@ -143,10 +144,8 @@ def judged(run: Run) -> Judged:
     """What came of a run."""
     result, errors = run.result, Errors.unknown()
     if len(result.history):
-        try:
+        with suppress(DataError):  # if it is too short to be judged
             errors = Errors.of(run.truth, result.trajectory, "yaw")
-        except DataError:  # too short to be judged
-            pass
     return Judged(result.status, result.message, errors, result.logs.frames)
 
 
@@ -171,11 +170,10 @@ def good_trials(algorithms: Iterable[str] = CORE) -> list[Trial]:
 
 CLEAN_OF_WRONG = (
     Trial(IMAGES, 2, "msckf"),
-    *(Trial("euroc_inertial/V1_02_medium", 2, name) for name in CORE),
+    Trial("euroc_inertial/V1_02_medium", 2, "swf"),
+    Trial("euroc_inertial/V1_02_medium", 2, "okvis"),
     Trial("tumvi_inertial/room1", 1, "msckf"),
-    Trial("euroc_inertial/V2_01_easy", 1, "swf"),
     Trial("euroc_inertial/V2_02_medium", 2, "msckf", FIRST_HELD_OUT_SEED),
-    Trial("euroc_inertial/MH_04_difficult", 1, "msckf", FIRST_HELD_OUT_SEED),
 )
 """Good runs that are repeated with every wrong set-up."""
 
@@ -188,3 +186,55 @@ def wrong_trials() -> list[tuple[Trial, Trial]]:
         for wrong, setup in WRONG_SETUPS.items()
         if setup.cameras <= clean.cameras
     ]
+
+
+def measure(data: Path) -> Outcome:
+    """False alarms among good runs, and wrong runs that are not noticed; held out apart."""
+    good, pairs = good_trials(), wrong_trials()
+    cleans = [clean for clean in dict.fromkeys(clean for clean, _ in pairs) if clean not in good]
+    trials = [*good, *cleans, *(wrong for _, wrong in pairs)]
+    found = in_parallel(judge, [(data, trial) for trial in trials])
+    return summed_up(dict(zip(trials, found, strict=True)))
+
+
+def summed_up(found: dict[Trial, Judged]) -> Outcome:
+    """Figures of all trials."""
+    outcome = Outcome()
+    for held_out in (False, True):
+        good = [t for t in good_trials() if t.held_out == held_out]
+        pairs = [(c, w) for c, w in wrong_trials() if w.held_out == held_out]
+        alarms = [t for t in good if found[t].status in ("suspect", "failed")]
+        harmed = [(c, w) for c, w in pairs if found[w].harmed_beside(found[c])]
+        missed = [w for c, w in harmed if found[w].status == "ok"]
+        refused = [w for _, w in pairs if found[w].status == "failed"]
+        rate = len(alarms) / max(len(good), 1)
+        outcome.add(
+            "held_out" if held_out else "chosen_on",
+            [
+                info("good", len(good), "runs"),
+                Metric("false_alarms", rate, "of the good", "lower", FALSE_ALARMS_BAR, EXACT),
+                info("wrong", len(pairs), "runs"),
+                info("harmed", len(harmed), "runs"),
+                Metric("missed", len(missed), "runs", "lower", 0.0, EXACT),
+                info("named", sum(found[w].is_named for _, w in pairs), "runs"),
+                info("refused", len(refused), "runs"),
+            ],
+            held_out=held_out,
+        )
+        outcome.notes += [f"false alarm: {t.name}: {found[t].message}" for t in alarms]
+        outcome.notes += [
+            f"good, but {found[t].status}: {t.name}: {found[t].message}"
+            for t in good
+            if found[t].status not in ("ok", "suspect", "failed")
+        ]
+        outcome.notes += [f"missed: {found[t].described(t)}" for t in missed]
+    return outcome
+
+
+BENCHMARKS = {
+    "verdict": Benchmark(
+        "good runs that are called suspect, and runs with a wrong set-up that are not",
+        (IMAGES, TRACKS, TRUTH, *FLIGHTS),
+        measure,
+    )
+}

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions, RecordedSequence, SequenceInfo
 from slam_graph.datasets.streams.imu_stream import clean_blocks
-from slam_graph.geometry import NavState, Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.sensors import Camera, FeatureFrame, ImuData, Rig, RigCamera
 
 Change = Callable[[Rig], Rig]

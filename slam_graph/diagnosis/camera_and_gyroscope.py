@@ -7,6 +7,7 @@ Each step corrects what it has found, so that the next one sees only its own fau
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -21,7 +22,7 @@ from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.mountings import Explanation, axes_text, explained
 from slam_graph.diagnosis.rotation_fit import UNKNOWNS, Kinematics, RotationFit, RotationProblem
 from slam_graph.diagnosis.turning import Turning, coarse_turning
-from slam_graph.sensors import ImuData, Rig
+from slam_graph.sensors import ImuData, Rig, RigCamera
 
 _SAME_RATE = (0.55, 1.8)
 """Camera and gyroscope turn equally fast within these; focal lengths may be wrong, too."""
@@ -43,12 +44,14 @@ _SIGMAS = 6.0
 """A difference is a finding from so many standard deviations on, and if it is larger than these,
 which grow with the square of the noise in pixels above 1 px, as the bias by the noise does:"""
 _OFFSET_S, _BAD_OFFSET_S = 5e-3, 1.5e-2
-_FOCAL, _BAD_FOCAL = 0.04, 0.07
-_TURN_RAD, _BAD_TURN_RAD = np.deg2rad(2.5), np.deg2rad(6.0)
+_FOCAL, _BAD_FOCAL = 0.02, 0.07
+_TURN_RAD, _BAD_TURN_RAD = np.deg2rad(2.0), np.deg2rad(6.0)
 _READOUT_S = 8e-3
 _NAMED_RAD = np.deg2rad(4.0)
 """So near a named explanation must come to a mounting that was found."""
 _FEWEST_PAIRS = 10
+_CLEARLY = 1.05
+"""The noise of one fit is clearly larger than that of another by this factor."""
 _FOCAL_STARTS = (1.0, 0.77, 1.3)
 _GOOD_PX = 1.5
 """A fit with this noise needs no other start."""
@@ -91,14 +94,16 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     turning = _unit(now, pairs, turning)
     turning = _handedness(now, pairs, turning)
     start = _coarse_mounting(now, turning)
-    now.fit = _solved(now, pairs, start)
+    problem = RotationProblem(pairs, now.gyroscopes, camera)
+    now.fit = _solved(problem, start)
     if now.fit is None or turning.misfit > _NOTHING_FITS:
         now.fit = None
         what = "camera and gyroscope do not turn alike under any mounting"
         fix = "compare the clocks (more than 0.2 s?); mask moving objects; check the matches"
         now.findings.append(Finding("not_alike", "warning", what, fix, "likely"))
         return now
-    _judge(now, now.fit)
+    if not _calibration_is_better(problem, _calibrated(camera), now.fit):
+        _judge(now, now.fit)
     return now
 
 
@@ -112,14 +117,28 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     pairs = frame_pairs(now.parts, now.gyroscopes, camera, turns=False)
     if len(pairs) < _FEWEST_PAIRS:
         return now
-    R = camera.body_T_camera.rotation().matrix()
-    start = Kinematics(camera.clock_offset_s, 1.0, camera.readout_s, R, np.zeros(3))
+    start = _calibrated(camera)
+    problem = RotationProblem(pairs, now.gyroscopes, camera)
     try:
-        now.fit = RotationProblem(pairs, now.gyroscopes, camera).solve(start)
+        now.fit = problem.solve(start)
     except np.linalg.LinAlgError:
         return now
-    _judge(now, now.fit)
+    if not _calibration_is_better(problem, start, now.fit):
+        _judge(now, now.fit)
     return now
+
+
+def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: RotationFit) -> bool:
+    """Whether most features fit the calibration as it is clearly better than what was found.
+
+    Gauss-Newton minimises weighted squares, and a few pairs that hardly move can lead it away.
+    """
+    calibrated = problem.noise_px(start)
+    if calibrated * _CLEARLY > fit.noise_px:
+        with suppress(np.linalg.LinAlgError):
+            bias = problem.solve(start, ("bx", "by", "bz"))
+            calibrated = min(calibrated, bias.noise_px)
+    return calibrated * _CLEARLY < fit.noise_px
 
 
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:
@@ -190,11 +209,14 @@ def _coarse_mounting(now: CameraAndGyroscope, turning: Turning) -> Kinematics:
     return Kinematics(offset_s, 1.0, camera.readout_s, R, np.zeros(3))
 
 
-def _solved(
-    now: CameraAndGyroscope, pairs: list[FramePair], start: Kinematics
-) -> RotationFit | None:
+def _calibrated(camera: RigCamera) -> Kinematics:
+    """What the calibration says."""
+    R = camera.body_T_camera.rotation().matrix()
+    return Kinematics(camera.clock_offset_s, 1.0, camera.readout_s, R, np.zeros(3))
+
+
+def _solved(problem: RotationProblem, start: Kinematics) -> RotationFit | None:
     """The best fit from several focal lengths."""
-    problem = RotationProblem(pairs, now.gyroscopes, now.rig.cameras[0])
     best: RotationFit | None = None
     for focal in _FOCAL_STARTS:
         try:

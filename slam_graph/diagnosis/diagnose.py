@@ -120,12 +120,15 @@ class Diagnosis:
 
     @property
     def setup_faults(self) -> list[Finding]:
-        """Errors, and warnings that are certain, of calibration, units and clocks."""
+        """Errors and warnings of calibration, units and clocks that spoil an estimate.
+
+        A clock that is off by some milliseconds does not.
+        """
         return [
             finding
             for finding in self.faults
             if finding.kind in SETUP_KINDS
-            and (finding.severity == "error" or finding.sure == "certain")
+            and (finding.severity == "error" or finding.kind != "time_offset")
         ]
 
     def best_guess(self) -> str:

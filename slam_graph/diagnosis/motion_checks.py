@@ -33,7 +33,7 @@ _CLEARER = 1.12
 """Residuals with the axes as they are must be so many times those with others …"""
 _BEHIND = 0.2
 """… or at most such a share of the observations in front of the camera."""
-_BASELINE, _BAD_BASELINE = 0.1, 0.3
+_BASELINE, _BAD_BASELINE = 0.12, 0.3
 """Logarithms of wrong baselines that are a warning, and an error."""
 _BASELINE_SIGMAS = 6.0
 _FEWEST_WINDOWS = 3
@@ -69,9 +69,7 @@ def check_motion(
     return found + _baseline(solutions, rig)
 
 
-def _windows(
-    now: CameraAndGyroscope, fit: RotationFit, rig: Rig, length_s: float
-) -> list[Window]:
+def _windows(now: CameraAndGyroscope, fit: RotationFit, rig: Rig, length_s: float) -> list[Window]:
     """Windows that show something, the liveliest first."""
     found: list[Window] = []
     for part, gyroscope in zip(now.parts, now.gyroscopes, strict=True):

@@ -169,7 +169,7 @@ class Verdict(Stage):
             raise DataError(f"no start in {waited_s:.1f} s: {causes}; see `slam-graph doctor`")
 
     def _certain_causes(self, rig: Rig) -> str:
-        """What is certainly wrong with the set-up and neither estimated nor corrected in a start."""
+        """What is certainly wrong, and is neither estimated nor corrected in a start."""
         if not rig.cameras[0].rotation_known:
             return ""
         calibration = self._result.config.backend.calibration
