@@ -7,14 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import gtsam
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.datasets import kalibr_text
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.memory_sequence import dataset_from_arrays
+from slam_graph.datasets.sequence import RecordedSequence
+from slam_graph.diagnosis import Diagnosis
 from slam_graph.pipeline import verdict
 from slam_graph.pipeline.run_recording import run
+from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.simulator import simulate
 
@@ -38,12 +43,53 @@ def with_double_baseline(rig: Rig) -> Rig:
     return changed(rig, away, 1)
 
 
-def with_longer_lenses(rig: Rig) -> Rig:
+def with_longer_lenses(rig: Rig, factor: float = 1.1) -> Rig:
     def longer(camera: RigCamera) -> RigCamera:
         lens = camera.camera
-        return replace(camera, camera=replace(lens, fx=1.1 * lens.fx, fy=1.1 * lens.fy))
+        return replace(camera, camera=replace(lens, fx=factor * lens.fx, fy=factor * lens.fy))
 
     return changed(rig, longer)
+
+
+def turned(rig: Rig) -> Rig:
+    turn = gtsam.Pose3(gtsam.Rot3.Rx(np.deg2rad(5.0)), np.zeros(3))
+    return changed(rig, lambda c: replace(c, body_T_camera=turn * c.body_T_camera))
+
+
+def inverted(rig: Rig) -> Rig:
+    return changed(rig, lambda c: replace(c, body_T_camera=c.body_T_camera.inverse()))
+
+
+def exchanged(rig: Rig) -> Rig:
+    return Rig((rig.cameras[1], rig.cameras[0]), rig.imu)
+
+
+def flown(
+    wrong: Callable[[Rig], Rig] = lambda rig: rig,
+    gyro: float = 1.0,
+    accel: float = 1.0,
+    duration_s: float = 16.0,
+    trajectory: str = "random",
+) -> RecordedSequence:
+    """A flight without a start that is given, with a wrong calibration or IMU."""
+    sequence = simulate(
+        trajectory=trajectory, duration_s=duration_s, seed=3, flight={"hover_s": 0.0}
+    )
+    rig, imu = wrong(sequence.rig), sequence.imu()
+    frames = []
+    for frame in sequence.frames():
+        assert isinstance(frame, FeatureFrame)
+        seen = zip(frame.cameras, rig.cameras, strict=True)
+        cameras = [replace(s, normalized=c.camera.undistort(s.pixels)) for s, c in seen]
+        frames.append(FeatureFrame(frame.stamp_ns, tuple(cameras)))
+    return dataset_from_arrays(
+        rig,
+        imu_stamps_ns=imu.stamps_ns,
+        gyro=gyro * imu.gyro,
+        accel=accel * imu.accel,
+        features=frames,
+        groundtruth=sequence.groundtruth(),
+    )
 
 
 @pytest.mark.data
@@ -52,6 +98,7 @@ def with_longer_lenses(rig: Rig) -> Rig:
     [
         (with_double_baseline, "calibrated baseline is"),
         (with_longer_lenses, "calibrated focal length is"),
+        (exchanged, "the cameras are exchanged"),
     ],
 )
 def test_a_wrong_calibration_is_suspect(
@@ -80,6 +127,86 @@ def test_a_right_one_is_not_even_if_it_is_doubted(
     sequence = simulate(trajectory=trajectory, cameras=cameras, duration_s=14.0, seed=seed)
     result = run(sequence, overrides=CAUSAL)
     assert result.status == "ok", result.message
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (turned, "the camera is turned by"),
+        (lambda rig: with_longer_lenses(rig, 1.04), "calibrated focal length is 1.0"),
+    ],
+)
+def test_a_small_fault_that_nothing_in_the_run_shows_is_suspect(
+    wrong: Callable[[Rig], Rig], named: str
+) -> None:
+    result = run(flown(wrong), overrides=CAUSAL)
+    assert result.status == "suspect", result.message
+    assert named in result.message
+
+
+def test_a_quick_look_says_what_the_whole_diagnosis_says() -> None:
+    """Where the calibration is right or nearly so; there is nothing else that it is for."""
+    for wrong in (lambda rig: rig, with_longer_lenses, turned):
+        recording = flown(wrong)
+        frames = [f for f in recording.frames() if isinstance(f, FeatureFrame)]
+        of = recording.rig, frames, recording.imu()
+        quick, whole = Diagnosis.nearby(*of), Diagnosis.of_tracks(*of)
+        kinds = [[f.kind for f in found.setup_faults] for found in (quick, whole)]
+        assert kinds[0] == kinds[1]
+
+
+@pytest.mark.parametrize(
+    ("recording", "named"),
+    [
+        (lambda: flown(gyro=float(np.rad2deg(1.0))), "its unit is degrees/s"),
+        (lambda: flown(inverted), "the calibration is inverted"),
+    ],
+)
+def test_a_wrong_setup_that_never_starts_is_refused_soon(
+    recording: Callable[[], RecordedSequence], named: str
+) -> None:
+    result = run(recording(), overrides=CAUSAL)
+    assert result.status == "failed"
+    assert named in result.message
+    assert "slam-graph doctor" in result.message
+    waited_s = result.logs.frames / 20.0
+    assert waited_s < 11.0, "at the second look at the latest"
+
+
+def test_nothing_is_refused_if_that_is_not_wanted() -> None:
+    recording = flown(gyro=float(np.rad2deg(1.0)), duration_s=8.0)
+    result = run(recording, overrides=(*CAUSAL, "limits.refuse_wrong_setup=false"))
+    assert result.status == "not_initialized"
+    assert "its unit is degrees/s" in result.message
+
+
+def test_a_right_setup_that_waits_is_not_refused() -> None:
+    """It has too few features for a start, and moves enough to show a fault."""
+    sequence = simulate(
+        trajectory="random",
+        duration_s=12.0,
+        seed=3,
+        flight={"hover_s": 0.0},
+        tracks={"features": 8},
+    )
+    result = run(sequence, overrides=(*CAUSAL, "backend.initialization.mode=motion"))
+    assert result.status == "not_initialized", result.message
+
+
+def test_an_accelerometer_in_g_does_not_end_well() -> None:
+    """A start at rest would take gravity for whatever is measured."""
+    sequence = simulate(trajectory="figure8", duration_s=10.0, seed=1)
+    imu = sequence.imu()
+    recording = dataset_from_arrays(
+        sequence.rig,
+        imu_stamps_ns=imu.stamps_ns,
+        gyro=imu.gyro,
+        accel=imu.accel / 9.81,
+        features=[f for f in sequence.frames() if isinstance(f, FeatureFrame)],
+    )
+    result = run(recording, overrides=CAUSAL)
+    assert result.status != "ok"
+    assert "its unit is g" in result.message
 
 
 def test_a_failed_run_names_the_likeliest_cause() -> None:
