@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterable
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +24,6 @@ from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
-    from slam_graph.diagnosis.finding import Finding
 
 _KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
@@ -178,13 +175,14 @@ class Verdict(Stage):
             "mounting": calibration.extrinsics,
             "focal_length": calibration.intrinsics,
         }
-        return _in_words(
-            finding
+        certain = [
+            finding.what
             for finding in self._diagnosed(rig).setup_faults
             if finding.severity == "error"
             and finding.sure == "certain"
             and not estimated.get(finding.kind, False)
-        )
+        ]
+        return "; or ".join(certain[:2])
 
     def _judge(self, failed: bool) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with."""
@@ -193,7 +191,7 @@ class Verdict(Stage):
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
         elif found.setup_faults and not failed:
-            likely = _in_words(found.setup_faults)
+            likely = "; or ".join(finding.what for finding in found.setup_faults[:2])
             ending.status = "suspect"
             ending.message = f"the estimate may be wrong: {likely}; see `slam-graph doctor`"
         else:
@@ -224,8 +222,3 @@ class Verdict(Stage):
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
         return bool(Diagnosis.nearby(self._final_rig(), kept.frames, kept.imu).setup_faults)
-
-
-def _in_words(findings: Iterable[Finding]) -> str:
-    """The two likeliest causes."""
-    return "; or ".join(finding.what for finding in islice(findings, 2))
