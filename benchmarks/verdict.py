@@ -162,7 +162,8 @@ def good_trials(algorithms: Iterable[str] = CORE) -> list[Trial]:
                     seeds = range(first, first + PATH_SEEDS)
                     trials += [Trial(path, cameras, name, seed) for seed in seeds]
             for flight in FLIGHTS:
-                seeds = (FIRST_HELD_OUT_SEED,) if is_held_out(flight) else range(SEEDS)
+                held = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + 1)
+                seeds = held if is_held_out(flight) else range(SEEDS)
                 trials += [Trial(flight, cameras, name, seed) for seed in seeds]
     return trials
 

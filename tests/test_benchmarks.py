@@ -18,6 +18,7 @@ from benchmarks import (
     run,
     speed,
     speed_worker,
+    verdict,
 )
 from benchmarks.metric import Bar, Direction, Metric, info
 from benchmarks.openvins_sim import Quality, best
@@ -338,6 +339,31 @@ def test_each_combination_of_policies_is_measured_under_its_own_name() -> None:
     names = [algorithm.name for algorithm in policy_product.product()]
     assert len(set(names)) == len(names)
     assert {name.split("-")[0] for name in names} >= {"most_recent", "evenly_spaced", "keyframes"}
+
+
+def test_a_run_is_missed_if_it_is_harmed_and_ends_well_and_held_out_ones_count_apart() -> None:
+    good, small, large = Errors(0.01, 0.5, 20.0), Errors(0.02, 2.9, 20.0), Errors(0.01, 3.1, 20.0)
+    found = {t: verdict.Judged("ok", "", good, 400) for t in verdict.good_trials()}
+    for clean, wrong in verdict.wrong_trials():
+        found[clean] = verdict.Judged("ok", "", good, 400)
+        found[wrong] = verdict.Judged("ok", "", small, 400)
+    seen, unseen, apart = (
+        next(
+            w for _, w in verdict.wrong_trials() if w.held_out == held and w.wrong.startswith(what)
+        )
+        for what, held in (("baseline", False), ("clock", False), ("clock", True))
+    )
+    found[seen] = verdict.Judged("suspect", "slam-graph doctor", large, 400)
+    found[unseen] = found[apart] = verdict.Judged("ok", "", large, 400)
+    found[verdict.good_trials()[0]] = verdict.Judged("suspect", "", good, 400)
+    figures = {m.key: m for m in verdict.summed_up(found).metrics}
+    assert figures["chosen_on.harmed"].value == 2
+    assert figures["chosen_on.missed"].value == 1
+    assert figures["held_out.missed"].value == 1
+    assert figures["held_out.missed"].held_out
+    assert figures["held_out.false_alarms"].value == 0.0
+    alarms = figures["chosen_on.false_alarms"].value * figures["chosen_on.good"].value
+    assert alarms == pytest.approx(1.0)
 
 
 def test_a_long_flight_is_measured_in_a_process_of_its_own() -> None:

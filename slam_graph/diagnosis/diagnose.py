@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.finding import Finding, in_order
@@ -35,6 +36,8 @@ SETUP_KINDS = (
     "baseline_unit",
 )
 """Findings about what a run was given: calibration, units and clocks."""
+_PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
+"""Times without frames, and without samples, that end a part of what is in memory."""
 _FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
 """Samples and frames that a comparison needs at least."""
 
@@ -179,16 +182,32 @@ def _judged(material: Material) -> list[Finding]:
 
 
 def _remembered(rig: Rig, frames: Sequence[FeatureFrame], imu: ImuData) -> Material:
-    """Features and samples in memory as one part."""
+    """Features and samples in memory, in parts without interruption."""
     frames = [frame.usable(len(rig.cameras))[0] for frame in frames]
     material = Material(rig, imu, [])
     if frames:
-        part = Part(frames, around(imu, frames[0].stamp_ns, frames[-1].stamp_ns))
-        material.parts.append(part)
+        imu = around(imu, frames[0].stamp_ns, frames[-1].stamp_ns)
+        stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+        begins = np.sort(
+            np.concatenate([_after_gaps(stamps, _PAUSE_NS), _after_gaps(imu.stamps_ns, _GAP_NS)])
+        )
+        of_frame = np.searchsorted(begins, stamps, side="right")
+        of_sample = np.searchsorted(begins, imu.stamps_ns, side="right")
+        for k in np.unique(of_frame):
+            part = [frame for frame, of in zip(frames, of_frame, strict=True) if of == k]
+            rows = of_sample == k
+            samples = ImuData(imu.stamps_ns[rows], imu.gyro[rows], imu.accel[rows])
+            material.parts.append(Part(part, samples))
         if len(rig.cameras) > 1:
             step = max(1, len(frames) // 8)
             material.stereo = [StereoMatches.of_tracks(f) for f in frames[::step]]
     return material
+
+
+def _after_gaps(stamps_ns: IntArray, longest_ns: int) -> IntArray:
+    """The stamps before which nothing was recorded for too long."""
+    after: IntArray = stamps_ns[1:][np.diff(stamps_ns) > longest_ns]
+    return after
 
 
 def _enough(material: Material, factor: float) -> list[Part]:
