@@ -29,6 +29,8 @@ _STEP = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5])
 """Steps of the numerical derivatives."""
 _LARGEST = np.array([0.03, 0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
 """Largest change of an unknown in one step."""
+_JUMP = 0.6
+"""No epipolar distance changes so much by the largest change of an unknown, in focal lengths."""
 _CAUCHY = 2.4
 """Residual with half the weight, in units of the noise."""
 _SIGMA_OF_MEDIAN = 1.4826
@@ -217,6 +219,10 @@ class RotationProblem:
             change = np.zeros(9)
             change[k] = _STEP[k]
             J[..., c] = (self.residuals(at.moved(change), t)[0] - e) / _STEP[k]
+        # beyond the edge of a wide lens there is no bearing, so that a distance jumps in a step
+        most = _JUMP * self._mounted.camera.fx / _LARGEST[columns]
+        steady = np.all(np.abs(J) < most, axis=-1, keepdims=True)
+        J = np.where(steady, J, 0.0)
         root = np.sqrt(self._there / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
         e, J, by_t = e * root, J * root[..., None], by_t * root[..., None]
         inner = by_t.transpose(0, 2, 1) @ by_t + 1e-9 * np.eye(2)
