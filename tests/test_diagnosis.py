@@ -174,6 +174,28 @@ def test_focal_length(stereo_tracks: Recorded, factor: float) -> None:
     )
 
 
+def test_focal_length_of_a_wide_lens(tmp_path: Path) -> None:
+    """Points at its edge have no bearing under a focal length that is too short."""
+    rig = sg.simulate(cameras=1, duration_s=1.0).rig
+    wide = replace(
+        rig.cameras[0].camera,
+        fx=191.0,
+        fy=191.0,
+        cx=255.0,
+        cy=257.0,
+        width=512,
+        height=512,
+        distortion="equidistant",
+        coefficients=(0.0034, 0.0008, -0.0021, 0.0002),
+    )
+    chain = tmp_path / "wide.yaml"
+    write_kalibr(changed(rig, lambda c: replace(c, camera=wide)), chain)
+    recorded = taken(sg.simulate(calibration=chain, trajectory="random", duration_s=14, seed=3))
+    assert not judged(recorded).faults
+    short = changed(recorded[0], lambda c: magnified(c, 0.9))
+    assert first(judged(recorded, short), "focal_length")["factor"] == pytest.approx(0.9, rel=0.03)
+
+
 @pytest.mark.parametrize("factor", [2.0, 0.5])
 def test_baseline(stereo_tracks: Recorded, factor: float) -> None:
     def longer(poses: list[gtsam.Pose3]) -> list[gtsam.Pose3]:

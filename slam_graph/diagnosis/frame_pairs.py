@@ -97,7 +97,8 @@ def _pair(
     _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     found = None
     if mounted is not None:
-        found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
+        with np.errstate(all="ignore"):  # beyond the edge of a wide lens
+            found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
     turn = None if found is None else Rotation.from_matrix(found.R).as_rotvec()
     times = gyroscope.seconds(np.array([one.stamp_ns, two.stamp_ns]))
     step = max(1, len(i) // _FEATURES)

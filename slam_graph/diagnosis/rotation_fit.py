@@ -118,9 +118,10 @@ class RotationProblem:
         if focal not in self._normalized:
             camera = self._mounted.camera
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
-            m = scaled.undistort(self._pixels.reshape(-1, 2)).reshape(self._pixels.shape)
-            rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
-            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+            with np.errstate(all="ignore"):  # beyond the edge of a wide lens
+                m = scaled.undistort(self._pixels.reshape(-1, 2)).reshape(self._pixels.shape)
+                rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
+                rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
             if len(self._normalized) > 4:
                 self._normalized.clear()
             self._normalized[focal] = np.where(np.isfinite(rays), rays, 0.0)
