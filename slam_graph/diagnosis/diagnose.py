@@ -125,13 +125,14 @@ class Diagnosis:
     def setup_faults(self) -> list[Finding]:
         """Errors and warnings of calibration, units and clocks that spoil an estimate.
 
-        A clock that is off by some milliseconds does not.
+        A clock that is off by some milliseconds does not. Nor does a small turn of the camera count:
+        what a real IMU has of errors looks like one of two or three degrees.
         """
         return [
             finding
             for finding in self.faults
             if finding.kind in SETUP_KINDS
-            and (finding.severity == "error" or finding.kind != "time_offset")
+            and (finding.severity == "error" or finding.kind not in ("time_offset", "mounting"))
         ]
 
     def best_guess(self) -> str:
