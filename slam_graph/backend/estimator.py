@@ -22,6 +22,7 @@ from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.dynamics import Dynamics
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
@@ -30,6 +31,7 @@ from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.start_review import StartReview
+from slam_graph.backend.initialization.visual_start import VisualStart
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
@@ -83,6 +85,12 @@ class Estimator:
             ConfigError: if the engine cannot do what the settings ask for.
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
+        self._dynamics = Dynamics.of(rig, algorithm, config)
+        rig, algorithm, config = (
+            self._dynamics.rig,
+            self._dynamics.algorithm,
+            self._dynamics.config,
+        )
         own = algorithm.engine == "square_root"
         self._make_engine: Callable[[EngineContext], Engine] = (
             SquareRootEngine if own else SmootherEngine
@@ -115,7 +123,9 @@ class Estimator:
         )
         self._engine: Engine = self._make_engine(context)
         self._context = context
-        self._initializer = Initializer(context, self._start_mode)
+        self._initializer: Initializer | VisualStart = (
+            Initializer(context, self._start_mode) if rig.has_imu else VisualStart(context)
+        )
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
         self._review: StartReview | None = None
@@ -134,6 +144,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
+        state = self._dynamics.given(state)
         self._given, self._review = state, None
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
@@ -153,7 +164,12 @@ class Estimator:
         self._begin(self._context.imu)
 
     def add_imu(self, imu: ImuData) -> None:
-        """Add IMU samples that follow those already given; others are counted and left out."""
+        """Add IMU samples that follow those already given; others are counted and left out.
+
+        Under dynamics that use no IMU they mean nothing.
+        """
+        if not self.rig.has_imu:
+            return
         left_out = self._context.imu.add(imu)
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
@@ -195,6 +211,7 @@ class Estimator:
         self.report = StepReport()
         self.solved_ns = frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
+        self._dynamics.extend(imu, frame.stamp_ns + round(self.rig.end_offset_s * 1e9))
         state = self.window.state if self.window is not None else None
         stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
         if not self._latest_ns < stamp_ns <= imu.newest_ns() + _MAX_AHEAD_NS:
@@ -286,8 +303,9 @@ class Estimator:
             window = self._initializer.try_to_start(stamp_ns, frame)
         if window is not None:
             self._standstill.add_dynamic(self._initializer.outliers)
-            scale_sigma = self._initializer.scale_sigma
-            self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            if isinstance(self._initializer, Initializer):
+                scale_sigma = self._initializer.scale_sigma
+                self._review = StartReview(self._context, stamp_ns, scale_sigma)
             window = self._placed(window)
         return window
 
@@ -335,6 +353,8 @@ class Estimator:
         """What a start still needs, and the likeliest cause of the lack."""
         if not self._check.mounted:
             return self._check.waiting_for
+        if isinstance(self._initializer, VisualStart):
+            return self._initializer.waiting_for()
         return self._initializer.waiting_for(self._check.contradiction(self._context.imu))
 
     @property

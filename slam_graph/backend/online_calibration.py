@@ -147,7 +147,7 @@ class CalibrationVariables:
             self._camera(c, mounted, values, shift_s)
             for c, mounted in enumerate(self.nominal.cameras)
         )
-        return Rig(tuple(cameras), self.nominal.imu)
+        return replace(self.nominal, cameras=tuple(cameras))
 
     def _shift_s(self, values: gtsam.Values) -> float:
         """Difference of the estimated time offset from the nominal one, in seconds."""

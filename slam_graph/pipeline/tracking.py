@@ -188,7 +188,8 @@ def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
     )
     count = len(asked.rig.cameras)
     for packet in packets:
-        yield Packet(packet.imu, _first_cameras(packet.frame, count))
+        imu = packet.imu if asked.rig.has_imu else ImuData.empty()
+        yield Packet(imu, _first_cameras(packet.frame, count))
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:

@@ -8,7 +8,7 @@ The body frame is the IMU frame. `CalibrationEstimate` is the result of online c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import gtsam
@@ -132,10 +132,12 @@ class Rig:
     Attributes:
         cameras: in the order of the images of a frame.
         imu: noise of the IMU.
+        has_imu: whether there is an IMU; without one, `imu` means nothing.
     """
 
     cameras: tuple[RigCamera, ...]
     imu: ImuNoise = field(default_factory=ImuNoise)
+    has_imu: bool = True
 
     @property
     def rolling(self) -> bool:
@@ -159,7 +161,7 @@ class Rig:
         """The same rig with its first `count` cameras only."""
         if not 1 <= count <= len(self.cameras):
             raise DataError(f"asked for {count} cameras, the rig has {len(self.cameras)}")
-        return Rig(self.cameras[:count], self.imu)
+        return replace(self, cameras=self.cameras[:count])
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
@@ -54,6 +55,7 @@ class FrameLog:
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
+        self._lead_ns = round(rig.end_offset_s * 1e9)
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
@@ -80,6 +82,9 @@ class FrameLog:
             frame: the observations of all cameras.
             noise: factors on the white noise of gyroscope and accelerometer around this time.
         """
+        if not self.rig.has_imu:
+            newest_ns = None if self._imu_ns is None else self._imu_ns[1]
+            imu = motionless_samples(newest_ns, frame.stamp_ns + self._lead_ns)
         if len(imu):
             self._imu.append(imu)
             first, last = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])

@@ -22,10 +22,16 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
-from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
+from slam_graph.backend.smoothing.keyframe_states import (
+    fill_in,
+    fill_in_by_motion,
+    states_in,
+    values_of,
+)
 from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
@@ -54,7 +60,7 @@ from slam_graph.backend.smoothing.state_covariances import (
 )
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.state import stacked_poses
-from slam_graph.geometry import NavState
+from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import Rig
 
 logger = logging.getLogger(__name__)
@@ -82,11 +88,20 @@ class SmoothingTask:
         rig: the best calibration available.
         backend: noise and triangulation.
         config: settings of the bundle adjustment.
+        causal: motion between keyframes where there is no IMU to predict it.
     """
 
     rig: Rig
     backend: BackendConfig
     config: FinalBaConfig
+    causal: Trajectory | None = None
+
+    @classmethod
+    def of(cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig) -> SmoothingTask:
+        """The task under the dynamics that the settings choose."""
+        if backend.dynamics.uses_imu(rig.has_imu):
+            return cls(rig, backend, config)
+        return cls(model_rig(rig, backend.dynamics), without_imu(backend), config)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -338,7 +353,7 @@ class BundleAdjustment:
                 self._config.learn_imu_noise,
                 self._count_step,
             )
-            return keyframe_covariances(states, self._values, weights)
+            return keyframe_covariances(states, self._values, weights, self._task.rig.has_imu)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None
@@ -352,6 +367,11 @@ class BundleAdjustment:
     def _states(self, stamps_ns: IntArray) -> list[NavState]:
         """The states at some times, those of the keyframes among them."""
         imu, preintegration = self._segment.imu, self._task.preintegration
+        causal = self._task.causal
+        if causal is not None:
+            return fill_in_by_motion(
+                self._keyframe_states(), stamps_ns, causal, imu, preintegration
+            )
         return fill_in(self._keyframe_states(), stamps_ns, imu, preintegration)
 
     def _keyframe_states(self) -> list[NavState]:
