@@ -79,6 +79,10 @@ class Dynamics:
         """A state that was given from outside, as a state of this model."""
         return state
 
+    def reported(self, state: NavState) -> NavState:
+        """A state of this model as users know it."""
+        return state
+
 
 class ConstantVelocity(Dynamics):
     """White noise on linear and angular acceleration; see the module."""
@@ -95,7 +99,11 @@ class ConstantVelocity(Dynamics):
         covariance = state.covariance.copy()
         covariance[9:], covariance[:, 9:] = 0.0, 0.0
         covariance[9:, 9:] = bias_covariance(_ANGULAR_RATE_SIGMA)
-        return replace(state, accel_bias=np.zeros(3), gyro_bias=np.zeros(3), covariance=covariance)
+        return replace(self.reported(state), covariance=covariance)
+
+    def reported(self, state: NavState) -> NavState:
+        """The state without biases: there is no sensor that has them."""
+        return replace(state, accel_bias=np.zeros(3), gyro_bias=np.zeros(3))
 
 
 def model_rig(rig: Rig, config: DynamicsConfig) -> Rig:

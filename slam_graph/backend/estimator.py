@@ -233,12 +233,12 @@ class Estimator:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still, self.report)
-            return self._reviewed(stamp_ns, whole, stepped)
+            return self._reviewed(stamp_ns, whole, self._dynamics.reported(stepped))
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
             return None
-        return self.window.current(self.window.prior)
+        return self._dynamics.reported(self.window.current(self.window.prior))
 
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""

@@ -22,7 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
-from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
 from slam_graph.backend.smoothing.recording_problem import (
     AdjustedSegment,
     BundleAdjustment,
@@ -176,7 +176,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             continue
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
-            task = replace(task, causal=causal)
+            task, start = replace(task, causal=causal), with_angular_rates(start)
         anchor = int(np.searchsorted(stamps_ns[:-1], began_ns))
         begin, link = 0, None
         if states:

@@ -113,6 +113,17 @@ def _predict_backward(
     )
 
 
+def with_angular_rates(states: list[NavState]) -> list[NavState]:
+    """The states with the rates of the motion to the next one, as `constant_velocity` has them."""
+    rates = []
+    for state, later in pairwise(states):
+        seconds = (later.stamp_ns - state.stamp_ns) * 1e-9
+        turn = state.world_T_body.rotation().between(later.world_T_body.rotation())
+        rates.append(gtsam.Rot3.Logmap(turn) / seconds)
+    rates += rates[-1:] or [np.zeros(3)]
+    return [replace(s, gyro_bias=-rate) for s, rate in zip(states, rates, strict=True)]
+
+
 def fill_in(
     keyframes: list[NavState],
     stamps_ns: IntArray,
