@@ -22,6 +22,7 @@ from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import Dynamics
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
@@ -85,7 +86,8 @@ class Estimator:
             ConfigError: if the engine cannot do what the settings ask for.
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
-        self._dynamics = Dynamics.of(rig, algorithm, config)
+        self._real_rig = rig
+        self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = (
             self._dynamics.rig,
             self._dynamics.algorithm,
@@ -220,6 +222,7 @@ class Estimator:
             return None
         self._latest_ns = stamp_ns
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
+        frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
             self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
@@ -346,7 +349,9 @@ class Estimator:
     @property
     def corrected_rig(self) -> Rig | None:
         """The rig, if the first motion has shown that its calibration does not fit; else None."""
-        return None if self._held is None else self.rig
+        if self._held is None:
+            return None
+        return self.rig.select(len(self._real_rig.cameras))
 
     @property
     def waiting_for(self) -> str:

@@ -13,11 +13,13 @@ from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
@@ -48,7 +50,8 @@ class FrameLog:
     """
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
-        self.rig = rig
+        self._real_rig, self.rig = rig, with_depth_camera(rig)
+        rig = replace(self.rig, depth=None)  # which is a camera now
         self._config = config
         self._path = folder / "frames"
         self._recorder = TrackRecorder(self._path, rig)
@@ -91,6 +94,7 @@ class FrameLog:
             self._imu_ns = (first if self._imu_ns is None else self._imu_ns[0], last)
         if not self._follows(frame.stamp_ns):
             return
+        frame = with_depth_observed(frame, self._real_rig)
         missing = len(self.rig.cameras) - len(frame.cameras)
         cameras = frame.cameras + (FeatureObservations.empty(),) * missing
         frame = FeatureFrame(frame.stamp_ns, cameras)

@@ -22,6 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.depth_camera import with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
@@ -99,6 +100,7 @@ class SmoothingTask:
     @classmethod
     def of(cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig) -> SmoothingTask:
         """The task under the dynamics that the settings choose."""
+        rig = with_depth_camera(rig)
         if backend.dynamics.uses_imu(rig.has_imu):
             return cls(rig, backend, config)
         return cls(model_rig(rig, backend.dynamics), without_imu(backend), config)
