@@ -233,11 +233,11 @@ class DynamicsConfig(Settings):
     model: Literal["auto", "imu", "constant_velocity"] = "auto"
     """imu: gyroscope and accelerometer. constant_velocity: linear and angular acceleration are
     white noise, and an IMU is not used. auto: the IMU if the recording has one."""
-    accel_density: float = expert(1.0, gt=0)
+    accel_density: float = expert(3.0, gt=0)
     """Noise density of the acceleration of `constant_velocity`, m/s²/√Hz: after a time t the
     velocity has changed by this times √t. It is raised where the images show more. Lower it for
     slow platforms."""
-    angular_accel_density: float = expert(1.0, gt=0)
+    angular_accel_density: float = expert(4.0, gt=0)
     """The same for the angular acceleration, rad/s²/√Hz."""
 
     def uses_imu(self, has_imu: bool) -> bool:

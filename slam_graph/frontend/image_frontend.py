@@ -16,6 +16,7 @@ from slam_graph.frontend.depth_sampling import DepthSampler
 from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, FrameStats
+from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
@@ -108,8 +109,19 @@ class ImageFrontend:
                     config,
                 )
             predictor = PointPredictor(mounted, self._motion, config)
+            turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
+            rotation = ImageRotation(camera) if turns else None
             self._trackers.append(
-                CameraTracker(mounted, extractor, associator, predictor, config, self._stats, rng)
+                CameraTracker(
+                    mounted,
+                    extractor,
+                    associator,
+                    predictor,
+                    config,
+                    self._stats,
+                    rng,
+                    rotation,
+                )
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
         self._tracks = [Tracks.empty() for _ in rig.cameras]
