@@ -44,15 +44,16 @@ def with_depth_camera(rig: Rig) -> Rig:
         return rig
     mounted = rig.cameras[rig.depth.camera]
     real = mounted.camera
-    camera = Camera(
-        real.fx / _NOISIER,
-        real.fx / _NOISIER,
-        0.0,
-        0.0,
-        "none",
-        (),
-        max(1, round(real.width / _NOISIER)),
-        max(1, round(real.height / _NOISIER)),
+    camera = replace(
+        real,
+        fx=real.fx / _NOISIER,
+        fy=real.fy / _NOISIER,
+        cx=real.cx / _NOISIER,
+        cy=real.cy / _NOISIER,
+        distortion="none",
+        coefficients=(),
+        width=max(1, round(real.width / _NOISIER)),
+        height=max(1, round(real.height / _NOISIER)),
     )
     beside = gtsam.Pose3(gtsam.Rot3(), np.array([_baseline_m(rig.depth, real), 0.0, 0.0]))
     body_T_camera = mounted.body_T_camera.compose(beside)
@@ -79,7 +80,7 @@ def with_depth_observed(frame: FeatureFrame, rig: Rig) -> FeatureFrame:
         rows = (seen.depth_m > 0.0) & (seen.depth_sigma_m < _MAX_SIGMAS * noise)
     beside = seen.normalized[rows].copy()
     beside[:, 0] -= _baseline_m(rig.depth, camera) / seen.depth_m[rows]
-    pixels = beside * (camera.fx / _NOISIER)
+    pixels = (beside * [camera.fx, camera.fy] + [camera.cx, camera.cy]) / _NOISIER
     return replace(
         frame, cameras=(*frame.cameras, FeatureObservations(seen.ids[rows], pixels, beside))
     )

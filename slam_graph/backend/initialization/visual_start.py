@@ -8,25 +8,21 @@ angular rate. The world is that of the first camera at the second of them.
 
 from __future__ import annotations
 
-import cv2
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.cost.triangulation import triangulate_frames
+from slam_graph.arrays import IntArray
 from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.first_state import start_from
-from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
+from slam_graph.backend.initialization.start_diagnosis import Refusal
+from slam_graph.backend.visual_motion import ERROR_PX, MIN_POINTS, camera_pose, depths_within
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
 _MAX_INTERVAL_NS = 1_000_000_000
 """Two frames that are farther apart tell nothing of the velocity now."""
-_ERROR_PX = 4.0
-"""Largest error of a point that fits the motion."""
-_RANSAC_ITERATIONS = 200
 _VELOCITY_SIGMA, _RATE_SIGMA = 0.5, 0.3
 """Standard deviations of velocity (m/s) and angular rate (rad/s): those at the second frame are not
 their means since the first."""
@@ -87,51 +83,21 @@ class VisualStart:
     def _motion(self, before: FeatureFrame, now: FeatureFrame) -> gtsam.Pose3 | Refusal:
         """The motion before_T_now of the body, or what is missing for it."""
         rig, seen = self._context.rig, now.cameras[0]
-        origin = np.eye(3)[None], np.zeros((1, 3))
-        found = triangulate_frames(seen.ids, [before], *origin, rig)
-        rows = found.good
-        if np.count_nonzero(rows) < MIN_FEATURES:
+        ids, points = depths_within(before, rig)
+        rows = np.isin(seen.ids, ids)
+        count = np.count_nonzero(rows)
+        if count < MIN_POINTS:
             return Refusal(
                 "tracks",
-                f"{MIN_FEATURES} features with a depth that last from one frame to the next; there "
-                f"are {np.count_nonzero(rows)} of {len(seen)} (a second camera or a depth image "
-                "gives the depth)",
+                f"{MIN_POINTS} features with a depth that last from one frame to the next; there "
+                f"are {count} of {len(seen)} (a second camera or a depth image gives the depth)",
             )
-        error = _ERROR_PX / rig.cameras[0].camera.fx
-        solved = camera_motion(found.points[rows], seen.normalized[rows], error)
-        if solved is None or 2 * np.count_nonzero(solved[1]) < np.count_nonzero(rows):
+        order = np.argsort(ids)
+        known = points[order][np.searchsorted(ids[order], seen.ids[rows])]
+        error = ERROR_PX / rig.cameras[0].camera.fx
+        solved = camera_pose(known, seen.normalized[rows], error)
+        if solved is None or 2 * np.count_nonzero(solved[1]) < count:
             return Refusal("fit", "features that fit one motion from one frame to the next")
         camera_T_before, fits = solved
         self.outliers = np.sort(seen.ids[rows][~fits])
         return camera_T_before.inverse().compose(rig.cameras[0].body_T_camera.inverse())
-
-
-def camera_motion(
-    points: FloatArray, rays: FloatArray, error: float
-) -> tuple[gtsam.Pose3, BoolArray] | None:
-    """camera_T_points of known points that a camera sees, by PnP with RANSAC, and which fit it.
-
-    Args:
-        points: (N, 3).
-        rays: (N, 2) where the camera sees them, on its plane z = 1.
-        error: largest error on that plane of a point that fits.
-    """
-    cv2.setRNGSeed(0)  # OpenCV draws from one global generator
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points,
-        np.ascontiguousarray(rays),
-        np.eye(3),
-        None,
-        iterationsCount=_RANSAC_ITERATIONS,
-        reprojectionError=error,
-        confidence=0.999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
-    if not found or inliers is None:
-        return None
-    fits = np.zeros(len(points), np.bool_)
-    fits[inliers[:, 0]] = True
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[fits], rays[fits], np.eye(3), None, rotation, translation
-    )
-    return gtsam.Pose3(gtsam.Rot3(cv2.Rodrigues(rotation)[0]), translation[:, 0]), fits

@@ -51,10 +51,11 @@ class FrameLog:
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
         self._real_rig, self.rig = rig, with_depth_camera(rig)
-        rig = replace(self.rig, depth=None)  # which is a camera now
+        # the depth sensor is a camera in it, and the samples of the dynamics are those of an IMU
+        recorded = replace(self.rig, depth=None, has_imu=True)
         self._config = config
         self._path = folder / "frames"
-        self._recorder = TrackRecorder(self._path, rig)
+        self._recorder = TrackRecorder(self._path, recorded)
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
