@@ -15,7 +15,9 @@ from scipy.linalg import eigh
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.imu_factor import imu_factor
+from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.marginalization.marginalize import unobservable_directions
 from slam_graph.backend.policies import AlgorithmConfig
@@ -66,6 +68,44 @@ def claims_over_time(
 @pytest.mark.parametrize("name", ["ekf", "iekf", "msckf", "swf", "okvis"])
 def test_with_first_estimates_nothing_unseen_is_claimed(name: str, cameras: int) -> None:
     assert max(claims_over_time(name, True, cameras)) < 1.0 + 1e-6
+
+
+def seen_of_the_unobservable(cost: Cost) -> float:
+    """The largest derivative along the four directions, relative to the largest of all."""
+    linear, layout = cost.linearize(summed=True), cost.layout()
+    A = np.concatenate([cost.factor_rows(layout), cost.rows(linear, layout)])[:, :-1]
+    directions = unobservable_directions(cost.state.first, layout)
+    return float(np.abs(A @ directions).max() / np.abs(A).max())
+
+
+def test_no_row_sees_these_directions_wherever_a_step_leads() -> None:
+    """A feature that becomes a variable is linearised where its first estimate is.
+
+    Damped steps do not end where the cost is least, so any step will do.
+    """
+    more = ["algorithm.cost.max_state_features=20", "algorithm.cost.state_feature_frames=5"]
+    algorithm: AlgorithmConfig = load_config(algorithm="okvis", overrides=more).algorithm
+    rng, flight, mounted = np.random.default_rng(2), Flight(), rig(2)
+    estimator = Estimator(mounted, algorithm, CONFIG)
+    estimator.start(flight.nav_state(0.0, WEAK))
+    entered = 0
+    for packet in packets(flight, mounted, room(250, rng), 1.5, rng):
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        assert estimator.add_frame(packet.frame) is not None
+        engine = estimator._engine
+        assert isinstance(engine, SquareRootEngine)
+        if engine._cost is None or engine._cost.tracks is None:  # the start
+            continue
+        everything = np.ones(len(engine._cost.tracks.points), np.bool_)
+        cost = engine._cost.part(engine._cost.factors, everything)
+        cost.state = cost.state.copy()
+        assert cost.tracks is not None
+        entered += int(np.sum(cost.tracks.in_state))
+        linear, layout = cost.linearize(summed=True), cost.layout()
+        cost.apply(1e-3 * rng.standard_normal(layout.size), linear, layout)
+        assert seen_of_the_unobservable(cost) < 1e-7
+    assert entered > 5
 
 
 def test_without_first_estimates_the_claims_grow() -> None:

@@ -290,13 +290,21 @@ class Cost:
     # --- moving --------------------------------------------------------------------------------
 
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
-        """Move the estimates by an increment (n,), and the new features with them."""
+        """Move the estimates by an increment (n,), and the new features with them.
+
+        A new feature goes where it fits the moved poses best. One that becomes a variable of the
+        state goes where the increment says: a damped one is shorter. With two positions its rows
+        would be linearised at one, and its first estimate would be the other.
+        """
+        self.state.update(layout, delta)
         if self.tracks is not None and linear.tracks is not None:
             assert isinstance(linear.tracks, SummedFeatures)
-            columns = layout.indices(self.rig.keys_of(self.tracks.obs))
-            step = linear.tracks.point_increments(delta[columns])
-            self.tracks = replace(self.tracks, points=self.tracks.points + step)
-        self.state.update(layout, delta)
+            tracks, columns = self.tracks, layout.indices(self.rig.keys_of(self.tracks.obs))
+            points = tracks.points + linear.tracks.point_increments(delta[columns])
+            if tracks.in_state.any():
+                ids = tracks.obs.ids[tracks.in_state]
+                points[tracks.in_state] = stacked_points(self.state.estimate, ids)
+            self.tracks = replace(tracks, points=points)
 
     def snapshot(self) -> tuple[State, TrackFeatures | None]:
         """What `apply` changes, to be given back to `restore`."""
