@@ -143,7 +143,7 @@ class FrameLog:
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
-        sequence.rig = rig  # how far the samples lead
+        sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:
