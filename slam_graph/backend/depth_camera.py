@@ -18,6 +18,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from slam_graph.arrays import BoolArray
+from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.sensors import (
     Camera,
     DepthSensor,
@@ -84,6 +86,11 @@ def with_depth_observed(frame: FeatureFrame, rig: Rig) -> FeatureFrame:
     return replace(
         frame, cameras=(*frame.cameras, FeatureObservations(seen.ids[rows], pixels, beside))
     )
+
+
+def is_of_depth(obs: Observations, rig: Rig) -> BoolArray:
+    """Which observations (N,) are those of the depth sensor of a rig `with_depth_camera`."""
+    return obs.camera == (len(rig.cameras) - 1 if rig.depth is not None else -1)
 
 
 def _square_noise_per_m(sensor: DepthSensor) -> float:

@@ -28,6 +28,8 @@ from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Packe
 
 _MAX_BEYOND_NS = 100_000_000
 """Frames farther outside of the IMU samples than this are left out."""
+_SPACING_WITHOUT_IMU_S = 0.05
+"""Longest time between keyframes without an IMU, which else tells the motion between them."""
 _JITTER = 0.95
 """Part of the keyframe spacing that is enough, because time stamps jitter."""
 
@@ -158,7 +160,10 @@ class FrameLog:
         if not self._keyframes:
             return True
         since_s = (frame.stamp_ns - self._frames[self._keyframes[-1]]) * 1e-9
-        if since_s >= _JITTER * self._config.keyframe_spacing_s:
+        spacing_s = self._config.keyframe_spacing_s
+        if not self.rig.has_imu:
+            spacing_s = min(spacing_s, _SPACING_WITHOUT_IMU_S)
+        if since_s >= _JITTER * spacing_s:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
         return len(common) > 0 and bool(common.mean() < self._config.min_common_features)

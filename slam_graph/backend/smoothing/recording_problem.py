@@ -22,7 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.depth_camera import with_depth_camera
+from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
@@ -103,7 +103,8 @@ class SmoothingTask:
         rig = with_depth_camera(rig)
         if backend.dynamics.uses_imu(rig.has_imu):
             return cls(rig, backend, config)
-        return cls(model_rig(rig, backend.dynamics), without_imu(backend), config)
+        alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
+        return cls(model_rig(rig, backend.dynamics), without_imu(backend), alone)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -250,6 +251,7 @@ class BundleAdjustment:
         """
         at = Geometry(*stacked_poses(self._values, obs.frames), points)
         lengths = np.linalg.norm(self._projection.residuals(obs, at)[0], axis=1)
+        lengths = lengths[~is_of_depth(obs, self._task.rig)]  # whose noise is known
         unknowns = 3 * len(obs.ids) + 6 * len(self._segment.keyframes)
         freedom = 2 * len(obs) - unknowns
         if freedom <= unknowns:
@@ -310,7 +312,7 @@ class BundleAdjustment:
             inertial,
             ReprojectionCost(
                 obs,
-                self._sigma_px * np.sqrt(variances),
+                self._sigmas_px(obs) * np.sqrt(variances),
                 self._projection,
                 RobustLoss(self._config.robust_loss, self._config.robust_width),
             ),
@@ -324,6 +326,11 @@ class BundleAdjustment:
         self._values = end.states
         self._minimum = Minimum(cost, end)
         return value, inertial.error(self._values)
+
+    def _sigmas_px(self, obs: Observations) -> FloatArray:
+        """Standard deviations (N,) of observations: learned, but for those of a depth sensor."""
+        of_depth = is_of_depth(obs, self._task.rig)
+        return np.where(of_depth, self._backend.noise.pixel_sigma, self._sigma_px)
 
     def _count_step(self) -> None:
         self.iterations += 1
