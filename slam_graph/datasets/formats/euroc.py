@@ -80,7 +80,8 @@ def _read_rig(mav0: Path, options: ReaderOptions) -> tuple[Rig, list[Path]]:
         beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
         imu = next((file for file in beside if file.is_file()), None)
         noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
-        rig = read_kalibr(chain, fallback=noise, needs_imu=(mav0 / "imu0").is_dir())
+        needs_imu = options.imu and (mav0 / "imu0").is_dir()
+        rig = read_kalibr(chain, fallback=noise, needs_imu=needs_imu)
         if len(rig.cameras) > len(folders):
             raise DataError(
                 f"{chain}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "

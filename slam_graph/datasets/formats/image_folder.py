@@ -96,7 +96,7 @@ def find_files(
         stamps=None if rate_hz is not None else files["stamps"],
         rate_hz=rate_hz,
         imu=None if imu is None else ImuFile(imu, _parse_timed_imu),
-        rig=options.select(read_kalibr(chain, needs_imu=imu is not None).select(1)),
+        rig=options.select(read_kalibr(chain, needs_imu=imu is not None and options.imu).select(1)),
     )
 
 

@@ -91,7 +91,9 @@ class RosBagSequence(GroupedSequence):
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
         unknown = ImuNoise()
         if chain is not None:
-            rig = read_kalibr(chain, fallback=unknown, needs_imu=topics.imu is not None)
+            rig = read_kalibr(
+                chain, fallback=unknown, needs_imu=topics.imu is not None and options.imu
+            )
         else:
             count = len(topics.cameras) if cameras is None else cameras
             used = replace(topics, cameras=topics.cameras[:count])
@@ -107,11 +109,10 @@ class RosBagSequence(GroupedSequence):
                 f"{path}: {len(rig.cameras)} cameras are calibrated, images are on "
                 f"{', '.join(topics.cameras)}; choose with --topic cam0=…"
             )
-        rig = options.select(rig)
+        rig = replace(options.select(rig), has_imu=topics.imu is not None)
         self._cameras = topics.cameras[: len(rig.cameras)]
         truth = None if topics.groundtruth is None else self._read_poses
         super().__init__(path.stem, rig, self._cameras, None, options, truth)
-        self.has_imu = topics.imu is not None
         with self._bag.kept_open():
             for k, topic in enumerate(self._cameras):
                 self._check_first_images(topic, k)

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The measured depth of features: taken from a depth image where its neighbourhood is one surface.
+
+A plane in the world has an inverse depth that is linear in the pixels of a camera without
+distortion, and nearly so over a few pixels of any other. So a plane is fitted to the inverse depths
+around a feature. At the edge of an object, or where a depth is wrong, some of them are off by more
+than the noise of the sensor explains; such a feature has no depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.frontend.frontend_protocol import FrameStats
+from slam_graph.sensors import CameraFrame, DepthSensor, FeatureObservations
+
+_Metres = NDArray[np.float32]
+"""(height, width) depth along the optical axis in m; NaN where there is none."""
+
+_RADIUS = 2
+"""The neighbourhood has 5 x 5 pixels around that nearest to a feature."""
+
+_LEAST_VALID = 0.6
+"""Share of the neighbourhood that must have a depth; the pixels next to the feature all must."""
+
+_MOST_SIGMAS = 4.0
+"""A neighbour whose inverse depth is farther off the plane than this has another surface."""
+
+_PLACE_SIGMA_PX = 0.5
+"""Uncertainty of where in the depth image a feature is: half a pixel of the registration. On a
+slanted surface it is one of the depth."""
+
+_STEPS = np.arange(-_RADIUS, _RADIUS + 1)
+_DU, _DV = (grid.ravel() for grid in np.meshgrid(_STEPS, _STEPS))
+
+
+class DepthSampler:
+    """Gives the features of a camera the depths that are measured with its images.
+
+    A depth image that was taken a little before or after the camera's image shows a feature
+    elsewhere. It is looked up where the motion of the feature since the last frame, or that of most
+    features if it is new, puts it then.
+
+    Args:
+        sensor: camera and noise.
+
+    Attributes:
+        camera: number of the camera.
+    """
+
+    def __init__(self, sensor: DepthSensor) -> None:
+        self.camera = sensor.camera
+        self._sensor = sensor
+        self._before = FeatureObservations.empty()
+        self._before_ns = 0
+
+    def measure(
+        self, seen: FeatureObservations, frame: CameraFrame, stats: FrameStats
+    ) -> FeatureObservations:
+        """The features of a frame, which follows those before in time, with their depths.
+
+        Args:
+            seen: N features of the camera.
+            frame: may have a depth image.
+            stats: counts the features `with_depth`.
+        """
+        before, before_ns = self._before, self._before_ns
+        self._before, self._before_ns = seen, frame.stamp_ns
+        if frame.depth is None:
+            nothing = np.full(len(seen), np.nan)
+            return replace(seen, depth_m=nothing, depth_sigma_m=nothing.copy())
+        depth_ns = frame.stamp_ns if frame.depth_ns is None else frame.depth_ns
+        ahead = (depth_ns - frame.stamp_ns) / max(frame.stamp_ns - before_ns, 1)
+        places = seen.pixels
+        if ahead != 0.0 and len(before):
+            places = places + ahead * _motion(before, seen)
+        depth_m, sigma_m = sample_depth(places, frame.depth, self._sensor)
+        stats.count(with_depth=np.isfinite(depth_m))
+        return replace(seen, depth_m=depth_m, depth_sigma_m=sigma_m)
+
+
+def _motion(before: FeatureObservations, after: FeatureObservations) -> FloatArray:
+    """By how many pixels (N, 2) features moved since the frame before; new ones as most did."""
+    _, there, here = np.intersect1d(before.ids, after.ids, return_indices=True)
+    if len(here) == 0:
+        return np.zeros((len(after), 2))
+    moved = after.pixels[here] - before.pixels[there]
+    motion = np.tile(np.median(moved, axis=0), (len(after), 1))
+    motion[here] = moved
+    return motion
+
+
+def sample_depth(
+    places: FloatArray, depth: _Metres, sensor: DepthSensor
+) -> tuple[FloatArray, FloatArray]:
+    """Depths (N,) at pixels and their standard deviations (N,), in m; NaN where there is none.
+
+    Inverse depth is interpolated between the four pixels around a place. Its standard deviation is
+    that of one pixel, as the errors of neighbouring pixels are alike, and that of the place.
+
+    Args:
+        places: (N, 2) pixels.
+        depth: (height, width) in m, NaN where there is none.
+        sensor: noise of the depth.
+    """
+    height, width = depth.shape
+    depth_m, sigma_m = np.full(len(places), np.nan), np.full(len(places), np.nan)
+    with np.errstate(invalid="ignore"):
+        last = [width - 1 - _RADIUS, height - 1 - _RADIUS]
+        inside = np.all((places >= _RADIUS) & (places < last), axis=1)
+    rows = np.flatnonzero(inside)
+    if len(rows) == 0:
+        return depth_m, sigma_m
+    u, v = places[rows].T
+    inverse = _interpolated(depth, u, v)
+    centre_u, centre_v = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
+    around = depth[centre_v[:, None] + _DV, centre_u[:, None] + _DU].astype(np.float64)
+    flat, slope = _one_surface(1.0 / around, sensor)
+    good = flat & np.isfinite(inverse)
+    rows, z = rows[good], 1.0 / inverse[good]
+    noise = sensor.sigma_m(z)
+    depth_m[rows] = z
+    sigma_m[rows] = np.hypot(noise, z**2 * slope[good] * _PLACE_SIGMA_PX)
+    return depth_m, sigma_m
+
+
+def _interpolated(depth: _Metres, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Inverse depths (N,) between four pixels; NaN where one of them has none."""
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    right, below = u - left, v - top
+    corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
+    weights = [(right if du else 1 - right) * (below if dv else 1 - below) for du, dv in corners]
+    values = [1.0 / depth[top + dv, left + du].astype(np.float64) for du, dv in corners]
+    total: FloatArray = np.sum(np.multiply(weights, values), axis=0)
+    return total
+
+
+def _one_surface(inverse: FloatArray, sensor: DepthSensor) -> tuple[BoolArray, FloatArray]:
+    """Whether the inverse depths (N, 25) of each neighbourhood are those of one surface.
+
+    Returns:
+        Which are (N,), and by how much the inverse depth changes from pixel to pixel (N,), 1/m.
+    """
+    valid = np.isfinite(inverse)
+    enough = np.mean(valid, axis=1) >= _LEAST_VALID
+    values: FloatArray = np.where(valid, inverse, 0.0)
+    design = np.stack([np.ones(len(_DU)), _DU, _DV], axis=1)
+    normal: FloatArray = np.einsum("nk,ki,kj->nij", valid, design, design)
+    normal[~enough] = np.eye(3)
+    solved = np.linalg.solve(normal, (values @ design)[:, :, None])
+    plane: FloatArray = solved.astype(np.float64)[:, :, 0]
+    fitted: FloatArray = plane @ design.T
+    # sigma of 1/z is that of z over z²
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = sensor.sigma_m(1.0 / fitted) * fitted**2
+        off = np.abs(inverse - fitted) > _MOST_SIGMAS * sigma
+    flat = enough & ~np.any(off & valid, axis=1) & np.all(fitted > 0.0, axis=1)
+    return flat, np.linalg.norm(plane[:, 1:], axis=1)
