@@ -37,6 +37,7 @@ slanted surface it is one of the depth."""
 
 _STEPS = np.arange(-_RADIUS, _RADIUS + 1)
 _DU, _DV = (grid.ravel() for grid in np.meshgrid(_STEPS, _STEPS))
+_DESIGN: FloatArray = np.column_stack([np.ones(len(_DU)), _DU, _DV]).astype(np.float64)
 
 
 class DepthSampler:
@@ -149,12 +150,11 @@ def _one_surface(inverse: FloatArray, sensor: DepthSensor) -> tuple[BoolArray, F
     valid = np.isfinite(inverse)
     enough = np.mean(valid, axis=1) >= _LEAST_VALID
     values: FloatArray = np.where(valid, inverse, 0.0)
-    design = np.stack([np.ones(len(_DU)), _DU, _DV], axis=1)
-    normal: FloatArray = np.einsum("nk,ki,kj->nij", valid, design, design)
+    normal: FloatArray = np.einsum("nk,ki,kj->nij", valid, _DESIGN, _DESIGN)
     normal[~enough] = np.eye(3)
-    solved = np.linalg.solve(normal, (values @ design)[:, :, None])
+    solved = np.linalg.solve(normal, (values @ _DESIGN)[:, :, None])
     plane: FloatArray = solved.astype(np.float64)[:, :, 0]
-    fitted: FloatArray = plane @ design.T
+    fitted: FloatArray = plane @ _DESIGN.T
     # sigma of 1/z is that of z over z²
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = sensor.sigma_m(1.0 / fitted) * fitted**2
