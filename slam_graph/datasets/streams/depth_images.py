@@ -214,6 +214,8 @@ def nearest_in_time(
 ) -> IntArray:
     """For each of F frames the index (F,) of the depth image nearest in time, or `ABSENT`.
 
+    A depth image is that of one frame only, as its errors would count twice otherwise.
+
     Args:
         frames_ns: (F,) stamps of the frames, increasing.
         stamps_ns: (N,) stamps of the depth images, increasing.
@@ -226,8 +228,14 @@ def nearest_in_time(
     apart = np.abs(stamps_ns[around] - frames_ns)
     best = np.argmin(apart, axis=0)
     columns = np.arange(len(frames_ns))
-    index = np.where(apart[best, columns] <= tolerance_s * 1e9, around[best, columns], ABSENT)
-    return index.astype(np.int64)
+    distance, index = apart[best, columns], around[best, columns]
+    order = np.lexsort((distance, index))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = index[order][1:] != index[order][:-1]
+    used = np.zeros(len(order), np.bool_)
+    used[order[first]] = True
+    used &= distance <= tolerance_s * 1e9
+    return np.where(used, index, ABSENT).astype(np.int64)
 
 
 def require_depth_size(stream: DepthStream, count: int) -> None:
