@@ -34,6 +34,11 @@ DepthProcess = Callable[[NDArray[Any]], NDArray[Any]]
 """Turns a raw depth image (height, width) into another one."""
 
 
+_REACH = 0.7
+"""A registered point fills the pixels up to this share of a depth pixel's width around it: half,
+and some more, as points on a slanted surface are farther apart."""
+
+
 class DepthStream(Protocol):
     """The depth images of a recording, registered to a camera of its rig.
 
@@ -153,7 +158,7 @@ class Registration:
         self._rays: FloatArray = rays @ camera_T_depth.rotation().matrix().T
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
-        self._reach = 0.5 * max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
+        self._reach = _REACH * max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
 
     def register(self, depth: Metres) -> Metres:
         """The depth image of the camera, NaN where nothing is seen.
