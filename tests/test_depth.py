@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
@@ -14,10 +15,19 @@ from scipy.stats import chi2
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.streams.depth_images import Registration, nearest_in_time
 from slam_graph.datasets.streams.pairing import ABSENT
+from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.frontend.depth_sampling import sample_depth
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import Camera, CameraFrame, DepthSensor, FeatureFrame, FeatureObservations
+from slam_graph.sensors import (
+    Camera,
+    CameraFrame,
+    DepthSensor,
+    FeatureFrame,
+    FeatureObservations,
+    Rig,
+    RigCamera,
+)
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedImages
 
@@ -148,6 +158,14 @@ def test_features_keep_their_depth() -> None:
     left = FeatureFrame(0, (broken,)).usable(1)[0].cameras[0]
     assert left.depth_m is not None
     np.testing.assert_array_equal(left.depth_m, depth[[0, 2, 3]])
+
+
+def test_depth_of_another_size_is_refused() -> None:
+    rig = Rig((RigCamera(PINHOLE, gtsam.Pose3()),), has_imu=False, depth=SENSOR)
+    image = np.zeros((240, 320), np.uint8)
+    frame = CameraFrame(0, (image,), np.ones((120, 160), np.float32))
+    with pytest.raises(DataError, match="depth image has shape"):
+        build_frontend(rig).track(frame)
 
 
 # --- pairing --------------------------------------------------------------------------------------
