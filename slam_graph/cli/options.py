@@ -85,8 +85,8 @@ Sources = Annotated[
         "--source",
         metavar="SENSOR=WHERE",
         help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
-        "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
-        "rate=30 instead of stamps.",
+        "depth=/depth, groundtruth=/pose; files of a video or image folder: stamps=times.csv, "
+        "imu=imu.csv, or rate=30 instead of stamps.",
         rich_help_panel=_RECORDING,
     ),
 ]

@@ -136,7 +136,8 @@ class ImageFrontend:
         none, the cameras matched to it track their features by themselves.
 
         Raises:
-            DataError: if the frame does not have one image per camera of the calibrated size.
+            DataError: if the frame does not have one image per camera of the calibrated size, or
+                its depth image is of another size.
         """
         self._stats.clear()
         self._stats.add("rejected_gate", self._gated)
@@ -206,6 +207,13 @@ class ImageFrontend:
                 raise DataError(
                     f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has shape "
                     f"{image.shape}, its calibration says {size} (height, width)"
+                )
+        if frame.depth is not None and self._depth is not None:
+            lens = cameras[self._depth.camera].camera
+            if frame.depth.shape != (lens.height, lens.width):
+                raise DataError(
+                    f"frame {frame.stamp_ns}: the depth image has shape {frame.depth.shape}, its "
+                    f"camera {(lens.height, lens.width)} (height, width); register it"
                 )
         return frame.images
 

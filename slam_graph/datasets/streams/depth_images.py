@@ -34,6 +34,11 @@ DepthProcess = Callable[[NDArray[Any]], NDArray[Any]]
 """Turns a raw depth image (height, width) into another one."""
 
 
+_REACH = 0.7
+"""A registered point fills the pixels up to this share of a depth pixel's width around it: half,
+and some more, as points on a slanted surface are farther apart."""
+
+
 class DepthStream(Protocol):
     """The depth images of a recording, registered to a camera of its rig.
 
@@ -153,7 +158,7 @@ class Registration:
         self._rays: FloatArray = rays @ camera_T_depth.rotation().matrix().T
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
-        self._reach = 0.5 * max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
+        self._reach = _REACH * max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
 
     def register(self, depth: Metres) -> Metres:
         """The depth image of the camera, NaN where nothing is seen.
@@ -214,6 +219,8 @@ def nearest_in_time(
 ) -> IntArray:
     """For each of F frames the index (F,) of the depth image nearest in time, or `ABSENT`.
 
+    A depth image is that of one frame only, as its errors would count twice otherwise.
+
     Args:
         frames_ns: (F,) stamps of the frames, increasing.
         stamps_ns: (N,) stamps of the depth images, increasing.
@@ -226,8 +233,14 @@ def nearest_in_time(
     apart = np.abs(stamps_ns[around] - frames_ns)
     best = np.argmin(apart, axis=0)
     columns = np.arange(len(frames_ns))
-    index = np.where(apart[best, columns] <= tolerance_s * 1e9, around[best, columns], ABSENT)
-    return index.astype(np.int64)
+    distance, index = apart[best, columns], around[best, columns]
+    order = np.lexsort((distance, index))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = index[order][1:] != index[order][:-1]
+    used = np.zeros(len(order), np.bool_)
+    used[order[first]] = True
+    used &= distance <= tolerance_s * 1e9
+    return np.where(used, index, ABSENT).astype(np.int64)
 
 
 def require_depth_size(stream: DepthStream, count: int) -> None:
