@@ -28,7 +28,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, Rig
 
 _STEPS = 16
-"""Steps of integration from frame to frame: variances of the rotation are exact to 1.5 / 16 then."""
+"""Steps of integration from frame to frame: variances of the rotation are exact to 9 %."""
 _NOTHING = 1e-6
 """Noise densities that the model does not have; preintegration wants them positive."""
 _NO_GAP_S = 1e9

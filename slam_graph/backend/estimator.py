@@ -309,6 +309,8 @@ class Estimator:
             if isinstance(self._initializer, Initializer):
                 scale_sigma = self._initializer.scale_sigma
                 self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            else:
+                self._context.add_observations(window, frame)
             window = self._placed(window)
         return window
 
