@@ -90,7 +90,7 @@ def with_depth_observed(frame: FeatureFrame, rig: Rig) -> FeatureFrame:
 
 def is_of_depth(obs: Observations, rig: Rig) -> BoolArray:
     """Which observations (N,) are those of the depth sensor of a rig `with_depth_camera`."""
-    return obs.camera == (len(rig.cameras) - 1 if rig.depth is not None else -1)
+    return np.equal(obs.camera, len(rig.cameras) - 1 if rig.depth is not None else -1)
 
 
 def _square_noise_per_m(sensor: DepthSensor) -> float:

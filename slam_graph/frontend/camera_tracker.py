@@ -74,7 +74,7 @@ class CameraTracker:
         """
         with self._stats.timed("temporal_ms"):
             self._predictor.advance(before.stamp_ns, stamp_ns)
-            if self._rotation is not None and len(before):
+            if self._rotation is not None and before.image is not None:
                 self._predictor.turn(self._rotation.between(before.image, image))
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)

@@ -74,8 +74,8 @@ class ImageRotation:
         """A small, smooth copy with the mean of its surroundings taken away."""
         if self._last is not None and self._last[0] is image:
             return self._last[1]
-        small = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        small = cv2.GaussianBlur(small, (0, 0), _BLUR)
+        reduced = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        small = cv2.GaussianBlur(reduced.astype(np.float32), (0, 0), _BLUR)
         return np.asarray(small - cv2.blur(small, (31, 31)), np.float32)
 
     def _by_shift(self, one: _Small, other: _Small) -> FloatArray:

@@ -131,6 +131,9 @@ class RunResult(RunSummary):
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
+    def __post_init__(self) -> None:
+        self.history.level = self.input.rig.has_imu
+
     def __repr__(self) -> str:
         return (
             f"RunResult({self.input.info.name}, {self.config.algorithm.name}: {self.status}, "
@@ -144,7 +147,7 @@ class RunResult(RunSummary):
             since_ns: the time; None for all states. The points of the map begin anew with these.
         """
         if since_ns is None:
-            self.history, self.point_map = StateHistory(), PointMap()
+            self.history, self.point_map = StateHistory(self.history.level), PointMap()
         else:
             self.history.forget_from(since_ns)
         self.logs.forget_states(since_ns)
@@ -282,7 +285,7 @@ class RunResult(RunSummary):
                 "algorithm": self.config.algorithm.name,
                 "cameras": len(asked.rig.cameras),
                 "seed": self.config.seed,
-                "extent": {**extent, "start_was_given": self.start_was_given},
+                "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(self.segments, self.trajectory, truth),
                 "accuracy": tables.accuracy_table(truth, self.trajectory),
                 "final_ba": tables.final_ba_table(self.final_ba, truth),

@@ -119,7 +119,7 @@ def adjust_worlds(
             parts.append(found)
     if len(parts) < 2:
         return parts[0] if parts else None
-    history = StateHistory()
+    history = StateHistory(parts[0].history.level)
     for found in parts:
         history.extend(found.history)
     return FinalBa(history, total_of([found.summary for found in parts]), None)
@@ -166,7 +166,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     longest, began_ns = task.config.max_keyframes, causal.stamps_ns[0]
     causal = _extended_backward(log, causal, task, report)
-    history, level = StateHistory(), task.rig.has_imu
+    level = task.rig.has_imu
+    history = StateHistory(level)
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):
