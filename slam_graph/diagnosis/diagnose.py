@@ -99,7 +99,8 @@ class Diagnosis:
 
 def _plain(material: Material) -> tuple[list[Finding], float]:
     """What shows without tracks, and the factor that makes the forces m/s²."""
-    found, factor = [], 1.0
+    found: list[Finding] = []
+    factor = 1.0
     if material.rig.has_imu:
         found, factor = check_units(material.imu)
         found = found + check_sampling(material.imu, material.rig.imu, material.stamps_ns)
