@@ -11,6 +11,8 @@ phase correlation, from the last rotation or from none, whichever fits best.
 
 from __future__ import annotations
 
+from operator import itemgetter
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,8 @@ _SMALLEST_STEP = 2e-4
 """Steps end below this angle, rad: a tenth of a pixel of a large image."""
 _BLUR = 1.0
 """Standard deviation, in small pixels, of the blur that makes alignment smooth."""
+_FITTING = 0.2
+"""Images fit if they differ by less than this part of their contrast, squared."""
 _LEAST_OVERLAP = 0.4
 """Part of the image that both must show."""
 
@@ -65,9 +69,14 @@ class ImageRotation:
         self._last = after, other
         guesses = [np.eye(3), self._turn, self._by_shift(one, other)]
         costs = [self._cost(one, other, R) for R in guesses]
-        best = guesses[int(np.argmin(costs))]
-        aligned = self._aligned(one, other, best)
-        self._turn = aligned if self._cost(one, other, aligned) <= min(costs) else best
+        enough = _FITTING * float(np.mean(one * one))
+        found: list[tuple[float, FloatArray]] = list(zip(costs, guesses, strict=True))
+        for k in np.argsort(costs).tolist():
+            aligned = self._aligned(one, other, guesses[k])
+            found.append((self._cost(one, other, aligned), aligned))
+            if found[-1][0] < enough:
+                break
+        self._turn = min(found, key=itemgetter(0))[1]
         return self._turn
 
     def _small(self, image: Image) -> _Small:

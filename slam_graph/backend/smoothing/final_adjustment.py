@@ -178,7 +178,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
             task, start = replace(task, causal=causal), with_angular_rates(start)
-        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns))
+        # without an IMU errors are judged by the first pose, so that it defines the world
+        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
         begin, link = 0, None
         if states:
             anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
