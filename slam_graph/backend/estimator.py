@@ -86,9 +86,9 @@ class Estimator:
         self._real_rig = rig
         dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
-        self._make_engine: Callable[[EngineContext], Engine] = SmootherEngine
-        if algorithm.engine == "square_root":
-            self._make_engine = SquareRootEngine
+        self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine
+        if algorithm.engine != "square_root":
+            self._make_engine = SmootherEngine
         self._check = StartCalibration(rig, config)
         self._given: NavState | None = None
         self._before: NavState | None = None
@@ -134,8 +134,7 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        state = self._dynamics.given(state)
-        self._given = state
+        state = self._given = self._dynamics.given(state)
         self._start_up.doubtful = False
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
@@ -155,11 +154,8 @@ class Estimator:
         self._begin(self._context.imu)
 
     def add_imu(self, imu: ImuData) -> None:
-        """Add IMU samples that follow those already given; others are counted and left out.
-
-        Under dynamics that use no IMU they mean nothing.
-        """
-        if not self.rig.has_imu:
+        """Add IMU samples that follow those already given; others are counted and left out."""
+        if not self.rig.has_imu:  # they mean nothing
             return
         left_out = self._context.imu.add(imu)
         if left_out:
