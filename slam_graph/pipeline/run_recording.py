@@ -82,6 +82,7 @@ def run(
     settings = _settings(config, overrides, options)
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
+    result.history.level = result.input.rig.has_imu
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)

@@ -131,9 +131,6 @@ class RunResult(RunSummary):
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
-    def __post_init__(self) -> None:
-        self.history.level = self.input.rig.has_imu
-
     def __repr__(self) -> str:
         return (
             f"RunResult({self.input.info.name}, {self.config.algorithm.name}: {self.status}, "
