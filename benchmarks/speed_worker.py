@@ -93,7 +93,7 @@ class DecodedInTurn(EurocSequence):
             self.decoding.start()
             images = self._read_frame(index)
             self.decoding.stop()
-            yield self._report(index, images)
+            yield self._report(index, *images)
 
 
 class Reference(NullViewer, NullProgress):

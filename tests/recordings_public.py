@@ -155,7 +155,10 @@ def write_tum_rgbd(folder: Path, frames: int = 6) -> Path:
         lines = [f"# {kind} images", "# file: 'a.bag'", "# timestamp filename"]
         for k in range(frames):
             stamp = f"13050311{k // 30:02d}.{k % 30 * 33333:06d}"
-            pixels = np.random.default_rng(k).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+            shape, kind_of = ((480, 640, 3), np.uint8) if kind == "rgb" else ((480, 640), np.uint16)
+            pixels = np.random.default_rng(k).integers(0, 255, shape, dtype=kind_of)
+            if kind == "depth":
+                pixels += 10_000  # about 2 m
             cv2.imwrite(str(folder / kind / f"{stamp}.png"), pixels)
             lines.append(f"{stamp} {kind}/{stamp}.png")
         write_lines(folder / f"{kind}.txt", lines)

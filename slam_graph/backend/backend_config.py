@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from slam_graph.errors import ConfigError
 from slam_graph.settings import Settings, expert
 
 
@@ -48,7 +49,7 @@ class NoiseConfig(Settings):
     take it where it is clearly larger than `pixel_sigma`, up to four times that. any: also where
     it is smaller, down to a quarter; covariances are then more often too small. never: take
     `pixel_sigma`, as GTSAM's smoothers always do."""
-    gravity: float = expert(9.81, gt=0)
+    gravity: float = expert(9.81, ge=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""
     max_imu_gap_s: float = expert(0.03, gt=0)
@@ -226,9 +227,38 @@ class CalibrationConfig(Settings):
         return self.extrinsics or self.time_offset or self.readout or lens
 
 
+class DynamicsConfig(Settings):
+    """What predicts the state from frame to frame."""
+
+    model: Literal["auto", "imu", "constant_velocity"] = "auto"
+    """imu: gyroscope and accelerometer. constant_velocity: linear and angular acceleration are
+    white noise, and an IMU is not used. auto: the IMU if the recording has one."""
+    accel_density: float = expert(3.0, gt=0)
+    """Noise density of the acceleration of `constant_velocity`, m/s²/√Hz: after a time t the
+    velocity has changed by this times √t. It is raised where the images show more. Lower it for
+    slow platforms."""
+    angular_accel_density: float = expert(4.0, gt=0)
+    """The same for the angular acceleration, rad/s²/√Hz."""
+
+    def uses_imu(self, has_imu: bool) -> bool:
+        """Whether an IMU predicts the states, of a rig that has one or not.
+
+        Raises:
+            ConfigError: if it is to, and there is none.
+        """
+        if self.model == "imu" and not has_imu:
+            raise ConfigError(
+                "backend.dynamics.model is 'imu', and the recording has no IMU; "
+                "use constant_velocity, or auto"
+            )
+        return has_imu and self.model != "constant_velocity"
+
+
 class BackendConfig(Settings):
     """Settings of the back end that do not depend on the algorithm."""
 
+    dynamics: DynamicsConfig = DynamicsConfig()
+    """What predicts the state from frame to frame."""
     noise: NoiseConfig = NoiseConfig()
     """Noise of the sensors."""
     triangulation: TriangulationConfig = TriangulationConfig()

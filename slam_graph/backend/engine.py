@@ -44,7 +44,8 @@ class SquareRootEngine:
         """One turn of the loop: the three modules, in order."""
         context = self._context
         with report.timed("propagation"):
-            context.propagation.append_frame(window, context.imu, stamp_ns, still)
+            corrected = context.by_images(frame, window.points)
+            context.propagation.append_frame(window, context.imu, stamp_ns, still, corrected)
             context.add_observations(window, frame)
         with report.timed("cost"):
             if not still:

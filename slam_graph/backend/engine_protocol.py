@@ -10,7 +10,7 @@ package's own (`engine.py`) and GTSAM's smoothers (`gtsam_smoothers/`).
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,6 +27,7 @@ from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.visual_motion import VisualMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
@@ -88,6 +89,23 @@ class EngineContext:
     def pixels(self) -> PixelNoise:
         """Noise of the observations, which the engine estimates on the way."""
         return PixelNoise(self.config.noise, len(self.rig.cameras))
+
+    @cached_property
+    def _motion(self) -> VisualMotion:
+        return VisualMotion(self.rig)
+
+    def by_images(
+        self, frame: FeatureFrame, known: Callable[[], tuple[IntArray, FloatArray]]
+    ) -> Callable[[NavState, NavState], NavState] | None:
+        """What corrects the prediction of a frame by its images; None if an IMU predicts.
+
+        Args:
+            frame: its features.
+            known: gives ids (N,) and world positions (N, 3) of the features that are known.
+        """
+        if self.rig.has_imu:
+            return None
+        return lambda before, predicted: self._motion.corrected(before, predicted, frame, known())
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
         """Add the observations of the window's current frame to its tracks."""

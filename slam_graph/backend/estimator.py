@@ -22,14 +22,15 @@ from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
+from slam_graph.backend.dynamics import Dynamics
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
-from slam_graph.backend.initialization.initializer import Initializer
-from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
+from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
-from slam_graph.backend.initialization.start_review import StartReview
+from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
@@ -61,7 +62,6 @@ class Estimator:
         states: all that the last frame led to: one, none, or several where frames have waited.
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
         report: what is known of the last step besides the state.
-        joint: how the present segment continues the one before; None in the first.
     """
 
     def __init__(
@@ -83,14 +83,15 @@ class Estimator:
             ConfigError: if the engine cannot do what the settings ask for.
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
-        own = algorithm.engine == "square_root"
-        self._make_engine: Callable[[EngineContext], Engine] = (
-            SquareRootEngine if own else SmootherEngine
-        )
+        self._real_rig = rig
+        dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
+        rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
+        self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine
+        if algorithm.engine != "square_root":
+            self._make_engine = SmootherEngine
         self._check = StartCalibration(rig, config)
         self._given: NavState | None = None
         self._before: NavState | None = None
-        self.joint: SegmentJoint | None = None
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
@@ -115,10 +116,9 @@ class Estimator:
         )
         self._engine: Engine = self._make_engine(context)
         self._context = context
-        self._initializer = Initializer(context, self._start_mode)
+        self._start_up = StartUp(context, self._start_mode, self._before)
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
-        self._review: StartReview | None = None
         self.window: Window | None = None
 
     # --- input -----------------------------------------------------------------------------------
@@ -134,7 +134,8 @@ class Estimator:
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        self._given, self._review = state, None
+        state = self._given = self._dynamics.given(state)
+        self._start_up.doubtful = False
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
@@ -146,7 +147,7 @@ class Estimator:
             before: the last good state; the new start is put where the IMU predicts it from there.
         """
         self._given, self._start_mode = None, "auto"
-        self._before, self.joint = before, None
+        self._before = before
         if self._held is not None:
             self._held.clear()
         self._check.forget()
@@ -154,6 +155,8 @@ class Estimator:
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
+        if not self.rig.has_imu:  # they mean nothing
+            return
         left_out = self._context.imu.add(imu)
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
@@ -195,6 +198,7 @@ class Estimator:
         self.report = StepReport()
         self.solved_ns = frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
+        self._dynamics.extend(imu, frame.stamp_ns + round(self.rig.end_offset_s * 1e9))
         state = self.window.state if self.window is not None else None
         stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
         if not self._latest_ns < stamp_ns <= imu.newest_ns() + _MAX_AHEAD_NS:
@@ -203,6 +207,7 @@ class Estimator:
             return None
         self._latest_ns = stamp_ns
         imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
+        frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
             self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
@@ -216,12 +221,12 @@ class Estimator:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still, self.report)
-            return self._reviewed(stamp_ns, whole, stepped)
+            return self._reviewed(stamp_ns, whole, self._dynamics.reported(stepped))
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
             return None
-        return self.window.current(self.window.prior)
+        return self._dynamics.reported(self.window.current(self.window.prior))
 
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""
@@ -283,37 +288,31 @@ class Estimator:
         if not self._check.mounted:
             return None
         with self.report.timed("start"):
-            window = self._initializer.try_to_start(stamp_ns, frame)
+            window = self._start_up.try_to_start(stamp_ns, frame)
         if window is not None:
-            self._standstill.add_dynamic(self._initializer.outliers)
-            scale_sigma = self._initializer.scale_sigma
-            self._review = StartReview(self._context, stamp_ns, scale_sigma)
-            window = self._placed(window)
-        return window
-
-    def _placed(self, window: Window) -> Window:
-        """A window that has just begun, in the world of the segment before if there is one."""
-        if self._before is not None:
-            window, self.joint = place(window, self._before, self._context)
+            self._standstill.add_dynamic(self._start_up.outliers)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
         """The state, or that of a new beginning if what followed the start contradicts it."""
-        review = self._review
-        if review is None:
+        if not self._start_up.doubtful:
             return state
         with self.report.timed("start"):
-            window = review.better(stamp_ns, frame, state)
-        self._review = None if review.done else review
+            window = self._start_up.better(stamp_ns, frame, state)
         if window is None:
             return state
-        self._standstill.dynamic = review.outliers
-        self.window, self._engine = self._placed(window), self._make_engine(self._context)
+        self._standstill.dynamic = self._start_up.outliers
+        self.window, self._engine = window, self._make_engine(self._context)
         self._context.propagation.restart()
         self.replayed = self.states = [self.window.current(self.window.prior)]
         return self.replayed[0]
 
     # --- output ----------------------------------------------------------------------------------
+
+    @property
+    def joint(self) -> SegmentJoint | None:
+        """How the present segment continues the one before; None in the first."""
+        return self._start_up.joint
 
     @property
     def initialized(self) -> bool:
@@ -328,14 +327,14 @@ class Estimator:
     @property
     def corrected_rig(self) -> Rig | None:
         """The rig, if the first motion has shown that its calibration does not fit; else None."""
-        return None if self._held is None else self.rig
+        return None if self._held is None else self.rig.select(len(self._real_rig.cameras))
 
     @property
     def waiting_for(self) -> str:
         """What a start still needs, and the likeliest cause of the lack."""
         if not self._check.mounted:
             return self._check.waiting_for
-        return self._initializer.waiting_for(self._check.contradiction(self._context.imu))
+        return self._start_up.waiting_for(self._check.contradiction(self._context.imu))
 
     @property
     def rejected(self) -> IntArray:

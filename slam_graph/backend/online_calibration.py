@@ -147,7 +147,7 @@ class CalibrationVariables:
             self._camera(c, mounted, values, shift_s)
             for c, mounted in enumerate(self.nominal.cameras)
         )
-        return Rig(tuple(cameras), self.nominal.imu)
+        return replace(self.nominal, cameras=tuple(cameras))
 
     def _shift_s(self, values: gtsam.Values) -> float:
         """Difference of the estimated time offset from the nominal one, in seconds."""
@@ -296,7 +296,9 @@ def rolling_motion(now: NavState, frame_ns: int, imu: ImuBuffer, rig: Rig) -> Fr
     gyro, slope, force = imu.trend(now.stamp_ns, _around_ns(rig))
     body_R_world = now.world_T_body.rotation().inverse()
     velocity = body_R_world.rotate(now.velocity)
-    acceleration = force - now.accel_bias + body_R_world.rotate(_GRAVITY)
+    acceleration = force - now.accel_bias
+    if rig.has_imu:
+        acceleration = acceleration + body_R_world.rotate(_GRAVITY)
     return FrameMotion(
         np.concatenate([gyro - now.gyro_bias, velocity]),
         (now.stamp_ns - frame_ns) * 1e-9,

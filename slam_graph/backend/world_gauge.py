@@ -4,7 +4,9 @@
 
 A trajectory, or a segment of one, is known relative to a state that was given its position and yaw
 (Kelly & Sukhatme 2011). To join segments, one is moved by these four numbers, and what is not known
-of them is added to the covariances of its states.
+of them is added to the covariances of its states. Without an IMU nothing measures gravity, and they
+are six: position and all of the rotation. A covariance of the gauge has the position first, in axes
+of the world, then the rotation: about the vertical (4, 4), or about the axes of the world (6, 6).
 """
 
 from __future__ import annotations
@@ -21,15 +23,23 @@ _ERROR = len(NavState.COMPONENTS)
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
-def level_motion(moving: gtsam.Pose3, fixed: gtsam.Pose3) -> gtsam.Pose3:
-    """The motion of the world in position and yaw that moves one pose to the place of another."""
+def world_motion(moving: gtsam.Pose3, fixed: gtsam.Pose3, level: bool) -> gtsam.Pose3:
+    """The motion of the world that moves one pose to the place of another.
+
+    Args:
+        moving: the pose that is moved.
+        fixed: where it goes.
+        level: whether gravity is measured, so that the motion is one in position and yaw.
+    """
+    if not level:
+        return fixed.compose(moving.inverse())
     turn = fixed.rotation().compose(moving.rotation().inverse())
     yaw = gtsam.Rot3.Yaw(turn.yaw())
     return gtsam.Pose3(yaw, fixed.translation() - yaw.rotate(moving.translation()))
 
 
 def in_moved_world(states: list[NavState], motion: gtsam.Pose3) -> list[NavState]:
-    """States in a world that is moved by `new_T_old`, in position and yaw."""
+    """States in a world that is moved by `new_T_old`."""
     return [
         replace(
             state,
@@ -40,30 +50,38 @@ def in_moved_world(states: list[NavState], motion: gtsam.Pose3) -> list[NavState
     ]
 
 
-def gauge_motion(arms: FloatArray) -> FloatArray:
-    """How (N, 6, 4) poses move with position and yaw of the world, with axes of the world.
+def turned_axes(level: bool) -> FloatArray:
+    """Axes (1, 3) or (3, 3) of the world about which nothing measures its rotation."""
+    return np.eye(3)[2:] if level else np.eye(3)
+
+
+def gauge_motion(arms: FloatArray, level: bool = True) -> FloatArray:
+    """How (N, 6, 4 or 6) poses move with the gauge, with axes of the world.
 
     Args:
-        arms: (N, 3) positions relative to the point about which the yaw turns.
+        arms: (N, 3) positions relative to the point about which the world turns.
+        level: whether it turns about the vertical only.
     """
-    motion = np.zeros((len(arms), 6, 4))
-    motion[:, 2, 3] = 1.0
+    axes = turned_axes(level)
+    motion = np.zeros((len(arms), 6, 3 + len(axes)))
+    motion[:, :3, 3:] = axes.T
     motion[:, 3:, :3] = np.eye(3)
-    motion[:, 3:, 3] = np.cross([0.0, 0.0, 1.0], arms)
+    motion[:, 3:, 3:] = np.cross(axes, arms[:, None]).transpose(0, 2, 1)
     return motion
 
 
-def gauge_covariance(state: NavState) -> FloatArray:
-    """Covariance (4, 4) of position, in axes of the world, and yaw of a state."""
+def gauge_covariance(state: NavState, level: bool = True) -> FloatArray:
+    """Covariance of the gauge, (4, 4) if it is level or (6, 6), that a state gives its world."""
     assert state.covariance is not None
     R = state.world_T_body.rotation().matrix()
-    given = np.zeros((4, _ERROR))
+    axes = turned_axes(level)
+    given = np.zeros((3 + len(axes), _ERROR))
     given[:3, _POSITION] = R
-    given[3, _ROTATION] = R[2]
+    given[3:, _ROTATION] = axes @ R
     return np.asarray(given @ state.covariance @ given.T)
 
 
-def in_gauge_of(link: NavState, states: list[NavState]) -> list[NavState]:
+def in_gauge_of(link: NavState, states: list[NavState], level: bool = True) -> list[NavState]:
     """States of a segment with covariances relative to what those of an earlier one are.
 
     What is not known of position and yaw at the state where the segments join is added to all
@@ -72,26 +90,28 @@ def in_gauge_of(link: NavState, states: list[NavState]) -> list[NavState]:
     Args:
         link: the state of the earlier segment whose position and yaw the later one was given.
         states: of the later segment, with covariances relative to these.
+        level: whether gravity is measured.
     """
     if link.covariance is None:
         return states
-    unknown, place = gauge_covariance(link), link.world_T_body.translation()
+    unknown, place = gauge_covariance(link, level), link.world_T_body.translation()
     return [with_unknown_gauge(state, unknown, place) for state in states]
 
 
 def with_unknown_gauge(state: NavState, unknown: FloatArray, centre: FloatArray) -> NavState:
-    """A state with the uncertainty (4, 4) of position and yaw of its world added.
+    """A state with the uncertainty of the gauge of its world added.
 
     Args:
         state: with its covariance in that world; without one it stays as it is.
-        unknown: covariance of position (m), in axes of the world, and yaw (rad).
-        centre: (3,) the point about which the yaw turns.
+        unknown: (4, 4) or (6, 6) covariance of the gauge (m, rad).
+        centre: (3,) the point about which the world turns.
     """
     if state.covariance is None:
         return state
+    level = len(unknown) == 4
     body_R_world = state.world_T_body.rotation().matrix().T
-    N = np.zeros((_ERROR, 4))
-    moved = gauge_motion((state.world_T_body.translation() - centre)[None])[0]
+    N = np.zeros((_ERROR, len(unknown)))
+    moved = gauge_motion((state.world_T_body.translation() - centre)[None], level)[0]
     N[_ROTATION], N[_POSITION] = body_R_world @ moved[:3], body_R_world @ moved[3:]
-    N[_VELOCITY, 3] = np.cross([0.0, 0.0, 1.0], state.velocity)
+    N[_VELOCITY, 3:] = np.cross(turned_axes(level), state.velocity).T
     return replace(state, covariance=state.covariance + N @ unknown @ N.T)

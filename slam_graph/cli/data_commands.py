@@ -18,6 +18,7 @@ from slam_graph.cli.options import (
     Format,
     Groundtruth,
     Json,
+    NoImu,
     Progress,
     Sources,
     open_recording,
@@ -39,10 +40,11 @@ def info(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
+    no_imu: NoImu = False,
     as_json: Json = False,
 ) -> None:
     """Show what a recording holds, without reading all of it."""
-    sequence = open_recording(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources, no_imu=no_imu)
     table = _describe(sequence)
     if as_json:
         echo_json(table)
@@ -60,6 +62,7 @@ def check(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
+    no_imu: NoImu = False,
     images: Annotated[bool, typer.Option("--images", help="Also read every image.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -70,7 +73,7 @@ def check(
     from slam_graph.datasets import check_sequence
     from slam_graph.diagnosis import Diagnosis
 
-    sequence = open_recording(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources, no_imu=no_imu)
     findings = [asdict(finding) for finding in check_sequence(sequence, read_images=images)]
     if images:
         findings = _joined(findings, Diagnosis.quick(sequence))
@@ -107,6 +110,7 @@ def convert(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
+    no_imu: NoImu = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace OUTPUT if it is an EuRoC folder.")
     ] = False,
@@ -117,7 +121,7 @@ def convert(
     from slam_graph.datasets import EurocWriter
 
     EurocWriter.refuse_existing(output, force)
-    sequence = open_recording(data, format_, calibration, groundtruth, sources)
+    sequence = open_recording(data, format_, calibration, groundtruth, sources, no_imu=no_imu)
     info = sequence.info()
     with ProgressBar(info.start_ns, info.end_ns) if progress else nullcontext() as bar:
         report = None if bar is None else lambda stamp_ns: bar.advance(stamp_ns, True)
@@ -146,4 +150,11 @@ def _describe(sequence: Sequence) -> dict[str, Any]:
         }
         for index, mounted in enumerate(sequence.rig.cameras)
     ]
+    depth = sequence.rig.depth
+    if depth is not None:
+        table["depth"] = (
+            f"of camera {depth.camera}, {depth.min_m:g} to {depth.max_m:g} m, sigma "
+            f"{depth.noise_constant_m:g} m + {depth.noise_square_per_m:g} z²/m, "
+            + ("registered" if depth.lens is None else "of a camera of its own")
+        )
     return table

@@ -16,6 +16,7 @@ from slam_graph.cli.options import (
     Format,
     Inject,
     Json,
+    NoImu,
     Sources,
     open_recording,
 )
@@ -29,6 +30,7 @@ def doctor(
     format_: Format = None,
     calibration: Calibration = None,
     sources: Sources = None,
+    no_imu: NoImu = False,
     cameras: Cameras = None,
     inject: Inject = None,
     as_json: Json = False,
@@ -42,7 +44,7 @@ def doctor(
     from slam_graph.diagnosis import Diagnosis
 
     count = load_config(cameras=cameras).cameras
-    sequence = open_recording(data, format_, calibration, None, sources, count, inject)
+    sequence = open_recording(data, format_, calibration, None, sources, count, inject, no_imu)
     diagnosis = Diagnosis.of(sequence)
     if as_json:
         echo_json({"recording": sequence.name, **diagnosis.as_dict()})

@@ -85,8 +85,8 @@ Sources = Annotated[
         "--source",
         metavar="SENSOR=WHERE",
         help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
-        "groundtruth=/pose; files of a video or image folder: stamps=times.csv, imu=imu.csv, or "
-        "rate=30 instead of stamps.",
+        "depth=/depth, groundtruth=/pose; files of a video or image folder: stamps=times.csv, "
+        "imu=imu.csv, or rate=30 instead of stamps.",
         rich_help_panel=_RECORDING,
     ),
 ]
@@ -98,6 +98,10 @@ Cameras = Annotated[
         help="Cameras to use; all by default.",
         rich_help_panel=_RECORDING,
     ),
+]
+NoImu = Annotated[
+    bool,
+    typer.Option("--no-imu", help="Read it as if it had no IMU.", rich_help_panel=_RECORDING),
 ]
 Inject = Annotated[
     list[str] | None,
@@ -231,10 +235,11 @@ def open_recording(
     sources: list[str] | None,
     cameras: int | None = None,
     faults: list[str] | None = None,
+    no_imu: bool = False,
 ) -> RecordedSequence:
     """Open the recording that the options name, with its first `cameras` cameras or all.
 
-    Faults are put into it as far as `--inject` asks for them.
+    Faults are put into it as far as `--inject` asks for them; its IMU is left out by `--no-imu`.
     """
     with loading(f"opening {data}"):
         from slam_graph.datasets import open_dataset
@@ -247,6 +252,7 @@ def open_recording(
             groundtruth=groundtruth,
             sources=sources_from(sources),
             faults=faults or (),
+            imu=not no_imu,
         )
 
 

@@ -33,6 +33,7 @@ from slam_graph.cli.options import (
     Groundtruth,
     Inject,
     Json,
+    NoImu,
     Output,
     Overrides,
     Progress,
@@ -241,6 +242,7 @@ def run(
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
     sources: Sources = None,
+    no_imu: NoImu = False,
     inject: Inject = None,
     as_json: Json = False,
 ) -> None:
@@ -260,7 +262,7 @@ def run(
     )
     with collected_log() as log:
         sequence = open_recording(
-            data, format_, calibration, groundtruth, sources, settings.cameras, inject
+            data, format_, calibration, groundtruth, sources, settings.cameras, inject, no_imu
         )
         result, folder, files = execute(
             sequence,

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets import SequenceInfo
 
 Kind = Literal["tracks", "images"]
+Depth = Literal["none", "stereo", "kinect"]
 
 
 def simulate(
@@ -42,6 +43,13 @@ def simulate(
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Kalibr YAML of the rig.")
+    ] = None,
+    depth: Annotated[
+        Depth | None, typer.Option("--depth", help="Depth of what the first camera sees.")
+    ] = None,
+    imu: Annotated[
+        bool | None,
+        typer.Option("--imu/--no-imu", help="With an IMU, by default.", show_default=False),
     ] = None,
     shutter_readout: Annotated[
         float | None,
@@ -97,6 +105,8 @@ def simulate(
         "real_imu": real_imu,
         "cameras": cameras,
         "calibration": calibration,
+        "depth": None if depth is None else {"sensor": depth},
+        "with_imu": imu,
         "shutter_readout_s": shutter_readout,
         "start_s": start,
         "duration_s": duration,
@@ -134,6 +144,8 @@ def _report(
         "folder": str(output),
         "content": f"{info.frames} frames of {info.content}, {info.cameras} cameras",
         "duration": f"{(info.end_ns - info.start_ns) * 1e-9:.2f} s",
-        "IMU": f"{info.imu_samples} samples",
+        "IMU": f"{info.imu_samples} samples" if info.has_imu else "none",
     }
+    if info.has_depth:
+        rows["depth"] = "of the first camera"
     echo_table((rows | dict(lines)).items())

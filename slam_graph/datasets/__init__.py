@@ -11,7 +11,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "DATASETS",
-    "EurocSequence",
     "EurocWriter",
     "Format",
     "ReaderOptions",
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     )
     from slam_graph.datasets.data_checks import check_sequence
     from slam_graph.datasets.dataset_registry import DATASETS, Format, open_dataset
-    from slam_graph.datasets.formats.euroc import EurocSequence
     from slam_graph.datasets.formats.euroc_writer import EurocWriter
     from slam_graph.datasets.formats.track_recorder import TrackRecorder
     from slam_graph.datasets.groundtruth import read_groundtruth
@@ -51,7 +49,6 @@ else:
             "calibration.kalibr_calibration": ("kalibr_text", "read_kalibr", "rig_from_kalibr"),
             "data_checks": ("check_sequence",),
             "dataset_registry": ("DATASETS", "Format", "open_dataset"),
-            "formats.euroc": ("EurocSequence",),
             "formats.euroc_writer": ("EurocWriter",),
             "formats.track_recorder": ("TrackRecorder",),
             "groundtruth": ("read_groundtruth",),

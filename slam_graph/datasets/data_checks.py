@@ -11,16 +11,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.datasets.streams.image_sequence import GroupedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, ImuNoise, Rig
+from slam_graph.sensors import CameraFrame, DepthSensor, FeatureFrame, ImuData, ImuNoise, Rig
 
 _WINDOW_NS = 1_000_000_000
 """Length of the windows of which the calmest is used."""
@@ -150,6 +151,12 @@ Severity = Literal["info", "warning", "error"]
 _LONG_PAUSE_PERIODS = 3.0
 """A pause between frames longer than this many median periods gives a warning."""
 
+_MOST_FRAMES = 0.9
+"""A smaller share of frames with a depth image gives a warning."""
+
+_FEW_DEPTHS = 0.1
+"""A smaller share of pixels with a depth gives a warning: wrong unit, or out of range."""
+
 _FARTHEST_CAMERA_M = 5.0
 """A camera farther from the IMU than this is probably a mistake of units."""
 
@@ -198,7 +205,7 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
         sequence = sequence.without_images()
     opened = dict(sequence.diagnostics.counts)
     with _collecting(sequence) as faults:
-        survey, stamps = _go_through(sequence)
+        survey, depths, stamps = _go_through(sequence)
         truth = sequence.groundtruth()
     name = sequence.info().name
     findings = [
@@ -209,7 +216,11 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
         Finding("warning", f"{kind}: {count} times, counted before the check", name)
         for kind, count in opened.items()
     ]
-    findings += [Finding(*found, "imu") for found in survey.findings(sequence.rig.imu)]
+    if sequence.rig.has_imu:
+        findings += [Finding(*found, "imu") for found in survey.findings(sequence.rig.imu)]
+    else:
+        findings.append(Finding("info", "no IMU", "imu"))
+    findings += depths.findings(sequence)
     findings += _check_frames(stamps, name)
     findings += _check_groundtruth(truth, stamps)
     findings += _check_calibration(sequence.rig)
@@ -228,17 +239,60 @@ def _collecting(sequence: Sequence) -> Iterator[_Collector]:
         sequence.diagnostics = previous
 
 
-def _go_through(sequence: Sequence) -> tuple[_ImuSurvey, IntArray]:
-    """Statistics of the IMU, and the times (N,) of the frames."""
-    survey = _ImuSurvey()
+@dataclass
+class _DepthSurvey:
+    """What the frames of a recording have of depth: shares of pixels or features with one."""
+
+    shares: list[float] = field(default_factory=list)
+    medians_m: list[float] = field(default_factory=list)
+
+    def add(self, frame: CameraFrame | FeatureFrame, sensor: DepthSensor | None) -> None:
+        """Take the next frame."""
+        if sensor is None:
+            return
+        if isinstance(frame, CameraFrame):
+            depth: NDArray[Any] | None = frame.depth
+        else:
+            depth = frame.cameras[sensor.camera].depth_m
+        if depth is None or depth.size == 0:
+            return
+        valid = np.isfinite(depth)
+        self.shares.append(float(np.mean(valid)))
+        if valid.any():
+            self.medians_m.append(float(np.median(depth[valid])))
+
+    def findings(self, sequence: Sequence) -> list[Finding]:
+        """What was found."""
+        info = sequence.info()
+        if sequence.rig.depth is None:
+            return []
+        found = []
+        if info.content == "images":
+            share = info.depth_frames / max(info.frames, 1)
+            severity: Severity = "info" if share > _MOST_FRAMES else "warning"
+            what = f"{info.depth_frames} of {info.frames} frames have a depth image"
+            found.append(Finding(severity, what, "depth"))
+        if self.shares:
+            mean = float(np.mean(self.shares))
+            what = f"{mean:.0%} of the {'pixels' if info.content == 'images' else 'features'}"
+            median = f"{np.median(self.medians_m):.2f} m" if self.medians_m else "no depth at all"
+            severity = "info" if mean > _FEW_DEPTHS else "warning"
+            found.append(Finding(severity, f"{what} have a depth, the median is {median}", "depth"))
+        return found
+
+
+def _go_through(sequence: Sequence) -> tuple[_ImuSurvey, _DepthSurvey, IntArray]:
+    """Statistics of the IMU and of depths, and the times (N,) of the frames."""
+    survey, depths = _ImuSurvey(), _DepthSurvey()
     stamps: list[int] = []
     for packet in sequence.packets():
         stamps.append(packet.frame.stamp_ns)
         survey.add(packet.imu)
+        depths.add(packet.frame, sequence.rig.depth)
     if not stamps and isinstance(sequence, GroupedSequence):
         for block in sequence.imu_blocks():
             survey.add(block)
-    return survey, np.array(stamps, np.int64)
+    return survey, depths, np.array(stamps, np.int64)
 
 
 def _check_frames(stamps: IntArray, name: str) -> list[Finding]:
@@ -292,6 +346,8 @@ def _check_calibration(rig: Rig) -> list[Finding]:
             findings.append(
                 Finding("warning", f"{distance:.1f} m from the IMU; is it in metres?", name)
             )
+    if not rig.has_imu:
+        return findings
     noise = rig.imu
     values = (
         noise.gyro_noise_density,

@@ -109,6 +109,7 @@ def open_dataset(
     diagnostics: Diagnostics | None = None,
     sources: Mapping[str, str] | None = None,
     faults: Sequence[str] = (),
+    imu: bool = True,
 ) -> RecordedSequence:
     """Open a recording.
 
@@ -122,6 +123,7 @@ def open_dataset(
         sources: where each sensor is, in formats that leave it open: topics of a ROS bag or files
             beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``.
         faults: to put into it on purpose, such as ``imu_missing:at_s=6,duration_s=1``.
+        imu: False to read it as if it had no IMU.
 
     Raises:
         DataError: if the path is not there, of no known format, or cannot be read.
@@ -143,6 +145,7 @@ def open_dataset(
         None if groundtruth is None else Path(groundtruth),
         sources or {},
         diagnostics if diagnostics is not None else Diagnostics(),
+        imu,
     )
     recording = chosen.open(path, options)
     if not faults:

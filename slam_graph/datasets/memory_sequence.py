@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from slam_graph.datasets.sequence import (
     RecordedSequence,
     SequenceInfo,
 )
+from slam_graph.datasets.streams.depth_images import DepthFinish, Metres
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, Image
 from slam_graph.datasets.streams.imu_stream import ImuArrays
@@ -30,11 +31,12 @@ from slam_graph.sensors import FeatureFrame, ImuData, Rig
 def dataset_from_arrays(
     rig: Rig,
     *,
-    imu_stamps_ns: ArrayLike,
-    gyro: ArrayLike,
-    accel: ArrayLike,
+    imu_stamps_ns: ArrayLike | None = None,
+    gyro: ArrayLike | None = None,
+    accel: ArrayLike | None = None,
     image_stamps_ns: ArrayLike | None = None,
     images: Sequence[Sequence[Image | None]] | None = None,
+    depth: Sequence[NDArray[np.float32] | None] | None = None,
     features: Sequence[FeatureFrame] | None = None,
     groundtruth: Trajectory | None = None,
     initial_state: NavState | None = None,
@@ -43,7 +45,7 @@ def dataset_from_arrays(
 ) -> RecordedSequence:
     """A recording from arrays in memory, to run on or to convert like any other.
 
-    Give either `images` with `image_stamps_ns`, or `features`.
+    Give either `images` with `image_stamps_ns`, or `features`; and all of the IMU, or nothing.
 
     Args:
         rig: calibrated cameras and noise of the IMU.
@@ -53,6 +55,8 @@ def dataset_from_arrays(
         image_stamps_ns: (F,) times of the frames in nanoseconds, increasing.
         images: for each camera of the rig F images (height, width) uint8, or None where one is
             missing. A (F, height, width) array will do for a camera.
+        depth: F depth images (height, width) in m, registered to the camera that `rig.depth` names,
+            NaN where there is none; None for one that is missing.
         features: what each camera sees in each frame, with increasing times.
         groundtruth: true trajectory of the body.
         initial_state: known state at the start.
@@ -62,7 +66,11 @@ def dataset_from_arrays(
     Raises:
         DataError: if the arrays do not fit one another or the rig.
     """
-    imu = ImuArrays(_imu(imu_stamps_ns, gyro, accel))
+    imu = None
+    if imu_stamps_ns is not None or gyro is not None or accel is not None:
+        if imu_stamps_ns is None or gyro is None or accel is None:
+            raise DataError(f"{name}: an IMU needs imu_stamps_ns, gyro and accel")
+        imu = ImuArrays(_imu(imu_stamps_ns, gyro, accel))
     options = ReaderOptions(diagnostics=diagnostics or Diagnostics())
     truth = None if groundtruth is None else lambda: groundtruth
     if (images is None) == (features is None):
@@ -72,8 +80,27 @@ def dataset_from_arrays(
     if image_stamps_ns is None:
         raise DataError(f"{name}: images need their times, image_stamps_ns")
     assert images is not None
-    streams = _streams(name, rig, np.asarray(image_stamps_ns), images)
-    return _ImagesInMemory(name, rig, streams, imu, options, truth, initial_state)
+    stamps = np.asarray(image_stamps_ns)
+    streams = _streams(name, rig, stamps, images)
+    measured = None if depth is None else _depths(name, rig, stamps, depth)
+    return _ImagesInMemory(name, rig, streams, imu, options, truth, initial_state, measured)
+
+
+def _depths(
+    name: str,
+    rig: Rig,
+    stamps: NDArray[np.generic],
+    depth: Sequence[NDArray[np.float32] | None],
+) -> _DepthInMemory:
+    """The depth images, without those that are None."""
+    if rig.depth is None or rig.depth.lens is not None:
+        raise DataError(f"{name}: depth needs a rig with a depth sensor that is registered")
+    if len(depth) != len(stamps):
+        raise DataError(f"{name}: expected {len(stamps)} depth images, got {len(depth)}")
+    there = [k for k, image in enumerate(depth) if image is not None]
+    images = [np.asarray(image, np.float32) for image in depth if image is not None]
+    stamps_ns = _nanoseconds(stamps, "image_stamps_ns")[there]
+    return _DepthInMemory("depth", stamps_ns, images, DepthFinish.of(rig))
 
 
 def _imu(stamps_ns: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> ImuData:
@@ -143,6 +170,24 @@ class _ImagesOfCamera:
         return f"{self.name}: image at {self.stamps_ns[index]}"
 
 
+@dataclass(eq=False)
+class _DepthInMemory:
+    """Depth images in memory, a `DepthStream`."""
+
+    name: str
+    stamps_ns: IntArray
+    images: Sequence[Metres]
+    finish: DepthFinish
+
+    def read(self, index: int) -> Metres | Fault:
+        """One image, without what is out of range."""
+        return self.finish(self.images[index], f"{self.name}: image at {self.stamps_ns[index]}")
+
+    def missing(self, index: int) -> Fault | None:
+        """None is missing."""
+        return None
+
+
 class _ImagesInMemory(ImageSequence):
     """Images in memory."""
 
@@ -153,12 +198,13 @@ class _ImagesInMemory(ImageSequence):
         name: str,
         rig: Rig,
         streams: Sequence[_ImagesOfCamera],
-        imu: ImuArrays,
+        imu: ImuArrays | None,
         options: ReaderOptions,
         truth: Callable[[], Trajectory] | None,
         initial_state: NavState | None,
+        depth: _DepthInMemory | None,
     ) -> None:
-        super().__init__(name, rig, streams, imu, options, truth)
+        super().__init__(name, rig, streams, imu, options, truth, depth=depth)
         self._start = initial_state
 
     def initial_state(self) -> NavState | None:
@@ -177,11 +223,12 @@ class _FeaturesInMemory(RecordedSequence):
         name: str,
         rig: Rig,
         features: Sequence[FeatureFrame],
-        imu: ImuArrays,
+        imu: ImuArrays | None,
         options: ReaderOptions,
         truth: Callable[[], Trajectory] | None,
         initial_state: NavState | None,
     ) -> None:
+        rig = replace(rig, has_imu=rig.has_imu and imu is not None)
         super().__init__(name, rig, options, truth)
         self._features = list(features)
         self._stamps_ns = np.array([frame.stamp_ns for frame in self._features], np.int64)
@@ -203,12 +250,13 @@ class _FeaturesInMemory(RecordedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
-        return self._imu.blocks(self.diagnostics, after_ns)
+        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
 
     def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
         stamps = self._stamps_ns
-        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), self._imu.count())
+        samples = 0 if self._imu is None else self._imu.count()
+        return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
 
     def initial_state(self) -> NavState | None:
         """The known state at the start, if one was given."""

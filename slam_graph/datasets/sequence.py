@@ -49,6 +49,9 @@ class SequenceInfo:
         start_ns, end_ns: times of the first and the last frame.
         imu_samples: number of IMU samples.
         has_groundtruth: whether `groundtruth()` gives one.
+        has_imu: whether there is an IMU, and it is to be used; the same as `Rig.has_imu`.
+        has_depth: whether depth is measured; the same as that `Rig.depth` is not None.
+        depth_frames: number of frames with a depth image; 0 for tracks.
     """
 
     name: str
@@ -60,11 +63,14 @@ class SequenceInfo:
     end_ns: int
     imu_samples: int
     has_groundtruth: bool
+    has_imu: bool = True
+    has_depth: bool = False
+    depth_frames: int = 0
 
 
 @runtime_checkable
 class Sequence(Protocol):
-    """A recording of cameras and one IMU that can be streamed from its start.
+    """A recording of cameras, an IMU or depth, that can be streamed from its start.
 
     Opening one reads calibration and indices only; images and tracks are read as they are asked
     for, so memory does not grow with the length of the recording.
@@ -109,6 +115,7 @@ class ReaderOptions:
         groundtruth: file or folder to use instead of the recording's own ground truth.
         sources: where each sensor is, in formats that leave it open.
         diagnostics: where faults are counted.
+        imu: whether the IMU is used; False reads the recording as if it had none.
     """
 
     cameras: int | None = None
@@ -116,6 +123,7 @@ class ReaderOptions:
     groundtruth: Path | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     diagnostics: Diagnostics = field(default_factory=Diagnostics)
+    imu: bool = True
 
     def select(self, rig: Rig) -> Rig:
         """The rig with the cameras that are to be used.
@@ -134,7 +142,7 @@ class RecordedSequence(Displayed, ABC):
     Args:
         name: of the recording.
         rig: its calibrated sensors, with the cameras that are used.
-        options: what was asked for; `groundtruth` and `diagnostics` are used here.
+        options: what was asked for; `groundtruth`, `diagnostics` and `imu` are used here.
         own_groundtruth: the recording's own ground truth: a file, or a function that gives it.
 
     Raises:
@@ -145,14 +153,12 @@ class RecordedSequence(Displayed, ABC):
         content: whether frames carry images or feature tracks.
         name: of the recording.
         rig: its calibrated sensors.
-        has_imu: whether it has gyroscope and accelerometer; without them packets hold frames only.
         groundtruth_path: the file that ground truth is read from; None where there is none.
         diagnostics: where faults are counted.
     """
 
     format: ClassVar[str]
     content: ClassVar[Literal["images", "tracks"]]
-    has_imu: bool = True
     rig: Rig
     diagnostics: Diagnostics
 
@@ -164,7 +170,7 @@ class RecordedSequence(Displayed, ABC):
         own_groundtruth: Path | Callable[[], Trajectory] | None = None,
     ) -> None:
         self.name = name
-        self.rig = rig
+        self.rig = rig if options.imu and rig.has_imu else rig.without_imu()
         self.groundtruth_path: Path | None = None
         self.diagnostics = options.diagnostics
         rolling = [c.name for c in rig.cameras if c.rolling_shutter and not c.readout_s]
@@ -199,8 +205,16 @@ class RecordedSequence(Displayed, ABC):
             + (f" ({(info.frames - 1) / seconds:.1f} Hz)" if seconds > 0 else ""),
             "cameras": lenses or None,
             "IMU": f"{info.imu_samples} samples" if self.has_imu else "none",
+            "depth": self._depth_facts(),
             "ground truth": "yes" if info.has_groundtruth else "none",
         }
+
+    def _depth_facts(self) -> str | None:
+        if self.rig.depth is None:
+            return None
+        of = self.rig.cameras[self.rig.depth.camera].name
+        frames = f"in {self.info().depth_frames} frames, " if self.content == "images" else ""
+        return f"{frames}of {of or 'the camera'}"
 
     def plot(self) -> Any:
         """IMU and true path (if there is one) of the whole recording, as a figure."""
@@ -245,9 +259,16 @@ class RecordedSequence(Displayed, ABC):
             frames=frames,
             start_ns=start_ns,
             end_ns=end_ns,
-            imu_samples=imu_samples,
+            imu_samples=imu_samples if self.has_imu else 0,
             has_groundtruth=self.has_groundtruth,
+            has_imu=self.has_imu,
+            has_depth=self.rig.depth is not None,
+            depth_frames=self.depth_frames(),
         )
+
+    def depth_frames(self) -> int:
+        """Number of frames with a depth image."""
+        return 0
 
     @cached_property
     def _info(self) -> SequenceInfo:
@@ -262,6 +283,11 @@ class RecordedSequence(Displayed, ABC):
         if end_ns is not None:
             inside &= stamps_ns <= end_ns
         return inside
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether it has an IMU that is used; without one packets hold frames only."""
+        return self.rig.has_imu
 
     @property
     def has_groundtruth(self) -> bool:
@@ -295,7 +321,9 @@ class RecordedSequence(Displayed, ABC):
         )
 
     def imu(self) -> ImuData:
-        """All IMU samples at once."""
+        """All IMU samples at once; none without an IMU."""
+        if not self.has_imu:
+            return ImuData.empty()
         return ImuData.concatenate(list(self.imu_blocks()))
 
     def groundtruth(self) -> Trajectory | None:

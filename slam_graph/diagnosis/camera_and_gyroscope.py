@@ -288,7 +288,7 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> 
         pose = mounted.body_T_camera
         pose = pose.inverse() if named.kind == "inverse" else gtsam.Pose3(turn, np.zeros(3)) * pose
         cameras.append(replace(mounted, body_T_camera=pose))
-    now.rig = Rig(tuple(cameras), now.rig.imu)
+    now.rig = replace(now.rig, cameras=tuple(cameras))
 
 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
@@ -326,7 +326,7 @@ def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> N
         Finding.measured("rolling_shutter", "warning", what, fix, abs(change) / sigma, values)
     )
     cameras = tuple(replace(c, readout_s=value, rolling_shutter=True) for c in now.rig.cameras)
-    now.rig = Rig(cameras, now.rig.imu)
+    now.rig = replace(now.rig, cameras=cameras)
 
 
 def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
@@ -364,4 +364,4 @@ def scaled_lenses(rig: Rig, factor: float) -> Rig:
         lens = mounted.camera
         lens = replace(lens, fx=lens.fx * factor, fy=lens.fy * factor)
         cameras.append(replace(mounted, camera=lens))
-    return Rig(tuple(cameras), rig.imu)
+    return replace(rig, cameras=tuple(cameras))

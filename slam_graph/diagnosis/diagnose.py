@@ -153,8 +153,11 @@ class Diagnosis:
 
 def _plain(material: Material) -> tuple[list[Finding], float]:
     """What shows without tracks, and the factor that makes the forces m/s²."""
-    units, factor = check_units(material.imu)
-    found = units + check_sampling(material.imu, material.rig.imu, material.stamps_ns)
+    found: list[Finding] = []
+    factor = 1.0
+    if material.rig.has_imu:
+        found, factor = check_units(material.imu)
+        found = found + check_sampling(material.imu, material.rig.imu, material.stamps_ns)
     found += check_stamps(material.stamps_ns)
     if material.images is not None:
         found += check_images(material.images)

@@ -130,7 +130,8 @@ def nees_of_run(
     """NEES of the states of a run, and the alignment under which it was taken.
 
     An estimate that does not live in the world of the truth is aligned in yaw and position, which
-    nothing tells it, and a covariance has to be that of what the alignment leaves:
+    nothing tells it (without an IMU in all of the rotation), and a covariance has to be that of
+    what the alignment leaves:
 
     - `yaw`: over the whole run, by the smoothed trajectory (`alignment_covariance.py`);
     - `first_pose`, without one: at the first state, relative to which covariances are. A truth
@@ -153,7 +154,8 @@ def nees_of_run(
         found = None if smoothed is None else aligned_by_smoothed(truth, history, smoothed)
         if found is not None:
             return nees(estimate, found[1], truth, found[0]), "yaw"
-    return nees(estimate, covariances, truth, Similarity.of_first_pose(true, own)), "first_pose"
+    first = Similarity.of_first_pose(true, own, history.level)
+    return nees(estimate, covariances, truth, first), "first_pose"
 
 
 def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:

@@ -12,6 +12,7 @@ from slam_graph.frontend.epipolar_test import EpipolarTest, distances_px, fitted
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
+from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
@@ -33,6 +34,7 @@ class CameraTracker:
         config: settings.
         stats: receives counts and times.
         rng: draws the samples of RANSAC.
+        rotation: takes the place of a gyroscope.
 
     Attributes:
         outliers: the features that RANSAC, or the map of the back end, rejected in the last image.
@@ -47,6 +49,7 @@ class CameraTracker:
         config: FrontendConfig,
         stats: FrameStats,
         rng: np.random.Generator,
+        rotation: ImageRotation | None = None,
     ) -> None:
         self._camera = mounted.camera
         self._body_T_camera = mounted.body_T_camera
@@ -57,6 +60,7 @@ class CameraTracker:
         self._stats = stats
         self._epipolar = EpipolarTest(mounted.camera, config, rng)
         self._motion_ids: list[IntArray] = []  # of the features of each rigid motion
+        self._rotation = rotation
         self.outliers = Tracks.empty()
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
@@ -70,6 +74,8 @@ class CameraTracker:
         """
         with self._stats.timed("temporal_ms"):
             self._predictor.advance(before.stamp_ns, stamp_ns)
+            if self._rotation is not None and before.image is not None:
+                self._predictor.turn(self._rotation.between(before.image, image))
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)
             keep = found.good.copy()

@@ -12,9 +12,11 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.association import Associator
 from slam_graph.frontend.camera_tracker import CameraTracker
+from slam_graph.frontend.depth_sampling import DepthSampler
 from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, FrameStats
+from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
@@ -51,7 +53,7 @@ class ImageFrontend:
             and those lost, by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
             `lost_merged`, `rejected_ransac`, `rejected_map`, `rejected_gate`, `rejected_new`,
             `rejected_stereo`), and milliseconds per stage (`prepare_ms`, `temporal_ms`,
-            `ransac_ms`, `detect_ms`, `stereo_ms`).
+            `ransac_ms`, `detect_ms`, `stereo_ms`). With depth also `with_depth` and `depth_ms`.
     """
 
     def __init__(
@@ -107,12 +109,24 @@ class ImageFrontend:
                     config,
                 )
             predictor = PointPredictor(mounted, self._motion, config)
+            turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
+            rotation = ImageRotation(camera) if turns else None
             self._trackers.append(
-                CameraTracker(mounted, extractor, associator, predictor, config, self._stats, rng)
+                CameraTracker(
+                    mounted,
+                    extractor,
+                    associator,
+                    predictor,
+                    config,
+                    self._stats,
+                    rng,
+                    rotation,
+                )
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
         self._tracks = [Tracks.empty() for _ in rig.cameras]
         self._next_id = 0
+        self._depth = None if rig.depth is None else DepthSampler(rig.depth)
         self.frame_stats: dict[str, float] = {}
 
     def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
@@ -122,7 +136,8 @@ class ImageFrontend:
         none, the cameras matched to it track their features by themselves.
 
         Raises:
-            DataError: if the frame does not have one image per camera of the calibrated size.
+            DataError: if the frame does not have one image per camera of the calibrated size, or
+                its depth image is of another size.
         """
         self._stats.clear()
         self._stats.add("rejected_gate", self._gated)
@@ -143,15 +158,17 @@ class ImageFrontend:
             reference = self._references[i]
             if image is not None and reference != i and images[reference] is not None:
                 self._tracks[i] = self._match(i, image, frame.stamp_ns, first_new_id)
+        found = [
+            FeatureObservations.empty() if image is None else tracks.observations()
+            for image, tracks in zip(images, self._tracks, strict=True)
+        ]
+        if self._depth is not None and isinstance(frame, CameraFrame):
+            with self._stats.timed("depth_ms"):
+                camera = self._depth.camera
+                found[camera] = self._depth.measure(found[camera], frame, self._stats)
         self.frame_stats = dict(self._stats)
-        return FeatureFrame(
-            frame.stamp_ns,
-            tuple(
-                FeatureObservations.empty() if image is None else tracks.observations()
-                for image, tracks in zip(images, self._tracks, strict=True)
-            ),
-            tuple(tracker.outliers.observations() for tracker in self._trackers),
-        )
+        outliers = tuple(tracker.outliers.observations() for tracker in self._trackers)
+        return FeatureFrame(frame.stamp_ns, tuple(found), outliers)
 
     def drop(self, ids: IntArray) -> None:
         """Forget features in all cameras, e.g. those that the back end rejected."""
@@ -190,6 +207,13 @@ class ImageFrontend:
                 raise DataError(
                     f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has shape "
                     f"{image.shape}, its calibration says {size} (height, width)"
+                )
+        if frame.depth is not None and self._depth is not None:
+            lens = cameras[self._depth.camera].camera
+            if frame.depth.shape != (lens.height, lens.width):
+                raise DataError(
+                    f"frame {frame.stamp_ns}: the depth image has shape {frame.depth.shape}, its "
+                    f"camera {(lens.height, lens.width)} (height, width); register it"
                 )
         return frame.images
 

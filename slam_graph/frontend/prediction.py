@@ -163,6 +163,10 @@ class PointPredictor:
             body_R_camera = self._body_T_camera.rotation().matrix()
             self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
 
+    def turn(self, end_R_start: FloatArray) -> None:
+        """Take a rotation (3, 3) of the camera over two frames that the gyroscope did not give."""
+        self.camera_R = end_R_start
+
     def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Prediction:
         """Where to look for the features of the image before.
 

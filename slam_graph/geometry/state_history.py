@@ -25,9 +25,14 @@ class StateHistory:
 
     It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
     NaN.
+
+    Attributes:
+        level: whether gravity was measured, so that the vertical of its world is known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, level: bool = True) -> None:
+        """Begin without states; see the class for `level`."""
+        self.level = level
         self._stamps_ns = array("q")
         self._states = array("d")
         self._sigmas = array("d")

@@ -71,8 +71,12 @@ class Similarity:
         return similarity
 
     @staticmethod
-    def of_first_pose(reference: Trajectory, estimate: Trajectory) -> Similarity:
-        """Yaw and translation that align the first pose of the estimate with that of the reference.
+    def of_first_pose(
+        reference: Trajectory, estimate: Trajectory, level: bool = True
+    ) -> Similarity:
+        """The motion that aligns the first pose of the estimate with that of the reference.
+
+        It is one in position and yaw, or in position and rotation where the estimate is not level.
 
         Unlike a least-squares fit it leaves the errors that grow from the start as they are. A
         consistency test needs these, because the covariance starts at zero.
@@ -81,6 +85,9 @@ class Similarity:
             Rotation.from_quat(reference.quaternions[0])
             * Rotation.from_quat(estimate.quaternions[0]).inv()
         ).as_matrix()
+        if not level:
+            moved = reference.positions[0] - difference @ estimate.positions[0]
+            return Similarity(difference, moved)
         yaw = np.arctan2(difference[1, 0] - difference[0, 1], difference[0, 0] + difference[1, 1])
         rotation = Rotation.from_euler("z", yaw).as_matrix()
         return Similarity(rotation, reference.positions[0] - rotation @ estimate.positions[0])

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as SequenceOf
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,7 @@ def run(
     settings = _settings(config, overrides, options)
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
+    result.history.level = result.input.rig.has_imu
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
@@ -163,11 +165,6 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     info = sequence.info()
     if info.frames == 0:
         raise DataError(f"{info.name}: holds no camera frames; there is nothing to run on")
-    if info.imu_samples == 0:
-        raise DataError(
-            f"{info.name}: format '{info.format}' gives no IMU (gyroscope and accelerometer); "
-            "every back end needs one, only the front end can be run on its frames"
-        )
     start_ns = info.start_ns + round(config.start_s * 1e9)
     if start_ns > info.end_ns:
         length_s = (info.end_ns - info.start_ns) * 1e-9
@@ -178,6 +175,10 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     if config.duration_s is not None:
         end_ns = min(end_ns, start_ns + round(config.duration_s * 1e9))
     rig = sequence.rig if config.cameras is None else sequence.rig.select(config.cameras)
+    recorded = rig.has_imu and info.imu_samples > 0
+    rig = replace(rig, has_imu=config.backend.dynamics.uses_imu(recorded))
+    if not rig.has_imu:  # gravity is not known
+        config = config.with_overrides(["loop_closure.degrees_of_freedom=6"])
     return RunInput(info, config, rig, start_ns, end_ns, sequence.groundtruth())
 
 

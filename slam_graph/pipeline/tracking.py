@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -188,11 +188,12 @@ def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
     )
     count = len(asked.rig.cameras)
     for packet in packets:
-        yield Packet(packet.imu, _first_cameras(packet.frame, count))
+        imu = packet.imu if asked.rig.has_imu else ImuData.empty()
+        yield Packet(imu, _first_cameras(packet.frame, count))
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:
     """The same frame without the cameras that are not used."""
     if isinstance(frame, CameraFrame):
-        return CameraFrame(frame.stamp_ns, frame.images[:count])
-    return FeatureFrame(frame.stamp_ns, frame.cameras[:count])
+        return replace(frame, images=frame.images[:count])
+    return replace(frame, cameras=frame.cameras[:count], outliers=())

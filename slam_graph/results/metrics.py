@@ -132,6 +132,17 @@ def extent_table(
     }
 
 
+def world_table(history: StateHistory, given: bool) -> Table:
+    """In which world the estimate lives, and the alignment with a truth that follows from it.
+
+    Args:
+        history: the causal estimate.
+        given: whether the start was given in the world of the truth.
+    """
+    free = "yaw" if history.level else "se3"
+    return {"start_was_given": given, "alignment": "none" if given else free}
+
+
 def coverage(start_ns: int, end_ns: int, segments: Segments) -> float:
     """Estimated time over the time asked for, from 0 to 1; what lies between segments is not."""
     if not len(segments):

@@ -15,11 +15,18 @@ from scipy.spatial.transform import Rotation
 from slam_graph import evaluation
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import Similarity, StateHistory, Trajectory, interpolate
+from slam_graph.geometry import AlignmentMode, Similarity, StateHistory, Trajectory, interpolate
 
 if TYPE_CHECKING:
     from slam_graph.backend import FinalBa
     from slam_graph.visualization import Panel, Picture
+
+ALIGNED_IN = {
+    "none": "not aligned",
+    "yaw": "aligned in yaw and position",
+    "se3": "aligned in rotation and position",
+}
+"""What the alignments of runs mean."""
 
 CAUSAL, SMOOTHED, LOOPS_CLOSED, IN_MAP = "causal", "smoothed", "loops closed", "in the map"
 _TRUTH = "ground truth"
@@ -97,17 +104,20 @@ class RunView:
             self.start_ns,
         )
 
-    def aligned(self) -> RunView:
-        """In the world of the truth: the yaw and translation that fit the best path over its whole.
+    def aligned(self, mode: AlignmentMode = "yaw") -> RunView:
+        """In the world of the truth, by the alignment that fits the best path over its whole.
 
         The covariances stay relative to the first state.
+
+        Args:
+            mode: `yaw` and translation; `se3` where gravity was not measured.
         """
         if self.truth is None:
             return self
         best = self.estimates.get(SMOOTHED, self.estimates[CAUSAL]).trajectory
         try:
             true, own = evaluation.synchronize(self.truth, best)
-            return self.moved(Similarity.of_positions(true.positions, own.positions, "yaw"))
+            return self.moved(Similarity.of_positions(true.positions, own.positions, mode))
         except DataError:  # no common time, or what never moves determines no yaw
             return self
 
@@ -158,7 +168,7 @@ def with_covariances_after_alignment(
                 estimates[name] = PoseEstimate(mapped, covariances)
                 similarity = judged.similarity
     if similarity is None:
-        return view.aligned()
+        return view.aligned("yaw" if histories[CAUSAL].level else "se3")
     moved = view.moved(similarity)
     return RunView(
         {**moved.estimates, **estimates}, moved.paths, view.truth, moved.points, view.start_ns
@@ -272,7 +282,8 @@ def _title(metrics: Mapping[str, Any]) -> str:
         f"{metrics['dataset']['name']}  ·  {metrics['algorithm']}, "
         f"{cameras} camera{'' if cameras == 1 else 's'}{ending}"
     ]
-    mode = "none" if metrics["extent"].get("start_was_given", False) else "yaw"
+    given = metrics["extent"].get("start_was_given", False)
+    mode = metrics["extent"].get("alignment", "none" if given else "yaw")
     loops = metrics["loop_closure"] or {}
     tables = {
         CAUSAL: (metrics["accuracy"], mode),
@@ -288,7 +299,7 @@ def _title(metrics: Mapping[str, Any]) -> str:
         if table and "ate" in table[alignment]
     ]
     if errors:
-        how = "not aligned" if mode == "none" else "aligned in yaw and position"
+        how = ALIGNED_IN[mode]
         lines.append(f"RMSE ({how}): {'  ·  '.join(errors)}")
     elif metrics["extent"]["estimated_frames"]:
         lines.append("no ground truth; ±3σ is relative to the first state")

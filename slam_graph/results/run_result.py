@@ -144,7 +144,7 @@ class RunResult(RunSummary):
             since_ns: the time; None for all states. The points of the map begin anew with these.
         """
         if since_ns is None:
-            self.history, self.point_map = StateHistory(), PointMap()
+            self.history, self.point_map = StateHistory(self.history.level), PointMap()
         else:
             self.history.forget_from(since_ns)
         self.logs.forget_states(since_ns)
@@ -282,7 +282,7 @@ class RunResult(RunSummary):
                 "algorithm": self.config.algorithm.name,
                 "cameras": len(asked.rig.cameras),
                 "seed": self.config.seed,
-                "extent": {**extent, "start_was_given": self.start_was_given},
+                "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(self.segments, self.trajectory, truth),
                 "accuracy": tables.accuracy_table(truth, self.trajectory),
                 "final_ba": tables.final_ba_table(self.final_ba, truth),

@@ -17,7 +17,7 @@ from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
-from slam_graph.results.run_picture import LOOPS_CLOSED, RunView, run_figure
+from slam_graph.results.run_picture import ALIGNED_IN, LOOPS_CLOSED, RunView, run_figure
 from slam_graph.results.scene import SceneParts, export_scene
 from slam_graph.results.scene_files import (
     SCENE_FORMATS,
@@ -193,6 +193,7 @@ class RunSummary(Displayed):
         metrics = self.metrics
         data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
         loops = metrics["loop_closure"] or {}
+        mode = extent.get("alignment", "yaw")
         cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
         return {
             "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
@@ -200,9 +201,11 @@ class RunSummary(Displayed):
             "status": f"{metrics['status']}. {metrics['message']}".rstrip(". "),
             "estimated": f"{extent['estimated_frames']} of {extent['frames']} frames, "
             f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
-            "error": _errors(metrics["accuracy"]),
-            "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy")),
-            "error, loops closed": _errors(loops["accuracy"]) if loops.get("accepted") else None,
+            "error": _errors(metrics["accuracy"], mode),
+            "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy"), mode),
+            "error, loops closed": _errors(loops["accuracy"], mode)
+            if loops.get("accepted")
+            else None,
             "speed": (
                 None
                 if timing["real_time_factor"] is None
@@ -216,12 +219,13 @@ class RunSummary(Displayed):
         return self.plot()
 
 
-def _errors(accuracy: dict[str, Any] | None) -> str | None:
-    """Root mean square errors after alignment of yaw and position."""
-    table = (accuracy or {}).get("yaw", {}).get("ate")
+def _errors(accuracy: dict[str, Any] | None, mode: str) -> str | None:
+    """Root mean square errors after an alignment; in yaw and position if that is none."""
+    mode = "yaw" if mode == "none" else mode
+    table = (accuracy or {}).get(mode, {}).get("ate")
     if table is None:
         return None
     return (
         f"{table['translation_m']['rmse']:.4f} m, {table['rotation_deg']['rmse']:.3f}° RMS, "
-        "aligned in yaw and position"
+        f"{ALIGNED_IN[mode]}"
     )

@@ -267,7 +267,8 @@ class SavedRun(RunSummary):
             self.points,
             self.metrics["extent"]["start_ns"],
         )
-        view = view if self.start_was_given else view.aligned()
+        mode = self.metrics["extent"].get("alignment", "yaw")
+        view = view if self.start_was_given else view.aligned(mode)
         return with_path_in_map(view, self.in_map)
 
     @cached_property

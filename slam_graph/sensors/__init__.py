@@ -6,6 +6,7 @@
 - `camera_model`: `CameraModel`, `CAMERA_MODELS` with the models by name, and how to add one.
 - `rig`: `Rig`, `RigCamera`, `ImuNoise`, `CalibrationEstimate` (the result of online calibration).
 - `measurements`: `ImuData`, `CameraFrame`, `FeatureObservations`, `FeatureFrame`, `Packet`.
+- `depth`: `DepthSensor`.
 - `imu_buffer`: `ImuBuffer`, the recent samples of the IMU.
 """
 
@@ -19,6 +20,7 @@ __all__ = [
     "Camera",
     "CameraFrame",
     "CameraModel",
+    "DepthSensor",
     "FeatureFrame",
     "FeatureObservations",
     "ImuBuffer",
@@ -32,6 +34,7 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.sensors.camera import Camera
     from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
+    from slam_graph.sensors.depth import DepthSensor
     from slam_graph.sensors.imu_buffer import ImuBuffer
     from slam_graph.sensors.measurements import (
         CameraFrame,
@@ -47,6 +50,7 @@ else:
         {
             "camera": ("Camera",),
             "camera_model": ("CAMERA_MODELS", "CameraModel"),
+            "depth": ("DepthSensor",),
             "imu_buffer": ("ImuBuffer",),
             "measurements": (
                 "CameraFrame",

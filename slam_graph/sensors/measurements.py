@@ -107,10 +107,16 @@ class CameraFrame:
     Attributes:
         stamp_ns: time of the exposure of the first camera that has an image.
         images: one (height, width) uint8 grey image per camera; None where that camera has none.
+        depth: (height, width) float32 depth, along the optical axis, of what the camera
+            `Rig.depth.camera` sees, in m, NaN where it has none; None without a depth image.
+        depth_ns: time at which the depth was measured; None if at `stamp_ns`. It differs where the
+            sensor is not synchronised with the camera.
     """
 
     stamp_ns: int
     images: tuple[NDArray[np.uint8] | None, ...]
+    depth: NDArray[np.float32] | None = None
+    depth_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,12 +130,18 @@ class FeatureObservations:
         normalized: (N, 2) undistorted coordinates on the plane z = 1 of the camera frame.
         descriptors: (N, B) binary descriptors of B bytes, compared by their Hamming distance; None
             where there are none.
+        depth_m: (N,) measured depths along the optical axis in m, NaN where a feature has none;
+            None where the camera has no depth.
+        depth_sigma_m: (N,) their standard deviations in m, NaN where `depth_m` is; None together
+            with it.
     """
 
     ids: IntArray
     pixels: FloatArray
     normalized: FloatArray
     descriptors: NDArray[np.uint8] | None = None
+    depth_m: FloatArray | None = None
+    depth_sigma_m: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -141,9 +153,13 @@ class FeatureObservations:
 
     def select(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
-        descriptors = None if self.descriptors is None else self.descriptors[rows]
         return FeatureObservations(
-            self.ids[rows], self.pixels[rows], self.normalized[rows], descriptors
+            self.ids[rows],
+            self.pixels[rows],
+            self.normalized[rows],
+            None if self.descriptors is None else self.descriptors[rows],
+            None if self.depth_m is None else self.depth_m[rows],
+            None if self.depth_sigma_m is None else self.depth_sigma_m[rows],
         )
 
 

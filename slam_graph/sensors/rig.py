@@ -8,7 +8,7 @@ The body frame is the IMU frame. `CalibrationEstimate` is the result of online c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import gtsam
@@ -17,6 +17,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.depth import DepthSensor
 
 _STAMPED_ROWS = {"first": 0.0, "middle": 0.5, "last": 1.0}
 """Rows of a rolling shutter that a stamp may be the time of, as parts of the height."""
@@ -132,10 +133,15 @@ class Rig:
     Attributes:
         cameras: in the order of the images of a frame.
         imu: noise of the IMU.
+        has_imu: whether there is an IMU; without one, `imu` means nothing.
+        depth: what measures the depth of the points that one of the cameras sees; None where
+            nothing does.
     """
 
     cameras: tuple[RigCamera, ...]
     imu: ImuNoise = field(default_factory=ImuNoise)
+    has_imu: bool = True
+    depth: DepthSensor | None = None
 
     @property
     def rolling(self) -> bool:
@@ -159,7 +165,13 @@ class Rig:
         """The same rig with its first `count` cameras only."""
         if not 1 <= count <= len(self.cameras):
             raise DataError(f"asked for {count} cameras, the rig has {len(self.cameras)}")
-        return Rig(self.cameras[:count], self.imu)
+        depth = self.depth if self.depth is None or self.depth.camera < count else None
+        return replace(self, cameras=self.cameras[:count], depth=depth)
+
+    def without_imu(self) -> Rig:
+        """The same rig without its IMU; the body frame stays where it is."""
+        cameras = tuple(replace(mounted, rotation_known=True) for mounted in self.cameras)
+        return replace(self, cameras=cameras, has_imu=False)
 
 
 @dataclass(frozen=True, slots=True)

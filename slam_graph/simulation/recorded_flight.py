@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.datasets import EurocSequence, ReaderOptions, read_groundtruth
+from slam_graph.datasets import RecordedSequence, open_dataset, read_groundtruth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
@@ -46,7 +46,7 @@ class RecordedFlight:
     path: Path
     truth: Trajectory
     rig: Rig | None
-    sequence: EurocSequence | None
+    sequence: RecordedSequence | None
     report: PathReport | None
 
     @staticmethod
@@ -66,7 +66,7 @@ class RecordedFlight:
         folder = path / "mav0" if (path / "mav0").is_dir() else path
         sequence = None
         if (folder / "imu0" / "data.csv").is_file() and any(folder.glob("cam[0-9]*")):
-            sequence = EurocSequence(path, ReaderOptions(diagnostics=diagnostics))
+            sequence = open_dataset(path, "euroc", diagnostics=diagnostics)
         elif config.real_imu:
             raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
         if sequence is None:

@@ -9,7 +9,7 @@ are those of the camera model, so distortion is exact. Textures are interpolated
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
+from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.landmarks import MovingBoard
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import ImageConfig, random_stream
@@ -166,6 +167,7 @@ class Renderer:
         config: noise, exposure, blur.
         seed: of the simulation.
         board: moving object, whose texture is the last one of the atlas; or None.
+        depth: what is measured of the depth; None for nothing.
     """
 
     def __init__(
@@ -176,7 +178,9 @@ class Renderer:
         config: ImageConfig,
         seed: int,
         board: MovingBoard | None = None,
+        depth: DepthRendering | None = None,
     ) -> None:
+        self._depth = depth
         self._cameras = [_RayCamera(mounted) for mounted in rig.cameras]
         self._middle_s = rig.cameras[0].middle_s
         self._world = world
@@ -210,13 +214,32 @@ class Renderer:
                 values += np.float32(self._config.noise_sigma) * noise
             image = np.rint(values).clip(0, 255).astype(np.uint8)
             images.append(image.reshape(camera.height, camera.width))
-        return CameraFrame(exposure_ns - offset_ns, tuple(images))
+        depth = None if self._depth is None else self._measured(motion, exposure_ns)
+        return CameraFrame(exposure_ns - offset_ns, tuple(images), depth)
+
+    def _measured(self, motion: Motion, exposure_ns: int) -> Grey:
+        """The depth image (height, width) at the middle of the exposure."""
+        assert self._depth is not None
+        number = self._depth.sensor.camera
+        lens, world = self._cameras[number], self._world_at(exposure_ns)
+        parts = self._rows(number, exposure_ns, motion)
+        exact = np.concatenate([self._distance(number, world, *part) for part in parts])
+        shape = (lens.height, lens.width)
+        since_ns = exposure_ns - motion.start_ns
+        return self._depth.measure((exact * lens.rays[:, 2]).reshape(shape), since_ns)
 
     def _sharp(self, number: int, world: World, stamp_ns: int, motion: Motion) -> Grey:
         """Noise-free grey values of a camera, (height · width,), without blur.
 
         Rows of a rolling shutter are seen from where the camera was; a moving board does not move.
         """
+        parts = self._rows(number, stamp_ns, motion)
+        return np.concatenate([self._radiance(number, world, *part) for part in parts])
+
+    def _rows(
+        self, number: int, stamp_ns: int, motion: Motion
+    ) -> Iterator[tuple[FloatArray, FloatArray, slice]]:
+        """Rotation and position of the body for each part of a camera's pixels."""
         camera = self._cameras[number]
         stamps, rows = np.array([stamp_ns]), [slice(None)]
         if camera.mounted.readout_s:
@@ -225,8 +248,7 @@ class Renderer:
             stamps = stamp_ns + np.round(seconds * 1e9).astype(np.int64)
             rows = [slice(row * camera.width, (row + 1) * camera.width) for row in v.tolist()]
         poses = motion.rotations(stamps).as_matrix(), motion.positions(stamps)
-        parts = zip(*poses, rows, strict=True)
-        return np.concatenate([self._radiance(number, world, *part) for part in parts])
+        return zip(*poses, rows, strict=True)
 
     def _radiance(
         self,
@@ -238,15 +260,38 @@ class Renderer:
     ) -> Grey:
         """Noise-free grey values of some pixels of a camera, for a pose of the body."""
         lens = self._cameras[camera]
-        R = world_R_body @ lens.body_R_camera
-        eye = position + world_R_body @ lens.position
-        rays = lens.rays[pixels] @ R.T.astype(np.float32)
-        hit = cast(world, eye, rays)
+        hit = self._hit(camera, world, world_R_body, position, pixels)
         # a pixel covers distance / focal length, and more on a wall at a slant
         footprint = hit.distance * lens.stretch[pixels] / (lens.focal_px * np.sqrt(hit.slant))
         shade = np.array([_shade(panel) for panel in world.panels], np.float32)
         grey = shade[hit.panel] * self._atlas.sample(hit.panel, footprint, hit.a, hit.b)
         return np.where(lens.lit[pixels], grey, np.float32(0.0))
+
+    def _distance(
+        self,
+        camera: int,
+        world: World,
+        world_R_body: FloatArray,
+        position: FloatArray,
+        pixels: slice,
+    ) -> Grey:
+        """Distances along the rays of some pixels, NaN outside the field of view."""
+        hit = self._hit(camera, world, world_R_body, position, pixels)
+        return np.where(self._cameras[camera].lit[pixels], hit.distance, np.float32(np.nan))
+
+    def _hit(
+        self,
+        camera: int,
+        world: World,
+        world_R_body: FloatArray,
+        position: FloatArray,
+        pixels: slice,
+    ) -> _Hits:
+        """What the rays of some pixels of a camera meet, for a pose of the body."""
+        lens = self._cameras[camera]
+        R = world_R_body @ lens.body_R_camera
+        eye = position + world_R_body @ lens.position
+        return cast(world, eye, lens.rays[pixels] @ R.T.astype(np.float32))
 
     def _world_at(self, stamp_ns: int) -> World:
         """The walls, and the board at a time."""

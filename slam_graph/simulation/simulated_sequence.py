@@ -27,6 +27,7 @@ from slam_graph.datasets import (
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks, MovingBoard
 from slam_graph.simulation.motion import Motion
@@ -192,6 +193,7 @@ class SimulatedTracks(SimulatedSequence):
             config.tracks,
             config.seed,
             config.place_seed,
+            config.depth.noise_scale,
         )
         stamps = flight.exposures_ns - self._offset_ns
         until = flight.exposures_ns[self.within(stamps, None, end_ns)]
@@ -224,7 +226,10 @@ class SimulatedImages(SimulatedSequence):
             sizes.append(board.size)
             texels_m.append(board.config.texel_m)
         atlas = paint(sizes, texels_m, config.place_seed)
-        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board)
+        depth = None
+        if flight.rig.depth is not None:
+            depth = DepthRendering(flight.rig.depth, config.depth.noise_scale, config.seed)
+        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board, depth)
 
     @cached_property
     def board(self) -> MovingBoard | None:
@@ -247,7 +252,9 @@ class SimulatedImages(SimulatedSequence):
 
     def _write(self, path: Path, notes: Mapping[str, str], progress: Progress) -> None:
         truth, rate_hz = self.groundtruth(), self.config.rate_hz
-        with EurocWriter(path, self.rig, truth, "simulated", rate_hz, notes=notes) as writer:
+        with EurocWriter(
+            path, self.rig, truth, "simulated", rate_hz, with_imu=self.has_imu, notes=notes
+        ) as writer:
             for packet in self.packets():
                 assert isinstance(packet.frame, CameraFrame)
                 writer.write_imu(packet.imu)

@@ -114,6 +114,17 @@ class ImageConfig(Settings):
     """Exposure time, over which motion blurs the image; 0 for sharp images."""
 
 
+class DepthConfig(Settings):
+    """The simulated depth of what a camera sees."""
+
+    sensor: Literal["none", "stereo", "kinect", "rig"] = Field("rig")
+    """none; stereo: a small depth camera of two infrared images, such as RealSense D435; kinect:
+    structured light, such as Microsoft's first Kinect; rig: what the calibration has."""
+    noise_scale: float = expert(1.0, ge=0)
+    """Factor on the noise of the sensor; 0 for the exact depth. The calibration that comes with the
+    data does not know of it."""
+
+
 class MovingObjectConfig(Settings):
     """A textured board that moves in front of the cameras and hides what is behind it.
 
@@ -186,6 +197,8 @@ class SimulationConfig(Settings):
     """Time that rolling shutters take from the first row to the last; 0 for global shutters, that
     of the rig if not given. Frames are stamped at the first row, and the ground truth is that of
     the middle row."""
+    with_imu: bool = Field(default=True)
+    """Whether the recording has an IMU."""
     start_s: float = expert(0.0, ge=0)
     """Where in a recorded trajectory to start."""
     duration_s: float | None = Field(None, gt=0)
@@ -208,6 +221,8 @@ class SimulationConfig(Settings):
     """The simulated front end."""
     images: ImageConfig = ImageConfig()
     """The rendered images."""
+    depth: DepthConfig = DepthConfig()
+    """The depth of what the first camera sees, as images or with the features."""
     moving_object: MovingObjectConfig | None = expert(None)
     """A board that moves in front of the cameras, in rendered images; none if not given."""
     start: StartConfig | None = expert(None)

@@ -20,7 +20,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import read_kalibr
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError
-from slam_graph.sensors import Camera, ImuNoise, Rig, RigCamera
+from slam_graph.sensors import Camera, DepthSensor, ImuNoise, Rig, RigCamera
 from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, SimulatedImu
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion, SplineMotion
@@ -72,6 +72,14 @@ _BODY_T_RIGHT = (
 )
 
 
+_DEPTH_SENSORS = {
+    "none": None,
+    "stereo": DepthSensor(scale=5000.0),
+    "kinect": DepthSensor.kinect(scale=5000.0),
+}
+"""With 0.2 mm to a unit, so that rounding does not count."""
+
+
 def simulate(
     config: SimulationConfig | str | Path | None = None,
     overrides: Iterable[str] = (),
@@ -108,6 +116,8 @@ def simulate(
         raise ConfigError(
             "moving_object is for images; for tracks set landmarks.moving_points instead"
         )
+    if config.real_imu and not config.with_imu:
+        raise ConfigError("real_imu is for recordings with an IMU; remove it, or set with_imu")
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
     flight = _flight(config, diagnostics)
     source = config.trajectory if config.recorded is None else _name(config.recorded)
@@ -190,13 +200,17 @@ def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:
 
 
 def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
-    """The rig of the settings, or that of the recording, or EuRoC's."""
+    """The rig of the settings, or that of the recording, or EuRoC's; with depth as asked for."""
     if config.calibration is not None:
         rig = read_kalibr(config.calibration)
     else:
         rig = recorded if recorded is not None else euroc_rig()
     if config.cameras is not None:
         rig = rig.select(config.cameras)
+    if config.depth.sensor != "rig":
+        rig = replace(rig, depth=_DEPTH_SENSORS[config.depth.sensor])
+    if not config.with_imu:
+        rig = rig.without_imu()
     if config.shutter_readout_s is None:
         return rig
     readout_s = config.shutter_readout_s

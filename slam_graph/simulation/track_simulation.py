@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
+from slam_graph.sensors import Camera, DepthSensor, FeatureFrame, FeatureObservations, Rig
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import TrackConfig, random_stream
@@ -90,6 +90,7 @@ class TrackSimulator:
         config: number of features, noise, losses, outliers.
         seed: of the simulation.
         place_seed: of what landmarks look like; the same as `seed` if None.
+        depth_noise: factor on the noise of the rig's depth sensor.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class TrackSimulator:
         config: TrackConfig,
         seed: int,
         place_seed: int | None = None,
+        depth_noise: float = 1.0,
     ) -> None:
         self.views = [View.of(mounted) for mounted in rig.cameras]
         self.groups = camera_groups(rig, self.views)
@@ -112,6 +114,7 @@ class TrackSimulator:
         self._descriptors = (
             _Descriptors(len(landmarks), config, looks, seed) if config.descriptors else None
         )
+        self._depth = None if rig.depth is None else _Depths(rig.depth, depth_noise, seed)
         self._tracks = [_Tracks() for _ in self.groups]
         self._next_id = 0
         self._next_landmark = 0
@@ -140,14 +143,15 @@ class TrackSimulator:
         for group, tracks in zip(self.groups, self._tracks, strict=True):
             self._follow(tracks, self.views[group[0]], pose)
             self._begin(tracks, self.views[group[0]], pose)
-            leading = self._measure(self.views[group[0]].camera, tracks.ids, tracks.pixels)
+            leading = self._measure(group[0], pose, tracks.landmarks, tracks.ids, tracks.pixels)
             if self._descriptors is not None:
                 observed = self._descriptors.observe(tracks.landmarks)
                 leading = replace(leading, descriptors=observed)
             seen[group[0]] = leading
             for camera in group[1:]:
                 index, pixels = self._see(self.views[camera], pose, tracks.landmarks)
-                seen[camera] = self._measure(self.views[camera].camera, tracks.ids[index], pixels)
+                rows = tracks.landmarks[index], tracks.ids[index]
+                seen[camera] = self._measure(camera, pose, *rows, pixels)
         return seen
 
     def _see(self, view: View, pose: _Pose, landmarks: IntArray) -> tuple[IntArray, FloatArray]:
@@ -222,17 +226,40 @@ class TrackSimulator:
         best = np.argsort(rank + occupied[cells], kind="stable")[:wanted]
         return order[best]
 
-    def _measure(self, camera: Camera, ids: IntArray, exact: FloatArray) -> FeatureObservations:
-        """Observations with noise and wrong matches."""
-        pixels, config = exact, self._config
+    def _measure(
+        self, number: int, pose: _Pose, landmarks: IntArray, ids: IntArray, exact: FloatArray
+    ) -> FeatureObservations:
+        """Observations of a camera, with noise and wrong matches, and with depth if it has one."""
+        pixels, config, camera = exact, self._config, self.views[number].camera
+        matched = np.arange(len(ids))
         if config.outliers > 0 and len(ids) > 1:
             wrong = np.flatnonzero(self._rng.random(len(ids)) < config.outliers)
             shift = self._rng.integers(1, len(ids), len(wrong))
-            pixels = exact.copy()
-            pixels[wrong] = exact[(wrong + shift) % len(ids)]
+            matched[wrong] = (wrong + shift) % len(ids)
+            pixels = exact[matched]
         if config.pixel_sigma > 0:
             pixels = pixels + self._rng.normal(0.0, config.pixel_sigma, pixels.shape)
-        return FeatureObservations(ids.copy(), pixels.copy(), camera.undistort(pixels))
+        seen = FeatureObservations(ids.copy(), pixels.copy(), camera.undistort(pixels))
+        if self._depth is None or self._depth.sensor.camera != number:
+            return seen
+        exact_m = self._depths_m(number, pose, landmarks, exact)
+        return self._depth.measure(seen, exact_m[matched])
+
+    def _depths_m(
+        self, number: int, pose: _Pose, landmarks: IntArray, exact: FloatArray
+    ) -> FloatArray:
+        """Depths (N,) of landmarks in a camera, each at the time of its row."""
+        view = self.views[number]
+        seconds = view.mounted.row_times_s(exact[:, 1]) - self._middle_s
+        R, p = pose.rotation, pose.position
+        if view.mounted.readout_s:
+            stamps = pose.stamp_ns + np.round(seconds * 1e9).astype(np.int64)
+            R, p = pose.motion.rotations(stamps).as_matrix(), pose.motion.positions(stamps)
+        points, _ = self._landmarks.at(landmarks, pose.stamp_ns)
+        from_eye = points - p - R @ view.position
+        axis = R @ view.body_R_camera[:, 2]
+        depths: FloatArray = np.sum(from_eye * axis, axis=1)
+        return depths
 
 
 def _cells(camera: Camera, pixels: FloatArray) -> IntArray:
@@ -240,6 +267,29 @@ def _cells(camera: Camera, pixels: FloatArray) -> IntArray:
     scale = np.array([GRID[0] / camera.width, GRID[1] / camera.height])
     cells = (pixels * scale).astype(np.int64)
     return np.asarray(cells[:, 1] * GRID[0] + cells[:, 0])
+
+
+class _Depths:
+    """Measured depths.
+
+    Args:
+        sensor: noise and range.
+        scale: factor on the noise.
+        seed: of the simulation.
+    """
+
+    def __init__(self, sensor: DepthSensor, scale: float, seed: int) -> None:
+        self.sensor = sensor
+        self._scale = scale
+        self._rng = np.random.default_rng(random_stream(seed, "depth"))
+
+    def measure(self, seen: FeatureObservations, exact_m: FloatArray) -> FeatureObservations:
+        """Features with their depths (N,) as they are measured; none outside of the range."""
+        sigma_m = self.sensor.sigma_m(exact_m)
+        depth_m = exact_m + self._scale * sigma_m * self._rng.standard_normal(len(exact_m))
+        depth_m[~((depth_m >= self.sensor.min_m) & (depth_m <= self.sensor.max_m))] = np.nan
+        sigma_m = self.sensor.sigma_m(depth_m)  # what a user of the depth can know
+        return replace(seen, depth_m=depth_m, depth_sigma_m=sigma_m)
 
 
 class _Descriptors:

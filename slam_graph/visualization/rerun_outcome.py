@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import mean_bounds, synchronize
-from slam_graph.geometry import Similarity, Trajectory
+from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
     IN_MAP,
@@ -84,8 +84,8 @@ class FinishedRun(Protocol):
         ...
 
     @property
-    def start_was_given(self) -> bool:
-        """Whether the estimate lives in the world of the truth."""
+    def metrics(self) -> dict[str, Any]:
+        """What `metrics.json` has."""
         ...
 
     @property
@@ -204,10 +204,10 @@ class OutcomeLog:
         )
         self._stream.log(entity, lines, static=True)
 
-    def show_truth(self, truth: Trajectory, estimate: Trajectory, given: bool) -> None:
+    def show_truth(self, truth: Trajectory, estimate: Trajectory, alignment: AlignmentMode) -> None:
         """Log the true path in the world of the estimate, fitted over what both share."""
         try:
-            onto = _onto(estimate, truth, given)
+            onto = _onto(estimate, truth, alignment)
         except DataError:
             return
         rr, entity = self._stream.rr, f"{self._world}/path/groundtruth"
@@ -290,9 +290,10 @@ class OutcomeLog:
         if truth is None or len(causal) == 0:
             return False
         best = causal if run.smoothed is None else run.smoothed
-        self.show_truth(truth, best, run.start_was_given)
+        alignment = run.metrics["extent"].get("alignment", "yaw")
+        self.show_truth(truth, best, alignment)
         try:
-            moved = _onto(causal, truth, run.start_was_given).apply(truth)
+            moved = _onto(causal, truth, alignment).apply(truth)
             true, own = synchronize(moved, causal)
         except DataError:
             return False
@@ -321,13 +322,13 @@ class OutcomeLog:
         self._series.send("consistency/nees/bounds", frames, stamps_ns, bounds)
 
 
-def _onto(estimate: Trajectory, truth: Trajectory, given: bool) -> Similarity:
+def _onto(estimate: Trajectory, truth: Trajectory, alignment: AlignmentMode) -> Similarity:
     """The map from the world of the truth to that of an estimate.
 
     Raises:
         DataError: if the two share no time, or determine no yaw.
     """
-    if given:
+    if alignment == "none":
         return Similarity.identity()
     true, own = synchronize(truth, estimate)
-    return Similarity.of_positions(own.positions, true.positions, "yaw")
+    return Similarity.of_positions(own.positions, true.positions, alignment)

@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend import Estimator
-from slam_graph.geometry import StateHistory, Trajectory
+from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
@@ -153,7 +153,7 @@ class RerunViewer:
         if not frame.waits:
             ids, points = frame.landmark_ids, frame.landmarks
             self._cameras.show_residuals(features, frame.state, ids, points)
-        if not len(self._history):
+        if not len(self._history) and estimator.rig.has_imu:
             self._outcome.show_gravity(np.asarray(frame.state.world_T_body.translation()))
         self._history.append(frame.state)
         self._states.add(number, stamp_ns, frame.state)
@@ -162,8 +162,9 @@ class RerunViewer:
         if self._detail == "graph":
             show_window(self._stream, estimator)
         if self._truth is not None and number % _ALIGN_FRAMES == 0:
-            given = estimator.start_is_given
-            self._outcome.show_truth(self._truth, self._history.trajectory(), given)
+            free: AlignmentMode = "yaw" if estimator.rig.has_imu else "se3"
+            alignment: AlignmentMode = "none" if estimator.start_is_given else free
+            self._outcome.show_truth(self._truth, self._history.trajectory(), alignment)
 
     def finish(self, result: FinishedRun) -> None:
         """Send what is known at the end only, and show everything at once."""

@@ -9,6 +9,7 @@ with the random walk of the biases (GTSAM's `CombinedImuFactor`); the integratio
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -89,7 +90,14 @@ class Propagation:
         self._still = False
         self._samples: ImuData | None = None
 
-    def append_frame(self, window: Window, imu: ImuBuffer, stamp_ns: int, still: bool) -> None:
+    def append_frame(
+        self,
+        window: Window,
+        imu: ImuBuffer,
+        stamp_ns: int,
+        still: bool,
+        corrected: Callable[[NavState, NavState], NavState] | None = None,
+    ) -> None:
         """Make a new frame the current one.
 
         Args:
@@ -98,6 +106,8 @@ class Propagation:
             imu: samples up to the frame.
             stamp_ns: time of the frame on the clock of the IMU.
             still: whether the platform has not moved.
+            corrected: gives the state at which the new frame is linearised, from the last state and
+                the predicted one; this one if None.
         """
         i, j = window.frame, window.frame + 1
         previous = window.state.nav_state(i, window.stamp_ns, None)
@@ -106,7 +116,8 @@ class Propagation:
         pim = samples.preintegrated(bias, self._params(imu, samples))
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
-        window.state.insert_imu_state(j, predicted)
+        first = predicted if corrected is None else corrected(previous, predicted)
+        window.state.insert_imu_state(j, first)
         window.past.append(i)
         window.moving.append(i)
         window.frame, window.stamp_ns = j, stamp_ns

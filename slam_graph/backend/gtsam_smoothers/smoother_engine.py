@@ -92,7 +92,8 @@ class SmootherEngine:
         propagation = self._context.propagation
         with report.timed("propagation"):
             ahead = Window(window.frame, window.stamp_ns, window.state.copy(), window.prior)
-            propagation.append_frame(ahead, self._context.imu, stamp_ns, still)
+            corrected = self._context.by_images(frame, lambda: self.landmarks(window))
+            propagation.append_frame(ahead, self._context.imu, stamp_ns, still, corrected)
             predicted = self._predicted(ahead)
         if stamp_ns - window.stamp_ns < self._policy.spacing_s * 1e9:
             return propagation.reported(predicted)

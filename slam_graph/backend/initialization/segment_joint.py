@@ -20,7 +20,7 @@ from slam_graph.backend.initialization.start_review import contradict
 from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import letter_and_index
 from slam_graph.backend.window import Window
-from slam_graph.backend.world_gauge import gauge_covariance, level_motion, with_unknown_gauge
+from slam_graph.backend.world_gauge import gauge_covariance, with_unknown_gauge, world_motion
 from slam_graph.geometry import NavState
 
 _UNKNOWN_M = 1000.0
@@ -37,18 +37,20 @@ class SegmentJoint:
             with its covariance.
         holds: whether the start agrees with the prediction. If not, the place of the new segment
             is not known: something else happened in between than the IMU has measured.
+        level: whether both worlds have gravity in common.
     """
 
     before: NavState
     predicted: NavState
     holds: bool
+    level: bool = True
 
     @property
     def covariance(self) -> FloatArray:
-        """(4, 4) of position (m), in axes of the world, and yaw (rad) of the new segment."""
+        """Of the gauge of the new segment: position (m), then yaw or rotation (rad)."""
         if self.holds:
-            return gauge_covariance(self.predicted)
-        return np.diag([_UNKNOWN_M**2] * 3 + [np.pi**2])
+            return gauge_covariance(self.predicted, self.level)
+        return np.diag([_UNKNOWN_M**2] * 3 + [np.pi**2] * (1 if self.level else 3))
 
     def added_to(self, state: NavState) -> NavState:
         """A state of the new segment with a covariance relative to the segment before."""
@@ -64,12 +66,14 @@ def place(window: Window, before: NavState, context: EngineContext) -> tuple[Win
         context: shared with the engine; it has the IMU samples from that state on.
     """
     start = window.current(window.prior)
-    measured = context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
+    level = context.rig.has_imu
+    measured = level and context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
     predicted = before
     if measured:
         predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
-    joint = SegmentJoint(before, predicted, measured and not contradict(start, predicted))
-    return moved(window, level_motion(start.world_T_body, predicted.world_T_body)), joint
+    holds = measured and not contradict(start, predicted)
+    motion = world_motion(start.world_T_body, predicted.world_T_body, level)
+    return moved(window, motion), SegmentJoint(before, predicted, holds, level)
 
 
 def moved(window: Window, motion: gtsam.Pose3) -> Window:
@@ -77,7 +81,7 @@ def moved(window: Window, motion: gtsam.Pose3) -> Window:
 
     Args:
         window: without factors and tracks that are not in its prior yet.
-        motion: new_T_old of the two worlds; a rotation about the vertical.
+        motion: new_T_old of the two worlds; with an IMU a rotation about the vertical.
     """
     rotation = motion.rotation().matrix()
     ids, points = window.last_points

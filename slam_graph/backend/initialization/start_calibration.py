@@ -272,4 +272,4 @@ class StartCalibration:
             message = f"rotation of the camera estimated to {np.rad2deg(sigma):.1f}°; {message}"
             self.mounted = True
         variables = CalibrationConfig(**{**self._config.calibration.model_dump(), **changes})
-        return FoundCalibration(Rig(tuple(cameras), self._rig.imu), variables, message)
+        return FoundCalibration(replace(self._rig, cameras=tuple(cameras)), variables, message)

@@ -22,7 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
-from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
 from slam_graph.backend.smoothing.recording_problem import (
     AdjustedSegment,
     BundleAdjustment,
@@ -32,7 +32,7 @@ from slam_graph.backend.smoothing.recording_problem import (
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
-from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, level_motion
+from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, world_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
 from slam_graph.sensors import Rig
@@ -119,7 +119,7 @@ def adjust_worlds(
             parts.append(found)
     if len(parts) < 2:
         return parts[0] if parts else None
-    history = StateHistory()
+    history = StateHistory(parts[0].history.level)
     for found in parts:
         history.extend(found.history)
     return FinalBa(history, total_of([found.summary for found in parts]), None)
@@ -152,7 +152,7 @@ def adjust_recording(
         EstimationError: if the minimum does not fit the observations.
     """
     try:
-        return _smoothed(log, causal, SmoothingTask(rig, backend, config), report)
+        return _smoothed(log, causal, SmoothingTask.of(rig, backend, config), report)
     except _UndeterminedError as reason:
         logger.info("no final bundle adjustment: %s", reason)
         return None
@@ -166,7 +166,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     longest, began_ns = task.config.max_keyframes, causal.stamps_ns[0]
     causal = _extended_backward(log, causal, task, report)
-    history = StateHistory()
+    level = task.rig.has_imu
+    history = StateHistory(level)
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):
@@ -175,7 +176,10 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         if not _overlaps(causal, stamps_ns):
             continue
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
-        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns))
+        if not level:
+            task, start = replace(task, causal=causal), with_angular_rates(start)
+        # without an IMU errors are judged by the first pose, so that it defines the world
+        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
         begin, link = 0, None
         if states:
             anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
@@ -184,16 +188,16 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             for state in states[:joint]:
                 history.append(state)
             link = states[joint]
-            start = _aligned(start, start[anchor], link)
+            start = _aligned(start, start[anchor], link, level)
         steps = sum(part.figures.iterations for part in solved)
         own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
         adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
         found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
         held = found[int(segment.keyframes[anchor])]
-        states = _aligned(found, held, start[anchor])[begin:]
+        states = _aligned(found, held, start[anchor], level)[begin:]
         if link is not None:
-            states = in_gauge_of(link, states)
+            states = in_gauge_of(link, states, level)
         solved.append(replace(adjusted, states=[]))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")
@@ -282,9 +286,11 @@ def _overlap(longest: int) -> int:
     return min(OVERLAP, longest // 2)
 
 
-def _aligned(states: list[NavState], moving: NavState, fixed: NavState) -> list[NavState]:
-    """States moved by the translation and yaw that align `moving` with `fixed`."""
-    return in_moved_world(states, level_motion(moving.world_T_body, fixed.world_T_body))
+def _aligned(
+    states: list[NavState], moving: NavState, fixed: NavState, level: bool
+) -> list[NavState]:
+    """States moved by what the gauge leaves open, so that `moving` comes to `fixed`."""
+    return in_moved_world(states, world_motion(moving.world_T_body, fixed.world_T_body, level))
 
 
 def _progress(

@@ -13,11 +13,14 @@ from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
+from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
@@ -25,6 +28,8 @@ from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Packe
 
 _MAX_BEYOND_NS = 100_000_000
 """Frames farther outside of the IMU samples than this are left out."""
+_SPACING_WITHOUT_IMU_S = 0.05
+"""Longest time between keyframes without an IMU, which else tells the motion between them."""
 _JITTER = 0.95
 """Part of the keyframe spacing that is enough, because time stamps jitter."""
 
@@ -47,13 +52,16 @@ class FrameLog:
     """
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
-        self.rig = rig
+        self._real_rig, self.rig = rig, with_depth_camera(rig)
+        # the depth sensor is a camera in it, and the samples of the dynamics are those of an IMU
+        recorded = replace(self.rig, depth=None, has_imu=True)
         self._config = config
         self._path = folder / "frames"
-        self._recorder = TrackRecorder(self._path, rig)
+        self._recorder = TrackRecorder(self._path, recorded)
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
+        self._lead_ns = round(rig.end_offset_s * 1e9)
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
@@ -80,12 +88,16 @@ class FrameLog:
             frame: the observations of all cameras.
             noise: factors on the white noise of gyroscope and accelerometer around this time.
         """
+        if not self.rig.has_imu:
+            newest_ns = None if self._imu_ns is None else self._imu_ns[1]
+            imu = motionless_samples(newest_ns, frame.stamp_ns + self._lead_ns)
         if len(imu):
             self._imu.append(imu)
             first, last = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
             self._imu_ns = (first if self._imu_ns is None else self._imu_ns[0], last)
         if not self._follows(frame.stamp_ns):
             return
+        frame = with_depth_observed(frame, self._real_rig)
         missing = len(self.rig.cameras) - len(frame.cameras)
         cameras = frame.cameras + (FeatureObservations.empty(),) * missing
         frame = FeatureFrame(frame.stamp_ns, cameras)
@@ -133,7 +145,7 @@ class FrameLog:
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
-        sequence.rig = rig  # how far the samples lead
+        sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
     def _follows(self, frame_ns: int) -> bool:
@@ -148,7 +160,10 @@ class FrameLog:
         if not self._keyframes:
             return True
         since_s = (frame.stamp_ns - self._frames[self._keyframes[-1]]) * 1e-9
-        if since_s >= _JITTER * self._config.keyframe_spacing_s:
+        spacing_s = self._config.keyframe_spacing_s
+        if not self.rig.has_imu:
+            spacing_s = min(spacing_s, _SPACING_WITHOUT_IMU_S)
+        if since_s >= _JITTER * spacing_s:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
         return len(common) > 0 and bool(common.mean() < self._config.min_common_features)

@@ -113,6 +113,17 @@ def _predict_backward(
     )
 
 
+def with_angular_rates(states: list[NavState]) -> list[NavState]:
+    """The states with the rates of the motion to the next one, as `constant_velocity` has them."""
+    rates = []
+    for state, later in pairwise(states):
+        seconds = (later.stamp_ns - state.stamp_ns) * 1e-9
+        turn = state.world_T_body.rotation().between(later.world_T_body.rotation())
+        rates.append(gtsam.Rot3.Logmap(turn) / seconds)
+    rates += rates[-1:] or [np.zeros(3)]
+    return [replace(s, gyro_bias=-rate) for s, rate in zip(states, rates, strict=True)]
+
+
 def fill_in(
     keyframes: list[NavState],
     stamps_ns: IntArray,
@@ -146,6 +157,49 @@ def fill_in(
             part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
             pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * pose_error))
             velocity = state.velocity + part * velocity_error
+            states.append(replace(state, world_T_body=pose, velocity=velocity))
+    return [*states, keyframes[-1]]
+
+
+def fill_in_by_motion(
+    keyframes: list[NavState],
+    stamps_ns: IntArray,
+    causal: Trajectory,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> list[NavState]:
+    """States at all frames by the motion of the causal estimate between the keyframes.
+
+    Its difference to the motion between two keyframes is distributed over the frames in between.
+
+    Args:
+        keyframes: at least one state.
+        stamps_ns: (N,) ascending times, those of the keyframes among them.
+        causal: poses with velocities; where it has none, `fill_in` takes its place.
+        imu: as for `fill_in`.
+        params: as for `fill_in`.
+    """
+    known, valid = interpolate(causal, stamps_ns, _MAX_GAP_S)
+    rows = np.cumsum(valid) - 1
+    states: list[NavState] = []
+    at = np.searchsorted(stamps_ns, [state.stamp_ns for state in keyframes])
+    for k, (start, end) in enumerate(pairwise(keyframes)):
+        between = range(int(at[k]), int(at[k + 1]) + 1)
+        if not valid[list(between)].all():
+            inside = stamps_ns[between.start : between.stop]
+            states += fill_in([start, end], inside, imu, params)[:-1]
+            continue
+        states.append(start)
+        first, last = (known.pose(int(rows[i])) for i in (between[0], between[-1]))
+        moved = first.between(last)
+        error = gtsam.Pose3.Logmap(moved.between(start.world_T_body.between(end.world_T_body)))
+        for i in between[1:-1]:
+            state = _state_at(known, int(rows[i]))
+            part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
+            motion = first.between(state.world_T_body).compose(gtsam.Pose3.Expmap(part * error))
+            pose = start.world_T_body.compose(motion)
+            turn = pose.rotation().compose(state.world_T_body.rotation().inverse())
+            velocity = np.asarray(turn.rotate(state.velocity))
             states.append(replace(state, world_T_body=pose, velocity=velocity))
     return [*states, keyframes[-1]]
 

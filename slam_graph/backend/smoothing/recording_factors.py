@@ -162,14 +162,15 @@ class RecordingFactors:
         return _graph(self._prior(values) + self._dynamics(values))
 
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
-        """A prior that fixes position and yaw of the anchor.
+        """A prior that fixes position and yaw of the anchor, or all of its pose without an IMU.
 
         Args:
             values: with the pose of the anchor.
             sigma: of position (m) and yaw (rad); by default so small that they define the world.
         """
         pose = values.atPose3(X(self._anchor))
-        sigmas = np.diag([_UNKNOWN_TILT_RAD, _UNKNOWN_TILT_RAD, sigma])
+        tilt = _UNKNOWN_TILT_RAD if self._rig.has_imu else sigma
+        sigmas = np.diag([tilt, tilt, sigma])
         root = pose.rotation().matrix().T @ sigmas
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = root @ root.T
@@ -178,8 +179,13 @@ class RecordingFactors:
         return gtsam.PriorFactorPose3(X(self._anchor), pose, noise)
 
     def densities(self) -> FloatArray:
-        """(K-1, 2) noise densities of gyroscope and accelerometer between the keyframes."""
+        """(K-1, 2) noise densities of gyroscope and accelerometer between the keyframes.
+
+        Zero without an IMU: frames in between follow the causal estimate, not the dynamics.
+        """
         imu, count = self._rig.imu, len(self._segment.keyframes) - 1
+        if not self._rig.has_imu:
+            return np.zeros((count, 2))
         factors = np.array([self._noise_factors(k) for k in range(count)]).reshape(-1, 3)
         white = np.array([imu.gyro_noise_density, imu.accel_noise_density])
         return np.asarray(factors[:, :1] * factors[:, 1:] * white)

@@ -22,10 +22,17 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
+from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
-from slam_graph.backend.smoothing.keyframe_states import fill_in, states_in, values_of
+from slam_graph.backend.smoothing.keyframe_states import (
+    fill_in,
+    fill_in_by_motion,
+    states_in,
+    values_of,
+)
 from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
@@ -54,7 +61,7 @@ from slam_graph.backend.smoothing.state_covariances import (
 )
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.state import stacked_poses
-from slam_graph.geometry import NavState
+from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import Rig
 
 logger = logging.getLogger(__name__)
@@ -82,11 +89,22 @@ class SmoothingTask:
         rig: the best calibration available.
         backend: noise and triangulation.
         config: settings of the bundle adjustment.
+        causal: motion between keyframes where there is no IMU to predict it.
     """
 
     rig: Rig
     backend: BackendConfig
     config: FinalBaConfig
+    causal: Trajectory | None = None
+
+    @classmethod
+    def of(cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig) -> SmoothingTask:
+        """The task under the dynamics that the settings choose."""
+        rig = with_depth_camera(rig)
+        if backend.dynamics.uses_imu(rig.has_imu):
+            return cls(rig, backend, config)
+        alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
+        return cls(model_rig(rig, backend.dynamics), without_imu(backend), alone)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -233,6 +251,7 @@ class BundleAdjustment:
         """
         at = Geometry(*stacked_poses(self._values, obs.frames), points)
         lengths = np.linalg.norm(self._projection.residuals(obs, at)[0], axis=1)
+        lengths = lengths[~is_of_depth(obs, self._task.rig)]  # whose noise is known
         unknowns = 3 * len(obs.ids) + 6 * len(self._segment.keyframes)
         freedom = 2 * len(obs) - unknowns
         if freedom <= unknowns:
@@ -293,7 +312,7 @@ class BundleAdjustment:
             inertial,
             ReprojectionCost(
                 obs,
-                self._sigma_px * np.sqrt(variances),
+                self._sigmas_px(obs) * np.sqrt(variances),
                 self._projection,
                 RobustLoss(self._config.robust_loss, self._config.robust_width),
             ),
@@ -307,6 +326,11 @@ class BundleAdjustment:
         self._values = end.states
         self._minimum = Minimum(cost, end)
         return value, inertial.error(self._values)
+
+    def _sigmas_px(self, obs: Observations) -> FloatArray:
+        """Standard deviations (N,) of observations: learned, but for those of a depth sensor."""
+        of_depth = is_of_depth(obs, self._task.rig)
+        return np.where(of_depth, self._backend.noise.pixel_sigma, self._sigma_px)
 
     def _count_step(self) -> None:
         self.iterations += 1
@@ -338,7 +362,7 @@ class BundleAdjustment:
                 self._config.learn_imu_noise,
                 self._count_step,
             )
-            return keyframe_covariances(states, self._values, weights)
+            return keyframe_covariances(states, self._values, weights, self._task.rig.has_imu)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             return None
@@ -352,6 +376,11 @@ class BundleAdjustment:
     def _states(self, stamps_ns: IntArray) -> list[NavState]:
         """The states at some times, those of the keyframes among them."""
         imu, preintegration = self._segment.imu, self._task.preintegration
+        causal = self._task.causal
+        if causal is not None:
+            return fill_in_by_motion(
+                self._keyframe_states(), stamps_ns, causal, imu, preintegration
+            )
         return fill_in(self._keyframe_states(), stamps_ns, imu, preintegration)
 
     def _keyframe_states(self) -> list[NavState]:

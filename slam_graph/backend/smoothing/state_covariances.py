@@ -98,7 +98,7 @@ class FrameInterpolation:
 
 
 def keyframe_covariances(
-    states: EliminatedStates, values: gtsam.Values, weights: FloatArray
+    states: EliminatedStates, values: gtsam.Values, weights: FloatArray, level: bool = True
 ) -> KeyframeCovariances:
     """Covariances of the keyframes 0 to K-1.
 
@@ -106,6 +106,8 @@ def keyframe_covariances(
         states: the factor of the cost; its gauge is what the covariances are relative to.
         values: the minimum.
         weights: (K,) of the keyframes in an alignment; their sum is one.
+        level: whether gravity is measured; if not, an alignment would turn about all axes, which
+            is not covered.
     """
     count = len(weights)
     rotations, positions = stacked_poses(values, range(count))
@@ -113,7 +115,7 @@ def keyframe_covariances(
     centre = weights @ positions
     arms = np.cross([0.0, 0.0, 1.0], positions - centre)
     extent = float(weights @ np.sum(arms**2, axis=1))
-    if extent < _LEAST_EXTENT_M**2:
+    if extent < _LEAST_EXTENT_M**2 or not level:
         return KeyframeCovariances(rotations, pairs, None, np.zeros((4, 4)), centre)
     W = np.zeros((count, 6, 4))  # g = Wᵀ e of all errors e, with axes of the world
     W[:, 3:, :3] = weights[:, None, None] * np.eye(3)

@@ -224,7 +224,8 @@ class State:
         """The same state in a world that is moved.
 
         Args:
-            motion: new_T_old of the two worlds; a rotation about the vertical, as gravity stays.
+            motion: new_T_old of the two worlds; with an IMU a rotation about the vertical, as
+                gravity stays.
         """
         other, turn = self.copy(), motion.rotation().matrix()
         for values in (other.first, other.estimate):

@@ -7,6 +7,9 @@ Kalibr writes `T_cam_imu`, the pose of the IMU in the camera frame, which is the
 camera may say `T_cam_imu: unknown`; its mounting is then estimated. The IMU's
 noise stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the
 same file under ``imu0``, so that one file describes the rig.
+
+Kalibr does not know of depth. A key ``depth0`` beside the cameras describes what measures it
+(`depth_calibration`).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import gtsam
 import yaml
 
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, parse_yaml, read_yaml
+from slam_graph.datasets.calibration.depth_calibration import depth_entry, read_depth_sensor
 from slam_graph.datasets.calibration.euroc_calibration import (
     camera_entry,
     read_camera,
@@ -28,9 +32,12 @@ from slam_graph.datasets.calibration.euroc_calibration import (
 )
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.sensors import ImuNoise, Rig, RigCamera
+from slam_graph.sensors import DepthSensor, ImuNoise, Rig, RigCamera
 
 _IMU_KEY = "imu0"
+_DEPTH_KEY = "depth0"
+_NONE = "none"
+"""Stands for the IMU of a rig without one."""
 _UNKNOWN = "unknown"
 """Stands for `T_cam_imu` where nobody has measured how the camera is mounted."""
 
@@ -55,7 +62,10 @@ def read_kalibr(
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
     """
     chain = read_yaml(path)
-    return Rig(_chain_cameras(chain, needs_imu), _read_imu(chain, imu_path, fallback))
+    no_imu = _says_none(chain)
+    cameras = _chain_cameras(chain, needs_imu and not no_imu)
+    noise = ImuNoise() if no_imu else _read_imu(chain, imu_path, fallback)
+    return Rig(cameras, noise, not no_imu, _read_depth(chain, len(cameras)))
 
 
 def rig_from_kalibr(text: str, path: str | Path) -> Rig:
@@ -69,7 +79,11 @@ def rig_from_kalibr(text: str, path: str | Path) -> Rig:
         DataError: if it is not YAML, a key is missing, or a value makes no sense.
     """
     table = parse_yaml(text, path)
-    return Rig(_chain_cameras(table), read_imu_noise(table.require(_IMU_KEY)))
+    cameras, imu = _chain_cameras(table, not _says_none(table)), table.require(_IMU_KEY)
+    depth = _read_depth(table, len(cameras))
+    if _says_none(table):
+        return Rig(cameras, has_imu=False, depth=depth)
+    return Rig(cameras, read_imu_noise(imu), depth=depth)
 
 
 def _chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera, ...]:
@@ -120,6 +134,12 @@ def _is_unknown(entry: YamlValue) -> bool:
     )
 
 
+def _says_none(chain: YamlValue) -> bool:
+    """Whether a camera chain says that there is no IMU."""
+    imu = chain.get(_IMU_KEY)
+    return imu is not None and isinstance(imu.node, yaml.ScalarNode) and imu.text() == _NONE
+
+
 def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
     direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
     if _is_unknown(entry) and previous is None:
@@ -134,6 +154,11 @@ def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool
         f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
         f"from calibrating cameras and IMU together, or 'T_cam_imu: {_UNKNOWN}' to estimate it"
     )
+
+
+def _read_depth(chain: YamlValue, cameras: int) -> DepthSensor | None:
+    entry = chain.get(_DEPTH_KEY)
+    return None if entry is None else read_depth_sensor(entry, cameras)
 
 
 def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise | None) -> ImuNoise:
@@ -159,21 +184,27 @@ def write_kalibr(rig: Rig, path: str | Path) -> None:
 
 
 def kalibr_text(rig: Rig) -> str:
-    """The content of a Kalibr file with cameras and IMU, which loses no digit."""
+    """The content of a Kalibr file with cameras, depth and IMU, which loses no digit."""
     content: dict[str, Any] = {
         f"cam{index}": _camera_entry(mounted) | _mounting(rig, index)
         for index, mounted in enumerate(rig.cameras)
     }
-    content[_IMU_KEY] = {
-        "gyroscope_noise_density": float(rig.imu.gyro_noise_density),
-        "gyroscope_random_walk": float(rig.imu.gyro_random_walk),
-        "accelerometer_noise_density": float(rig.imu.accel_noise_density),
-        "accelerometer_random_walk": float(rig.imu.accel_random_walk),
-        "update_rate": float(rig.imu.rate_hz),
-    }
+    if rig.depth is not None:
+        content[_DEPTH_KEY] = depth_entry(rig.depth)
+    content[_IMU_KEY] = _imu_entry(rig.imu) if rig.has_imu else _NONE
     comment = "T_cam_imu is camera_T_body, t_imu = t_cam + timeshift_cam_imu"
     table = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
     return f"# Kalibr camera chain: {comment}\n{table}"
+
+
+def _imu_entry(noise: ImuNoise) -> dict[str, float]:
+    return {
+        "gyroscope_noise_density": float(noise.gyro_noise_density),
+        "gyroscope_random_walk": float(noise.gyro_random_walk),
+        "accelerometer_noise_density": float(noise.accel_noise_density),
+        "accelerometer_random_walk": float(noise.accel_random_walk),
+        "update_rate": float(noise.rate_hz),
+    }
 
 
 def _mounting(rig: Rig, index: int) -> dict[str, Any]:

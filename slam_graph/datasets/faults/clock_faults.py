@@ -52,9 +52,9 @@ class _Rewritten(Fault):
 
 def restamped(frame: CameraFrame | FeatureFrame, stamp_ns: int) -> CameraFrame | FeatureFrame:
     """The same frame at another time."""
-    if isinstance(frame, CameraFrame):
-        return CameraFrame(stamp_ns, frame.images)
-    return FeatureFrame(stamp_ns, frame.cameras, frame.outliers)
+    if isinstance(frame, FeatureFrame) or frame.depth_ns is None:
+        return replace(frame, stamp_ns=stamp_ns)
+    return replace(frame, stamp_ns=stamp_ns, depth_ns=frame.depth_ns + stamp_ns - frame.stamp_ns)
 
 
 @FAULTS.register("clock_jump")

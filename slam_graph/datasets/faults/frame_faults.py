@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -104,7 +105,7 @@ class CameraFault(FrameFault):
                 self.image(image, camera, around, rng) if hit and image is not None else image
                 for image, camera, hit in zip(frame.images, cameras, struck, strict=True)
             ]
-            return CameraFrame(frame.stamp_ns, tuple(images))
+            return replace(frame, images=tuple(images))
         features = [
             self.features(seen, camera, rng) if hit else seen
             for seen, camera, hit in zip(frame.cameras, cameras, struck, strict=True)
@@ -313,4 +314,4 @@ class ImageColour(_OtherFile):
 
 def _moved(seen: FeatureObservations, pixels: FloatArray, camera: RigCamera) -> FeatureObservations:
     """The same features at other pixels (N, 2)."""
-    return FeatureObservations(seen.ids, pixels, camera.camera.undistort(pixels), seen.descriptors)
+    return replace(seen, pixels=pixels, normalized=camera.camera.undistort(pixels))

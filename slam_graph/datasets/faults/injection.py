@@ -78,7 +78,6 @@ class FaultySequence(RecordedSequence):
     def __init__(self, recording: RecordedSequence, faults: Iterable[Fault]) -> None:
         super().__init__(recording.name, recording.rig, ReaderOptions())
         self.diagnostics = recording.diagnostics
-        self.has_imu = recording.has_imu
         self.recording = recording
         self.faults = list(faults)
         start_ns = recording.info().start_ns

@@ -27,11 +27,13 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
+from slam_graph.datasets.calibration.depth_calibration import read_depth_sensor
 from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig, read_imu_noise
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.groundtruth import find_groundtruth
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
+from slam_graph.datasets.streams.depth_images import FileDepth
 from slam_graph.datasets.streams.image_sequence import STEREO_TOLERANCE_S, ImageSequence
 from slam_graph.datasets.streams.images import FileImages, file_within
 from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
@@ -80,7 +82,8 @@ def _read_rig(mav0: Path, options: ReaderOptions) -> tuple[Rig, list[Path]]:
         beside = (mav0 / "imu0" / "sensor.yaml", mav0.parent / "dso" / "imu_config.yaml")
         imu = next((file for file in beside if file.is_file()), None)
         noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
-        rig = read_kalibr(chain, fallback=noise, needs_imu=(mav0 / "imu0").is_dir())
+        needs_imu = options.imu and (mav0 / "imu0").is_dir()
+        rig = read_kalibr(chain, fallback=noise, needs_imu=needs_imu)
         if len(rig.cameras) > len(folders):
             raise DataError(
                 f"{chain}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "
@@ -88,6 +91,23 @@ def _read_rig(mav0: Path, options: ReaderOptions) -> tuple[Rig, list[Path]]:
             )
     rig = options.select(rig)
     return rig, folders[: len(rig.cameras)]
+
+
+def _find_depth(mav0: Path, rig: Rig, diagnostics: Diagnostics) -> tuple[Rig, FileDepth | None]:
+    """The rig with its depth sensor, and the depth images; EuRoC's recordings have none.
+
+    They are in a folder ``depth0`` like that of a camera. What measures them is in the Kalibr chain
+    that was given, or in ``sensor.yaml`` there.
+    """
+    folder = mav0 / DEPTH_FOLDER
+    if not folder.is_dir():
+        return rig, None
+    if rig.depth is None:
+        sensor = read_depth_sensor(read_yaml(folder / "sensor.yaml"), MOST_CAMERAS)
+        if sensor.camera >= len(rig.cameras):
+            return rig, None
+        rig = replace(rig, depth=sensor)
+    return rig, FileDepth(_list_images(folder, diagnostics), rig)
 
 
 def _list_images(folder: Path, diagnostics: Diagnostics) -> FileImages:
@@ -146,6 +166,13 @@ def _parse_image_row(line: str, where: Callable[[], str], folder: Path) -> tuple
     return parsed, file_within(folder, name.strip(), where())
 
 
+DEPTH_FOLDER = "depth0"
+"""Depth images of 16 bits; not EuRoC's, laid out like a camera."""
+
+MOST_CAMERAS = 64
+"""More than any rig has."""
+
+
 class EurocSequence(ImageSequence):
     """A recording in the ASL layout: a folder for each sensor, in one folder ``mav0``.
 
@@ -172,6 +199,7 @@ class EurocSequence(ImageSequence):
         options = options or ReaderOptions()
         self.path = _find_mav0(path)
         rig, folders = _read_rig(self.path, options)
+        rig, depth = _find_depth(self.path, rig, options.diagnostics)
         super().__init__(
             _name_of(self.path),
             rig,
@@ -180,6 +208,7 @@ class EurocSequence(ImageSequence):
             options,
             find_groundtruth(self.path),
             stereo_tolerance_s,
+            depth,
         )
 
 

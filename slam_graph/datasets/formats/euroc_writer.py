@@ -10,18 +10,22 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TextIO
+from typing import Any, Self, TextIO
 
 import cv2
 import gtsam
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.calibration.depth_calibration import depth_entry
 from slam_graph.datasets.calibration.euroc_calibration import camera_entry, shutter_entry
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
+from slam_graph.datasets.formats.euroc import DEPTH_FOLDER
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.errors import DataError
 from slam_graph.files import Files
@@ -83,6 +87,7 @@ class EurocWriter:
         self._path, self._rig, self._truth = path, rig, truth
         self._comment, self._rate_hz = comment, rate_hz
         self._notes = dict(notes or {})
+        self._depth_ns: int | None = None
         self._files = ExitStack()
 
     @staticmethod
@@ -119,6 +124,10 @@ class EurocWriter:
         self._images = [mav0 / f"cam{k}" / "data" for k in range(len(self._indices))]
         for folder in self._images:
             folder.mkdir()
+        if self._rig.depth is not None:
+            values = depth_entry(replace(self._rig.depth, lens=None))
+            self._depths = self._open(mav0 / DEPTH_FOLDER, _CAMERA_COLUMNS, values)
+            (mav0 / DEPTH_FOLDER / "data").mkdir()
         if self._with_imu:
             self._imu = self._open(mav0 / "imu0", IMU_COLUMNS, _imu_values(self._rig.imu))
         if self._truth is not None:
@@ -137,7 +146,9 @@ class EurocWriter:
             with Files.writing(self._path):  # what is buffered is written when a file is closed
                 self._files.close()
                 if kind is None:
-                    write_kalibr(self._rig, self._folder / CALIBRATION)
+                    registered = self._rig.depth and replace(self._rig.depth, lens=None)
+                    rig = replace(self._rig, has_imu=self._with_imu, depth=registered)
+                    write_kalibr(rig, self._folder / CALIBRATION)
                     for name, text in self._notes.items():
                         (self._folder / name).write_text(text, encoding="utf-8")
                     self._folder.chmod(0o755)
@@ -150,21 +161,33 @@ class EurocWriter:
 
     def write_imu(self, imu: ImuData) -> None:
         """The next samples."""
+        if len(imu) == 0:
+            return
         with Files.writing(self._path):
             _write_rows(self._imu, imu.stamps_ns, np.column_stack([imu.gyro, imu.accel]))
 
     def write_frame(self, frame: CameraFrame) -> None:
         """The next frame; a camera without an image is left out of it."""
-        name = f"{frame.stamp_ns}.png"
         for index, folder, image in zip(self._indices, self._images, frame.images, strict=True):
-            if image is None:
-                continue
-            good, data = cv2.imencode(".png", image)
-            if not good:
-                raise DataError(f"{self._path}: the image at {frame.stamp_ns} cannot be encoded")
-            with Files.writing(self._path):  # `imwrite` does not say if the disk is full
-                (folder / name).write_bytes(data.tobytes())
-                index.write(f"{frame.stamp_ns},{name}\n")
+            if image is not None:
+                self._write_image(index, folder, image, frame.stamp_ns)
+        sensor, stamp_ns = self._rig.depth, frame.depth_ns
+        stamp_ns = frame.stamp_ns if stamp_ns is None else stamp_ns
+        # at a low rate one depth image may be the nearest to two frames
+        if sensor is None or frame.depth is None or stamp_ns == self._depth_ns:
+            return
+        self._depth_ns = stamp_ns
+        folder = self._folder / "mav0" / DEPTH_FOLDER / "data"
+        self._write_image(self._depths, folder, sensor.raw(frame.depth), stamp_ns)
+
+    def _write_image(self, index: TextIO, folder: Path, image: NDArray[Any], stamp_ns: int) -> None:
+        name = f"{stamp_ns}.png"
+        good, data = cv2.imencode(".png", image)
+        if not good:
+            raise DataError(f"{self._path}: the image at {stamp_ns} cannot be encoded")
+        with Files.writing(self._path):  # `imwrite` does not say if the disk is full
+            (folder / name).write_bytes(data.tobytes())
+            index.write(f"{stamp_ns},{name}\n")
 
     @staticmethod
     def convert(
@@ -230,7 +253,12 @@ class EurocWriter:
             shutil.rmtree(old, ignore_errors=True)
 
 
-_SENSOR_TYPES = {"cam": "camera", "imu": "imu", _TRUTH_FOLDER.rstrip("0"): "ground truth"}
+_SENSOR_TYPES = {
+    "depth": "depth",
+    "cam": "camera",
+    "imu": "imu",
+    _TRUTH_FOLDER.rstrip("0"): "ground truth",
+}
 
 
 def _write_rows(file: TextIO, stamps_ns: IntArray, values: FloatArray) -> None:

@@ -5,7 +5,8 @@
 Images without a format: the files with their time stamps, IMU and calibration. Times in these files
 are nanoseconds if they are whole numbers, seconds if any has a decimal point.
 
-A folder of images of one camera, with a table of their times, and with or without an IMU.
+A folder of images of one camera, or a folder for each of two, with a table of their times, and with
+or without an IMU and depth images.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from slam_graph.datasets.streams.csv_rows import (
     read_rows,
     stamp_from_seconds,
 )
+from slam_graph.datasets.streams.depth_images import FileDepth
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages, file_within
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
@@ -53,7 +55,7 @@ class LooseFiles:
         stamps: table with a time for each image, or None.
         rate_hz: of the images, if that was given instead.
         imu: CSV with time, rate x y z [rad/s], specific force x y z [m/s²], or None.
-        rig: one camera; without an IMU its frame is the body frame.
+        rig: its cameras; without an IMU the frame of the first one is the body frame.
     """
 
     stamps: Path | None
@@ -63,7 +65,7 @@ class LooseFiles:
 
 
 def find_files(
-    path: Path, beside: Mapping[str, Sequence[Path]], options: ReaderOptions
+    path: Path, beside: Mapping[str, Sequence[Path]], options: ReaderOptions, cameras: int = 1
 ) -> LooseFiles:
     """Find the files that belong to some images: as named, or where they usually are.
 
@@ -71,6 +73,7 @@ def find_files(
         path: of the images.
         beside: where to look for ``stamps``, ``imu`` and ``calibration`` that are not named.
         options: `sources` names ``stamps`` and ``imu``, or gives ``rate`` in Hz.
+        cameras: that there are images of.
 
     Raises:
         DataError: if there is no calibration, a source is unknown, or its file is not there.
@@ -96,8 +99,17 @@ def find_files(
         stamps=None if rate_hz is not None else files["stamps"],
         rate_hz=rate_hz,
         imu=None if imu is None else ImuFile(imu, _parse_timed_imu),
-        rig=options.select(read_kalibr(chain, needs_imu=imu is not None).select(1)),
+        rig=options.select(_calibrated(chain, imu is not None and options.imu, cameras)),
     )
+
+
+def _calibrated(chain: Path, needs_imu: bool, cameras: int) -> Rig:
+    rig = read_kalibr(chain, needs_imu=needs_imu)
+    if len(rig.cameras) < cameras:
+        raise DataError(
+            f"{chain}: calibrates {len(rig.cameras)} cameras, there are images of {cameras}"
+        )
+    return rig.select(cameras)
 
 
 def is_usable_rate(rate_hz: float) -> bool:
@@ -212,34 +224,48 @@ def _rate(text: str) -> float:
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
-FOLDERS = ("", "images", "data")
+FOLDERS = ("", "images", "data", "rgb", "color")
 """Where the images may be, within the folder of a recording."""
+
+PAIRS = (("left", "right"), ("image_left", "image_right"), ("image_0", "image_1"), ("cam0", "cam1"))
+"""Where those of two cameras may be."""
+
+DEPTH_FOLDER = "depth"
 
 STAMPS = ("timestamps.csv", "timestamps.txt", "times.csv", "times.txt", "data.csv")
 
 
 def is_image_folder(path: Path) -> bool:
     """Whether this is a folder with images."""
-    return path.is_dir() and _find_images(path) is not None
+    return path.is_dir() and bool(_find_images(path))
 
 
-def _find_images(path: Path) -> Path | None:
-    """The folder that the images are in."""
-    for folder in (path / name for name in FOLDERS):
-        if folder.is_dir() and any(file.suffix.lower() in SUFFIXES for file in folder.iterdir()):
-            return folder
-    return None
+def _find_images(path: Path) -> list[Path]:
+    """The folders that the images of each camera are in; none if there are no images."""
+    for pair in PAIRS:
+        if all(_has_images(path / name) for name in pair):
+            return [path / name for name in pair]
+    return [path / name for name in FOLDERS if _has_images(path / name)][:1]
+
+
+def _has_images(folder: Path) -> bool:
+    return folder.is_dir() and any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
 
 
 class ImageFolderSequence(ImageSequence):
-    """Images of one camera in a folder.
+    """Images of one camera in a folder, or of two in a folder each, and depth images if there are.
 
     Their times are in a table (see `loose_files`), whose second column may name the files. Without
     names the times belong to the images in the order of the numbers in their names. Without a table
-    the names of the images must be their times, or a rate must be given.
+    the names of the images must be their times, or a rate must be given. Images of the second
+    camera, and of depth, have the names of those of the first, without their endings, or are as
+    many.
+
+    Depth images are in ``depth``, and the calibration has a key ``depth0``.
 
     Args:
-        path: the folder; the images are in it, or in its ``images`` or ``data``.
+        path: the folder; the images are in it or in its ``images``, ``data``, ``rgb`` or ``color``,
+            those of two cameras in ``left`` and ``right`` or another of `PAIRS`.
         options: what else is asked for. Without `calibration` it is ``calibration.yaml`` in the
             folder; `sources` may name files ``stamps`` and ``imu``, or give a ``rate`` in Hz.
 
@@ -252,28 +278,48 @@ class ImageFolderSequence(ImageSequence):
     def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
         options = options or ReaderOptions()
         self.path = path.resolve()
-        folder = _find_images(path)
-        if folder is None:
+        folders = _find_images(path)
+        if not folders:
             raise DataError(f"{path}: no images ({', '.join(sorted(SUFFIXES))}) in this folder")
         beside = {
             "stamps": [path / name for name in STAMPS],
             "imu": [path / "imu.csv"],
             "calibration": [path / "calibration.yaml"],
         }
-        files = find_files(path, beside, options)
-        images = _list_images(folder, files, options.diagnostics)
-        super().__init__(self.path.name, files.rig, [images], files.imu, options)
+        files = find_files(path, beside, options, len(folders))
+        used = folders[: len(files.rig.cameras)]
+        streams = [_list_images(folder, files, options.diagnostics, used[0]) for folder in used]
+        depth = None
+        if _has_images(path / DEPTH_FOLDER):
+            depth = _depth(path / DEPTH_FOLDER, files, options.diagnostics, used[0])
+        super().__init__(self.path.name, files.rig, streams, files.imu, options, depth=depth)
 
 
-def _list_images(folder: Path, files: LooseFiles, diagnostics: Diagnostics) -> FileImages:
+def _depth(
+    folder: Path, files: LooseFiles, diagnostics: Diagnostics, first: Path
+) -> FileDepth | None:
+    """The depth images, if the calibration says what they mean."""
+    if files.rig.depth is not None:
+        return FileDepth(_list_images(folder, files, diagnostics, first), files.rig)
+    what = f"{folder}: left out, as the calibration has no key 'depth0'"
+    diagnostics.warn("depth_left_out", what)
+    return None
+
+
+def _list_images(
+    folder: Path, files: LooseFiles, diagnostics: Diagnostics, first: Path
+) -> FileImages:
+    """The images in a folder; a table of times may name those in the `first` one."""
     there = sorted(
         (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES), key=_by_number
     )
-    stamps, paths, index = _times(folder, there, files)
+    stamps, paths, index = _times(folder, there, files, first)
     return ordered_images(folder.name, stamps, paths, index, diagnostics)
 
 
-def _times(folder: Path, there: list[Path], files: LooseFiles) -> tuple[IntArray, list[Path], Path]:
+def _times(
+    folder: Path, there: list[Path], files: LooseFiles, first: Path
+) -> tuple[IntArray, list[Path], Path]:
     """Times (N,), the image of each, and where the times are from."""
     if files.rate_hz is not None:
         return regular_stamps(len(there), files.rate_hz), there, folder
@@ -286,6 +332,10 @@ def _times(folder: Path, there: list[Path], files: LooseFiles) -> tuple[IntArray
             )
         return stamps, there, folder
     stamps, names = read_stamps(files.stamps)
+    if all(names) and folder != first:
+        named = {path.stem: path for path in there}
+        rows = [k for k, name in enumerate(names) if Path(name).stem in named]
+        return stamps[rows], [named[Path(names[k]).stem] for k in rows], files.stamps
     if all(names):
         return stamps, [_named(folder, files.stamps, name) for name in names], files.stamps
     if len(stamps) != len(there):

@@ -62,6 +62,7 @@ class TrackRecorder:
         self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
         self._latest_ns: int | None = None
         self._descriptor_bytes: int | None = None
+        self._depth_camera = None if rig.depth is None else rig.depth.camera
         self._record = layout.frame_record(len(rig.cameras))
 
     def __enter__(self) -> Self:
@@ -72,6 +73,8 @@ class TrackRecorder:
                 self._frames = self._open(layout.FRAMES)
                 self._features = self._open(layout.FEATURES)
                 self._imu = self._open(layout.IMU)
+                if self._depth_camera is not None:
+                    self._depths = self._open(layout.DEPTHS)
         except BaseException as error:
             self.__exit__(type(error), error, None)
             raise
@@ -129,6 +132,8 @@ class TrackRecorder:
         self._frames.write(row.tobytes())
         for seen in frame.cameras:
             self._features.write(_pack(seen).tobytes())
+        if self._depth_camera is not None:
+            self._depths.write(_pack_depth(frame.cameras[self._depth_camera]).tobytes())
         self._counts["frames"] += 1
         self._counts["imu_samples"] += len(imu)
         self._counts["features"] += sum(len(seen) for seen in frame.cameras)
@@ -164,6 +169,8 @@ class TrackRecorder:
             **self._counts,
             "descriptor_bytes": self._descriptor_bytes or 0,
         }
+        if self._depth_camera is not None:
+            meta["depth_camera"] = self._depth_camera
         write_kalibr(self.rig, self._folder / layout.CALIBRATION)
         if self._groundtruth is not None:
             layout.save_trajectory(self._folder / layout.GROUNDTRUTH, self._groundtruth)
@@ -179,4 +186,11 @@ class TrackRecorder:
 def _pack(seen: FeatureObservations) -> NDArray[np.void]:
     rows = np.empty(len(seen), layout.FEATURE_RECORD)
     rows["id"], rows["pixel"], rows["normalized"] = seen.ids, seen.pixels, seen.normalized
+    return rows
+
+
+def _pack_depth(seen: FeatureObservations) -> NDArray[np.void]:
+    rows = np.full(len(seen), np.nan, layout.DEPTH_RECORD)
+    if seen.depth_m is not None and seen.depth_sigma_m is not None:
+        rows["depth"], rows["sigma"] = seen.depth_m, seen.depth_sigma_m
     return rows

@@ -13,6 +13,8 @@ writes recordings. All numbers are little-endian, and no file is a pickle:
   number of features of each camera;
 - ``features.bin``: for each feature `id` (int64), `pixel` and `normalized` (two float64 each),
   ordered by frame, then camera, then as in the `FeatureFrame`;
+- ``depths.bin``, where the depth of features is measured (`depth_camera` of ``meta.yaml``): for
+  each feature of that camera, in the same order, `depth` and `sigma` (float64 each, NaN for none);
 - ``descriptors.bin``, where features have any: for each feature of the first camera, in the same
   order, `descriptor_bytes` of ``meta.yaml`` bytes (0 or missing if there are none);
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
@@ -55,11 +57,12 @@ FORMAT_VERSION = 1
 
 META, CALIBRATION = "meta.yaml", "calibration.yaml"
 FRAMES, FEATURES, IMU = "frames.bin", "features.bin", "imu.bin"
-DESCRIPTORS = "descriptors.bin"
+DESCRIPTORS, DEPTHS = "descriptors.bin", "depths.bin"
 GROUNDTRUTH, INITIAL_STATE = "groundtruth.npz", "initial_state.npz"
 
 IMU_RECORD = np.dtype([("stamp", "<i8"), ("gyro", "<f8", (3,)), ("accel", "<f8", (3,))])
 FEATURE_RECORD = np.dtype([("id", "<i8"), ("pixel", "<f8", (2,)), ("normalized", "<f8", (2,))])
+DEPTH_RECORD = np.dtype([("depth", "<f8"), ("sigma", "<f8")])
 
 
 _Shape = tuple[int | Literal["N"], ...]
@@ -230,7 +233,8 @@ class TrackRecordingSequence(RecordedSequence):
         recorded = read_kalibr(path / CALIBRATION)
         chain = options.calibration
         self._recalibrated = chain is not None
-        rig = options.select(recorded if chain is None else read_kalibr(chain))
+        rig = recorded if chain is None else read_kalibr(chain, needs_imu=recorded.has_imu)
+        rig = replace(options.select(rig), has_imu=recorded.has_imu)
         truth = path / GROUNDTRUTH
         own = partial(load_trajectory, truth) if truth.is_file() else None
         super().__init__(path.resolve().name, rig, options, own)
@@ -243,11 +247,17 @@ class TrackRecordingSequence(RecordedSequence):
             raise DataError(f"{path}: has {self._cameras} cameras, fewer than the calibration")
         width = meta.get("descriptor_bytes")
         self._descriptor_bytes = 0 if width is None else _whole(width)
+        depth_camera = meta.get("depth_camera")
+        most = self._cameras - 1
+        self._depth_camera = None if depth_camera is None else _whole(depth_camera, 0, most)
         self._record = frame_record(self._cameras)
         self._check_sizes(counts)
         self._index = np.fromfile(path / FRAMES, self._record)
         self._check_index(counts["features"])
         self._check_descriptors()
+        if self._depth_camera is not None:
+            features = int(self._index["counts"][:, self._depth_camera].sum())
+            self._check_size(DEPTHS, features * DEPTH_RECORD.itemsize)
 
     def measure(self) -> SequenceInfo:
         """How much was recorded."""
@@ -277,6 +287,7 @@ class TrackRecordingSequence(RecordedSequence):
             file = files.enter_context((self.path / FEATURES).open("rb"))
             file.seek(int(before.sum()) * size)
             descriptors_file = self._open_descriptors(files, int(before[:, 0].sum()))
+            depths_file = self._open_depths(files, before)
             for row in self._index[wanted[0] : wanted[-1] + 1]:
                 counts = row["counts"].tolist()
                 features = np.frombuffer(file.read(sum(counts) * size), FEATURE_RECORD)
@@ -291,6 +302,11 @@ class TrackRecordingSequence(RecordedSequence):
                     )
                     descriptors = rows.reshape(counts[0], self._descriptor_bytes)
                     observed[0] = replace(observed[0], descriptors=descriptors)
+                if depths_file is not None and self._depth_camera is not None:
+                    measured = depths_file.read(counts[self._depth_camera] * DEPTH_RECORD.itemsize)
+                    if self._depth_camera < len(observed):
+                        seen = observed[self._depth_camera]
+                        observed[self._depth_camera] = self._with_depth(seen, measured)
                 yield FeatureFrame(int(row["stamp"]), tuple(observed))
 
     def initial_state(self) -> NavState | None:
@@ -307,6 +323,23 @@ class TrackRecordingSequence(RecordedSequence):
         if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
             raise DataError(f"{self.path / FEATURES}: a feature is not finite; {_AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
+
+    def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:
+        rows = np.frombuffer(data, DEPTH_RECORD)
+        depth, sigma = (np.ascontiguousarray(rows[name]) for name in ("depth", "sigma"))
+        known = ~np.isnan(depth)
+        usable = (depth[known] > 0.0) & np.isfinite(depth[known]) & (sigma[known] > 0.0)
+        if not (usable.all() and np.isfinite(sigma[known]).all()):
+            raise DataError(f"{self.path / DEPTHS}: a depth or its sigma is not positive; {_AGAIN}")
+        return replace(seen, depth_m=depth, depth_sigma_m=sigma)
+
+    def _open_depths(self, files: ExitStack, before: NDArray[np.int64]) -> BinaryIO | None:
+        """The file of depths, positioned after frames with `before` (F, cameras) features."""
+        if self._depth_camera is None:
+            return None
+        file = files.enter_context((self.path / DEPTHS).open("rb"))
+        file.seek(int(before[:, self._depth_camera].sum()) * DEPTH_RECORD.itemsize)
+        return file
 
     def _open_descriptors(self, files: ExitStack, first: int) -> BinaryIO | None:
         """The file of descriptors, positioned at feature `first`; None where there are none."""

@@ -1,21 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""TUM RGB-D: colour images of a Kinect with motion capture, without an IMU.
+"""TUM RGB-D: colour and depth images of a Kinect with motion capture, without an IMU.
 
 Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. ``rgb.txt`` lists
 time [s] and file of the images, ``groundtruth.txt`` the poses of the colour camera's optical frame.
-``depth.txt`` and the depth images are not read, nor is ``accelerometer.txt``, which is of no use
-without a gyroscope.
+``depth.txt`` lists the depth images, of 16 bits with 5000 units to a metre, which the driver of the
+sensor has registered to the colour images as they are, with their distortion. They are read if they
+are there. ``accelerometer.txt`` is not, as it is of no use without a gyroscope.
 
-The images are undistorted with the published calibration as they are read, because it has five
-coefficients of Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera` knows. `rectifier`
-does the same for KITTI's unsynchronised images.
+The images, those of depth too, are undistorted with the published calibration as they are read,
+because it has five coefficients of Brown's distortion (k1, k2, p1, p2, k3), one more than `Camera`
+knows. `rectifier` does the same for KITTI's unsynchronised images.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,11 +32,12 @@ from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import read_rows, stamp_from_seconds
+from slam_graph.datasets.streams.depth_images import DepthProcess, FileDepth
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import FileImages, Image, file_within
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera, Rig, RigCamera
+from slam_graph.sensors import Camera, DepthSensor, Rig, RigCamera
 
 Size = tuple[int, int]
 
@@ -82,13 +85,17 @@ CAMERAS = {
 freiburg1 to freiburg3; the images of the third come undistorted."""
 
 
+UNITS_PER_METRE = 5000.0
+"""Of the depth images."""
+
+
 def is_tum_rgbd(path: Path) -> bool:
     """Whether this is the folder of a sequence."""
     return (path / "rgb.txt").is_file() and (path / "rgb").is_dir()
 
 
 class TumRgbdSequence(ImageSequence):
-    """A sequence of TUM RGB-D, its colour images in grey; the body frame is the camera's.
+    """A sequence of TUM RGB-D, its colour images in grey, with depth; the body is the camera.
 
     Args:
         path: the folder with ``rgb.txt``.
@@ -104,11 +111,14 @@ class TumRgbdSequence(ImageSequence):
     def __init__(self, path: Path, options: ReaderOptions | None = None) -> None:
         options = options or ReaderOptions()
         self.path = path.resolve()
-        images = _list_images(path, options.diagnostics)
+        images = _list_images(path, "rgb", options.diagnostics)
         if options.calibration is not None:
-            rig = read_kalibr(options.calibration, needs_imu=False).select(1)
+            rig, process = read_kalibr(options.calibration, needs_imu=False).select(1), None
         else:
-            rig = _known_rig(self.path, images)
+            rig, process = _known_rig(self.path, images)
+        rig, depth = replace(rig, depth=rig.depth or DepthSensor.kinect(UNITS_PER_METRE)), None
+        if (path / "depth.txt").is_file():
+            depth = FileDepth(_list_images(path, "depth", options.diagnostics), rig, process)
         truth = path / "groundtruth.txt"
         super().__init__(
             self.path.name,
@@ -117,11 +127,16 @@ class TumRgbdSequence(ImageSequence):
             None,
             options,
             truth if truth.is_file() else None,
+            depth=depth,
         )
 
 
-def _known_rig(path: Path, images: FileImages) -> Rig:
-    """The published calibration; the images are undistorted with it as they are read."""
+def _known_rig(path: Path, images: FileImages) -> tuple[Rig, DepthProcess | None]:
+    """The published calibration; the images are undistorted with it as they are read.
+
+    Returns:
+        The rig, and what undistorts depth images; None where they are not distorted.
+    """
     found = re.search(r"freiburg([123])|fr([123])(?!\d)", path.name)
     if found is None:
         raise DataError(
@@ -130,16 +145,25 @@ def _known_rig(path: Path, images: FileImages) -> Rig:
         )
     fx, fy, cx, cy, coefficients = CAMERAS[found[1] or found[2]]
     camera = Camera(fx, fy, cx, cy, "none", (), *SIZE)
+    depth: DepthProcess | None = None
     if any(coefficients):
-        K = camera.K
-        images.process = rectifier(K, np.array(coefficients), np.eye(3), K, SIZE, SIZE)
-    return Rig((RigCamera(camera, gtsam.Pose3(), 0.0, images.name),))
+        K, D = camera.K, np.array(coefficients)
+        images.process = rectifier(K, D, np.eye(3), K, SIZE, SIZE)
+        u, v = cv2.initUndistortRectifyMap(K, D, np.eye(3), K, SIZE, cv2.CV_32FC1)
+        depth = partial(_nearest, u, v)
+    return Rig((RigCamera(camera, gtsam.Pose3(), 0.0, images.name),)), depth
 
 
-def _list_images(path: Path, diagnostics: Diagnostics) -> FileImages:
+def _nearest(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any]) -> NDArray[Any]:
+    """The depth of the nearest pixel; between two surfaces there is none to interpolate."""
+    return depth if depth.shape != u.shape else cv2.remap(depth, u, v, cv2.INTER_NEAREST)
+
+
+def _list_images(path: Path, kind: str, diagnostics: Diagnostics) -> FileImages:
+    table = path / f"{kind}.txt"
     stamps: list[int] = []
     files: list[Path] = []
-    for rows in read_rows(path / "rgb.txt"):
+    for rows in read_rows(table):
         for k, line in enumerate(rows.lines):
             stamp, _, name = line.strip().partition(" ")
             if not name:
@@ -147,5 +171,5 @@ def _list_images(path: Path, diagnostics: Diagnostics) -> FileImages:
             stamps.append(stamp_from_seconds(stamp, rows, k))
             files.append(file_within(path, name.strip(), rows.where(k)))
     if not stamps:
-        raise DataError(f"{path / 'rgb.txt'}: no images listed in this file")
-    return ordered_images("rgb", np.array(stamps, np.int64), files, path / "rgb.txt", diagnostics)
+        raise DataError(f"{table}: no images listed in this file")
+    return ordered_images(kind, np.array(stamps, np.int64), files, table, diagnostics)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -130,7 +131,8 @@ class VideoSequence(GroupedSequence):
                 "calibration": [path.with_suffix(".yaml")],
             }
             files = find_files(path, beside, options)
-            super().__init__(path.stem, files.rig, ["video"], files.imu, options)
+            rig = replace(files.rig, has_imu=files.imu is not None, depth=None)
+            super().__init__(path.stem, rig, ["video"], files.imu, options)
             rate_hz = files.rate_hz if files.rate_hz is not None else video.rate_hz
             count = video.count if video.count is not None else _count_frames(path)
             looked_at = [video.read(k) for k in range(LOOKED_AT)]

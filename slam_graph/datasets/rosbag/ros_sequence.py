@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
+from slam_graph.datasets.rosbag.ros_depth import depth_of, find_depth
 from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions, SequenceInfo
+from slam_graph.datasets.streams.depth_images import DepthFinish, Metres, nearest_in_time
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     STEREO_TOLERANCE_S,
@@ -36,35 +38,43 @@ from slam_graph.sensors import ImuData, ImuNoise
 
 SAMPLES_PER_BLOCK = 256
 
+_Result = Image | tuple[int, Metres] | Fault | None
+"""An image, or the stamp and the image of depth, or what is wrong with one."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Index:
     """The images of a bag by their stamps.
 
     Attributes:
-        received_ns: for each camera the times at which all its messages were recorded.
+        received_ns: for each camera the times at which all its messages were recorded; those of
+            depth come last.
         kept: for each camera which of its messages are used: those in the order of time.
         groups: frames, with indices into `kept`.
+        depth_frames: the frame of each message of depth that is in one, by its number.
+        depth_stamps_ns: of these messages.
         imu_samples: number of messages of the IMU.
     """
 
     received_ns: list[NDArray[np.int64]]
     kept: list[NDArray[np.intp]]
     groups: Groups
+    depth_frames: dict[int, int]
+    depth_stamps_ns: dict[int, int]
     imu_samples: int
 
     def frame_of(self) -> list[dict[int, int]]:
-        """For each camera the frame of each message that is in one."""
+        """For each camera, and for depth, the frame of each message that is in one."""
         frames: list[dict[int, int]] = [{} for _ in self.kept]
         for frame, members in enumerate(self.groups.members.tolist()):
             for camera, member in enumerate(members):
                 if member != ABSENT:
                     frames[camera][int(self.kept[camera][member])] = frame
-        return frames
+        return [*frames, self.depth_frames]
 
 
 class RosBagSequence(GroupedSequence):
-    """A bag with images and an IMU.
+    """A bag with images, and with an IMU or depth or both.
 
     The whole bag is read once for its stamps before the first frame is delivered. Messages without
     a stamp get the time at which they were recorded (`stamp_missing`). A damaged bag is used up to
@@ -73,8 +83,8 @@ class RosBagSequence(GroupedSequence):
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or the folder of a ROS 2 bag.
         options: what else is asked for. Without a calibration `CameraInfo` and ``/tf_static`` are
-            used; `sources` are topics by ``imu``, ``cam0``, … and ``groundtruth`` (poses of the
-            body).
+            used; `sources` are topics by ``imu``, ``cam0``, …, ``depth`` and ``groundtruth`` (poses
+            of the body).
 
     Raises:
         DataError: if a topic or the calibration is missing, or the bag cannot be read.
@@ -91,7 +101,9 @@ class RosBagSequence(GroupedSequence):
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
         unknown = ImuNoise()
         if chain is not None:
-            rig = read_kalibr(chain, fallback=unknown, needs_imu=topics.imu is not None)
+            rig = read_kalibr(
+                chain, fallback=unknown, needs_imu=topics.imu is not None and options.imu
+            )
         else:
             count = len(topics.cameras) if cameras is None else cameras
             used = replace(topics, cameras=topics.cameras[:count])
@@ -107,14 +119,31 @@ class RosBagSequence(GroupedSequence):
                 f"{path}: {len(rig.cameras)} cameras are calibrated, images are on "
                 f"{', '.join(topics.cameras)}; choose with --topic cam0=…"
             )
-        rig = options.select(rig)
+        rig = replace(options.select(rig), has_imu=topics.imu is not None)
         self._cameras = topics.cameras[: len(rig.cameras)]
+        with self._bag.kept_open():
+            self._depth_topic, rig = find_depth(self._bag, topics, rig, options.diagnostics)
         truth = None if topics.groundtruth is None else self._read_poses
         super().__init__(path.stem, rig, self._cameras, None, options, truth)
-        self.has_imu = topics.imu is not None
         with self._bag.kept_open():
             for k, topic in enumerate(self._cameras):
                 self._check_first_images(topic, k)
+            self._finish_depth = None if rig.depth is None else DepthFinish.of(rig)
+            self._check_first_depth()
+
+    @property
+    def _topics(self) -> list[str]:
+        """Those of the cameras, and that of depth."""
+        return [*self._cameras, *([] if self._depth_topic is None else [self._depth_topic])]
+
+    @cached_property
+    def _with_depth(self) -> set[int]:
+        """The frames that have a depth image."""
+        return set(self._index.depth_frames.values())
+
+    def depth_frames(self) -> int:
+        """Number of frames with a depth image."""
+        return len(self._with_depth)
 
     @property
     def groups(self) -> Groups:
@@ -152,20 +181,26 @@ class RosBagSequence(GroupedSequence):
         wanted = self._range(start_ns, end_ns)
         waiting = {frame: self._members(frame) for frame in wanted}
         images: dict[int, list[Image | Fault | None]] = {}
+        depths: dict[int, tuple[int, Metres] | Fault | None] = {}
         following = iter(wanted)
         current = next(following, None)
         with closing(prefetch(self._jobs(wanted))) as results:
-            for frame, camera, image in results:
-                images.setdefault(frame, [None] * len(self._cameras))[camera] = image
+            for frame, camera, result in results:
+                seen = images.setdefault(frame, [None] * len(self._cameras))
+                if isinstance(result, tuple) or camera == len(seen):
+                    depths[frame] = result if isinstance(result, tuple | Fault) else None
+                else:
+                    seen[camera] = result
                 waiting[frame] -= 1
                 while current is not None and waiting[current] == 0:
-                    yield self._report(current, images.pop(current))
+                    yield self._report(current, images.pop(current), depths.pop(current, None))
                     current = next(following, None)
 
     def _members(self, frame: int) -> int:
-        return int(np.count_nonzero(self.groups.members[frame] != ABSENT))
+        of_cameras = int(np.count_nonzero(self.groups.members[frame] != ABSENT))
+        return of_cameras + (frame in self._with_depth)
 
-    def _jobs(self, wanted: range) -> Iterator[Callable[[], tuple[int, int, Image | Fault | None]]]:
+    def _jobs(self, wanted: range) -> Iterator[Callable[[], tuple[int, int, _Result]]]:
         """What decodes each image of the wanted frames."""
         if not wanted:
             return
@@ -178,19 +213,42 @@ class RosBagSequence(GroupedSequence):
         ]
         since_ns, until_ns = min(times), max(times)
         passed = [int(np.count_nonzero(received < since_ns)) for received in index.received_ns]
-        with closing(self._bag.messages(self._cameras, since_ns, until_ns)) as messages:
+        with closing(self._bag.messages(self._topics, since_ns, until_ns)) as messages:
             for message in messages:
-                camera = self._cameras.index(message.topic)
-                frame = frame_of[camera].get(passed[camera])
+                camera = self._topics.index(message.topic)
+                number = passed[camera]
+                frame = frame_of[camera].get(number)
                 passed[camera] += 1
-                if frame is not None and frame in wanted:
+                if frame is None or frame not in wanted:
+                    continue
+                if camera == len(self._cameras):
+                    stamp_ns = index.depth_stamps_ns[number]
+                    yield partial(self._decode_depth, frame, stamp_ns, message)
+                else:
                     yield partial(self._decode, frame, camera, message)
 
-    def _decode(
-        self, frame: int, camera: int, message: Message
-    ) -> tuple[int, int, Image | Fault | None]:
+    def _decode(self, frame: int, camera: int, message: Message) -> tuple[int, int, _Result]:
         """An image with its frame and camera; runs in a thread, so it counts no faults."""
         return frame, camera, self._read(message, camera) if self.decode else None
+
+    def _decode_depth(
+        self, frame: int, stamp_ns: int, message: Message
+    ) -> tuple[int, int, _Result]:
+        """The same for a depth image."""
+        if not self.decode:
+            return frame, len(self._cameras), None
+        metres = self._depth(message)
+        done = metres if isinstance(metres, Fault) else (stamp_ns, metres)
+        return frame, len(self._cameras), done
+
+    def _depth(self, message: Message) -> Metres | Fault:
+        where = self._where(message)
+        try:
+            raw = depth_of(message.decode(), where)
+        except DataError as error:
+            return Fault("depth_unreadable", str(error))
+        assert self._finish_depth is not None
+        return raw if isinstance(raw, Fault) else self._finish_depth(raw, where)
 
     def _read(self, message: Message, camera: int) -> Image | Fault:
         model = self.rig.cameras[camera].camera
@@ -206,6 +264,16 @@ class RosBagSequence(GroupedSequence):
         if len(faults) == len(images) and "unknown encoding" in faults[0].message:
             raise DataError(faults[0].message)
         require_size(images, self.rig.cameras[camera].camera, topic)
+
+    def _check_first_depth(self) -> None:
+        """Refuse depth of another size than calibrated, or of an encoding that is not known."""
+        if self._depth_topic is None:
+            return
+        with closing(self._bag.messages([self._depth_topic])) as messages:
+            first = [self._depth(message) for message in islice(messages, LOOKED_AT)]
+        faults = [image for image in first if isinstance(image, Fault)]
+        if first and len(faults) == len(first):
+            raise DataError(f"{faults[0].message}; give --calibration with the key 'depth0'")
 
     def _image(self, message: Message) -> Image | Fault:
         try:
@@ -223,22 +291,32 @@ class RosBagSequence(GroupedSequence):
     @cached_property
     def _index(self) -> _Index:
         """The stamps of all images, from one pass over the bag."""
-        received: list[list[int]] = [[] for _ in self._cameras]
-        stamps: list[list[int]] = [[] for _ in self._cameras]
+        received: list[list[int]] = [[] for _ in range(len(self._cameras) + 1)]
+        stamps: list[list[int]] = [[] for _ in range(len(self._cameras) + 1)]
         samples = 0
         inertial = [] if self._imu_topic is None else [self._imu_topic]
-        for message in self._until_damage([*self._cameras, *inertial]):
+        for message in self._until_damage([*self._topics, *inertial]):
             if message.topic == self._imu_topic:
                 samples += 1
                 continue
-            camera = self._cameras.index(message.topic)
+            camera = self._topics.index(message.topic)
             received[camera].append(message.received_ns)
             stamps[camera].append(self._stamp_ns(message))
-        all_stamps = [np.array(column, np.int64) for column in stamps]
+        *all_stamps, depth_ns = [np.array(column, np.int64) for column in stamps]
         kept = [self._in_order(*camera) for camera in zip(self._cameras, all_stamps, strict=True)]
         used = [column[rows] for column, rows in zip(all_stamps, kept, strict=True)]
         groups = self._group(used, STEREO_TOLERANCE_S)
-        return _Index([np.array(column, np.int64) for column in received], kept, groups, samples)
+        rows = self._in_order(self._depth_topic or "", depth_ns)
+        nearest = nearest_in_time(groups.stamps_ns, depth_ns[rows]).tolist()
+        depth_frames = {int(rows[k]): f for f, k in enumerate(nearest) if k != ABSENT}
+        return _Index(
+            [np.array(column, np.int64) for column in received],
+            kept,
+            groups,
+            depth_frames,
+            {number: int(depth_ns[number]) for number in depth_frames},
+            samples,
+        )
 
     def _in_order(self, topic: str, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
         """The images of a camera whose stamps increase; the others are counted."""

@@ -17,6 +17,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import yaml
 
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag
@@ -40,11 +41,13 @@ class Topics:
         imu: topic of the IMU, None where there is none.
         cameras: topic of each camera.
         groundtruth: topic of poses, None where none was named.
+        depth: topic of depth, None where none was named.
     """
 
     imu: str | None
     cameras: tuple[str, ...]
     groundtruth: str | None
+    depth: str | None = None
 
 
 def find_topics(bag: Bag, named: Mapping[str, str], calibration: Path | None) -> Topics:
@@ -52,31 +55,33 @@ def find_topics(bag: Bag, named: Mapping[str, str], calibration: Path | None) ->
 
     Args:
         bag: the bag.
-        named: topics by ``imu``, ``cam0``, ``cam1``, … and ``groundtruth``.
+        named: topics by ``imu``, ``cam0``, ``cam1``, …, ``depth`` and ``groundtruth``.
         calibration: a Kalibr camera chain, whose keys ``rostopic`` are used where nothing is named.
 
     Raises:
         DataError: if a topic is missing or of another type, or several could be meant.
     """
-    unknown = [key for key in named if not re.fullmatch(r"imu|groundtruth|cam\d+", key)]
+    unknown = [key for key in named if not re.fullmatch(r"imu|groundtruth|depth|cam\d+", key)]
     if unknown:
-        raise DataError(f"unknown sensor '{unknown[0]}'; known: imu, cam0, cam1, …, groundtruth")
+        raise DataError(
+            f"unknown sensor '{unknown[0]}'; known: imu, cam0, cam1, …, depth, groundtruth"
+        )
     recorded = _recorded_topics(calibration) if calibration is not None else {}
     known = {key: topic for key, topic in recorded.items() if topic in bag.topics} | dict(named)
     truth = known.get("groundtruth")
     if truth is not None:
         _require(bag, truth, tuple(POSES))
-    return Topics(_find_imu(bag, known), _find_cameras(bag, known), truth)
+    return Topics(_find_imu(bag, known), _find_cameras(bag, known), truth, known.get("depth"))
 
 
 def _recorded_topics(calibration: Path) -> dict[str, str]:
     """The keys ``rostopic`` of a Kalibr file, by sensor."""
     topics = {}
     for name, value in read_yaml(calibration).items():
-        if re.fullmatch(r"imu0|cam\d+", name):
+        if re.fullmatch(r"imu0|depth0|cam\d+", name) and isinstance(value.node, yaml.MappingNode):
             topic: YamlValue | None = value.get("rostopic")
             if topic is not None:
-                topics["imu" if name == "imu0" else name] = topic.text()
+                topics[name[:-1] if name in ("imu0", "depth0") else name] = topic.text()
     return topics
 
 
@@ -140,6 +145,30 @@ def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
         body_T_camera = _path(bag, transforms, body, str(info.header.frame_id))
         mounted.append(RigCamera(camera, body_T_camera, 0.0, f"cam{k}"))
     return Rig(tuple(mounted), noise)
+
+
+def frame_of(bag: Bag, topic: str) -> str:
+    """The frame of the messages on a topic."""
+    return _plain(str(_first(bag, topic).header.frame_id))
+
+
+def own_camera(bag: Bag, topic: str) -> Camera:
+    """The intrinsics in the `CameraInfo` beside a topic of images.
+
+    Raises:
+        DataError: if there is none, or it cannot be used.
+    """
+    info = _info(bag, topic)
+    return _camera(bag, info, rectified="rect" in topic.rpartition("/")[2])
+
+
+def path_between(bag: Bag, begin: str, end: str) -> gtsam.Pose3:
+    """begin_T_end of two frames, along ``/tf_static``.
+
+    Raises:
+        DataError: if it does not connect them.
+    """
+    return _path(bag, _static_transforms(bag), begin, end)
 
 
 def _first(bag: Bag, topic: str) -> Any:
@@ -217,8 +246,8 @@ def _path(
                 queue.append(other)
     if end not in reached:
         raise DataError(
-            f"{bag.path}: {_STATIC_TOPIC} does not connect the IMU ('{begin}') with the camera "
-            f"('{end}'); give --calibration"
+            f"{bag.path}: {_STATIC_TOPIC} does not connect '{begin}' (IMU or camera) with the "
+            f"camera ('{end}'); give --calibration"
         )
     return reached[end]
 

@@ -8,6 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
@@ -20,6 +21,12 @@ from slam_graph.datasets.sequence import (
     ReaderOptions,
     RecordedSequence,
     SequenceInfo,
+)
+from slam_graph.datasets.streams.depth_images import (
+    DepthStream,
+    Metres,
+    nearest_in_time,
+    require_depth_size,
 )
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.imu_stream import ImuSource
@@ -92,7 +99,6 @@ class GroupedSequence(RecordedSequence):
     ) -> None:
         super().__init__(name, rig, options, own_groundtruth)
         self.decode = True
-        self.has_imu = imu is not None
         self._imu = imu
         self._camera_names = camera_names
 
@@ -109,16 +115,19 @@ class GroupedSequence(RecordedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
-        return iter(()) if self._imu is None else self._imu.blocks(self.diagnostics, after_ns)
+        if self._imu is None or not self.has_imu:
+            return iter(())
+        return self._imu.blocks(self.diagnostics, after_ns)
 
     def measure(self) -> SequenceInfo:
         """Count frames and IMU samples."""
-        samples = 0 if self._imu is None else self._imu.count()
+        used = self._imu if self.has_imu else None
+        samples = 0 if used is None else used.count()
         stamps = self.groups.stamps_ns
         if len(stamps):
             return self.holding(len(stamps), int(stamps[0]), int(stamps[-1]), samples)
-        assert self._imu is not None
-        return self.holding(0, *self._imu.ends_ns(), samples)
+        assert used is not None
+        return self.holding(0, *used.ends_ns(), samples)
 
     def _range(self, start_ns: int | None, end_ns: int | None) -> range:
         """The frames within [start_ns, end_ns]."""
@@ -133,7 +142,12 @@ class GroupedSequence(RecordedSequence):
             self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
         return groups
 
-    def _report(self, index: int, images: Sequence[Image | Fault | None]) -> CameraFrame:
+    def _report(
+        self,
+        index: int,
+        images: Sequence[Image | Fault | None],
+        depth: tuple[int, Metres] | Fault | None = None,
+    ) -> CameraFrame:
         """Count what is wrong with a frame, and deliver the rest of it."""
         stamp_ns = int(self.groups.stamps_ns[index])
         for camera, member in enumerate(self.groups.members[index].tolist()):
@@ -143,7 +157,12 @@ class GroupedSequence(RecordedSequence):
                 self.diagnostics.warn("camera_frame_missing", f"{name} has no image at {stamp_ns}")
             elif isinstance(image, Fault):
                 self.diagnostics.warn(image.kind, image.message)
-        return CameraFrame(stamp_ns, tuple(None if isinstance(i, Fault) else i for i in images))
+        if isinstance(depth, Fault):
+            self.diagnostics.warn(depth.kind, depth.message)
+            depth = None
+        good = tuple(None if isinstance(image, Fault) else image for image in images)
+        depth_ns, metres = (None, None) if depth is None else depth
+        return CameraFrame(stamp_ns, good, metres, depth_ns)
 
 
 class ImageSequence(GroupedSequence):
@@ -157,6 +176,7 @@ class ImageSequence(GroupedSequence):
         options: what was asked for.
         own_groundtruth: as for `RecordedSequence`.
         stereo_tolerance_s: largest time difference of images that are one frame.
+        depth: the depth images of the rig's depth sensor; None where there are none.
 
     Raises:
         DataError: if there are neither images nor an IMU, or the calibration is for images of
@@ -172,7 +192,14 @@ class ImageSequence(GroupedSequence):
         options: ReaderOptions,
         own_groundtruth: Path | Callable[[], Trajectory] | None = None,
         stereo_tolerance_s: float = STEREO_TOLERANCE_S,
+        depth: DepthStream | None = None,
     ) -> None:
+        rig = replace(
+            rig,
+            has_imu=rig.has_imu and imu is not None,
+            depth=None if depth is None else rig.depth,
+        )
+        depth = None if rig.depth is None else depth
         super().__init__(name, rig, [s.name for s in streams], imu, options, own_groundtruth)
         self._streams = streams
         for mounted, stream in zip(rig.cameras, streams, strict=True):
@@ -180,23 +207,33 @@ class ImageSequence(GroupedSequence):
             images = (stream.read(k) for k in range(count))
             require_size(images, mounted.camera, stream.name)
         self._groups = self._group([s.stamps_ns for s in streams], stereo_tolerance_s)
-        if imu is None and len(self._groups.stamps_ns) == 0:
+        if not self.has_imu and len(self._groups.stamps_ns) == 0:
             raise DataError(f"{name}: neither images nor an IMU in this recording")
+        self._depth = depth
+        if depth is not None:
+            require_depth_size(depth, LOOKED_AT)
+            self._depth_of_frame = nearest_in_time(self._groups.stamps_ns, depth.stamps_ns)
 
     @property
     def groups(self) -> Groups:
         """Which images belong together."""
         return self._groups
 
+    def depth_frames(self) -> int:
+        """Number of frames with a depth image."""
+        return 0 if self._depth is None else int(np.sum(self._depth_of_frame != ABSENT))
+
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """Frames with their images, the next ones decoded in a thread."""
         wanted = self._range(start_ns, end_ns)
         jobs = (partial(self._read_frame, k) for k in wanted)
         with closing(prefetch(jobs)) as results:
-            for k, images in zip(wanted, results, strict=True):
-                yield self._report(k, images)
+            for k, (images, depth) in zip(wanted, results, strict=True):
+                yield self._report(k, images, depth)
 
-    def _read_frame(self, index: int) -> list[Image | Fault | None]:
+    def _read_frame(
+        self, index: int
+    ) -> tuple[list[Image | Fault | None], tuple[int, Metres] | Fault | None]:
         """The images of one frame; runs in a thread, so it counts no faults."""
         images: list[Image | Fault | None] = []
         for camera, member in enumerate(self._groups.members[index].tolist()):
@@ -206,7 +243,18 @@ class ImageSequence(GroupedSequence):
                 images.append(self._read_image(camera, member))
             else:
                 images.append(self._streams[camera].missing(member))
-        return images
+        return images, self._read_depth(index)
+
+    def _read_depth(self, index: int) -> tuple[int, Metres] | Fault | None:
+        """The depth image nearest in time to a frame, after its stamp."""
+        if self._depth is None or (member := int(self._depth_of_frame[index])) == ABSENT:
+            return None
+        if not self.decode:
+            return self._depth.missing(member)
+        metres = self._depth.read(member)
+        if isinstance(metres, Fault):
+            return metres
+        return int(self._depth.stamps_ns[member]), metres
 
     def _read_image(self, camera: int, member: int) -> Image | Fault:
         stream, model = self._streams[camera], self.rig.cameras[camera].camera

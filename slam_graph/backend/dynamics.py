@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The dynamics as a policy: what predicts the state of the next frame.
+
+`imu` preintegrates gyroscope and accelerometer. `constant_velocity` takes linear and angular
+acceleration for white noise: the velocity keeps its direction in the world, the angular rate ω its
+direction in the body. Its state has the same variables. The rate stands in the place of the bias of
+the gyroscope, as -ω, because the model is that of an IMU that measures nothing in a world without
+gravity: the noise of such an accelerometer is the acceleration, the random walk of such a
+gyroscope's bias is the angular acceleration. So preintegration, the factor between frames, the
+noise that is learned on the way, every algorithm and the final adjustment are the same for both.
+
+Without an accelerometer nothing tells where down is: the world is the first camera's, and position
+and all of the rotation are what the measurements do not observe.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig, DynamicsConfig
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.errors import ConfigError
+from slam_graph.geometry import NavState
+from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, Rig
+
+_STEPS = 16
+"""Steps of integration from frame to frame: variances of the rotation are exact to 9 %."""
+_NOTHING = 1e-6
+"""Noise densities that the model does not have; preintegration wants them positive."""
+_NO_GAP_S = 1e9
+"""No time between frames is a gap in the samples of the model."""
+_ANGULAR_RATE_SIGMA = 3.0
+"""Standard deviation of the angular rate of a given state, which does not have it, rad/s."""
+_STATE_FEATURE_FRAMES = 2
+"""Features enter the state when so many frames have seen them: without an IMU they are what holds
+the pose from frame to frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """The problem as the engine solves it, under the dynamics that were chosen.
+
+    Attributes:
+        rig: the sensors; without an IMU its `imu` is the noise of the model.
+        algorithm: the policies.
+        config: settings that do not depend on the algorithm.
+    """
+
+    rig: Rig
+    algorithm: AlgorithmConfig
+    config: BackendConfig
+
+    @staticmethod
+    def of(rig: Rig, algorithm: AlgorithmConfig, config: BackendConfig) -> Dynamics:
+        """The dynamics of `backend.dynamics.model`.
+
+        Raises:
+            ConfigError: if they want an IMU and there is none, or a setting wants one.
+        """
+        if config.dynamics.uses_imu(rig.has_imu):
+            return Dynamics(rig, algorithm, config)
+        return ConstantVelocity(
+            model_rig(rig, config.dynamics), without_prediction(algorithm), without_imu(config)
+        )
+
+    @property
+    def measures_gravity(self) -> bool:
+        """Whether roll and pitch in the world are known."""
+        return self.rig.has_imu
+
+    def extend(self, imu: ImuBuffer, until_ns: int) -> None:
+        """Add to the samples of an IMU what the model says of the time up to a frame."""
+
+    def given(self, state: NavState) -> NavState:
+        """A state that was given from outside, as a state of this model."""
+        return state
+
+    def reported(self, state: NavState) -> NavState:
+        """A state of this model as users know it."""
+        return state
+
+
+class ConstantVelocity(Dynamics):
+    """White noise on linear and angular acceleration; see the module."""
+
+    def extend(self, imu: ImuBuffer, until_ns: int) -> None:
+        """Add samples of an IMU that measures nothing."""
+        newest_ns = imu.newest_ns() if len(imu.data) else None
+        if newest_ns is None or newest_ns < until_ns:
+            imu.add(motionless_samples(newest_ns, until_ns))
+
+    def given(self, state: NavState) -> NavState:
+        """The state with an unknown angular rate in the place of its biases."""
+        assert state.covariance is not None
+        covariance = state.covariance.copy()
+        covariance[9:], covariance[:, 9:] = 0.0, 0.0
+        covariance[9:, 9:] = bias_covariance(_ANGULAR_RATE_SIGMA)
+        return replace(self.reported(state), covariance=covariance)
+
+    def reported(self, state: NavState) -> NavState:
+        """The state without biases: there is no sensor that has them."""
+        return replace(state, accel_bias=np.zeros(3), gyro_bias=np.zeros(3))
+
+
+def model_rig(rig: Rig, config: DynamicsConfig) -> Rig:
+    """The rig with the noise of an IMU that measures nothing; see the module."""
+    noise = ImuNoise(
+        gyro_noise_density=_NOTHING,
+        gyro_random_walk=config.angular_accel_density,
+        accel_noise_density=config.accel_density,
+        accel_random_walk=_NOTHING,
+    )
+    return replace(rig, imu=noise, has_imu=False)
+
+
+def without_imu(config: BackendConfig) -> BackendConfig:
+    """The settings without gravity, and without all that compares images with an IMU.
+
+    Raises:
+        ConfigError: if a time offset is to be estimated, which wants an IMU.
+    """
+    if config.calibration.time_offset:
+        raise ConfigError(
+            "backend.calibration.time_offset compares cameras with an IMU, and none is used; "
+            "remove it"
+        )
+    noise = config.noise.model_copy(
+        update={"gravity": 0.0, "max_imu_gap_s": _NO_GAP_S, "imu_scale": 1.0}
+    )
+    return config.model_copy(
+        update={
+            "noise": noise,
+            "zero_velocity": config.zero_velocity.model_copy(update={"enabled": False}),
+            "initialization": config.initialization.model_copy(
+                update={"check_calibration": False, "fix_gauge": False}
+            ),
+        }
+    )
+
+
+def without_prediction(algorithm: AlgorithmConfig) -> AlgorithmConfig:
+    """The policies for frames whose poses nothing but their features tells.
+
+    Features enter early, where nothing else was asked for. In GTSAM's smoothers every frame is a
+    state, and the lag is half as long, so that they hold about as many as with an IMU.
+    """
+    cost, smoother = algorithm.cost, algorithm.smoother
+    if cost.max_state_features != 0 and cost.state_feature_frames is None:
+        cost = cost.model_copy(update={"state_feature_frames": _STATE_FEATURE_FRAMES})
+    asked = smoother.model_fields_set
+    early = {
+        "spacing_s": 0.0,
+        "lag_s": 0.5 * smoother.lag_s,
+        "min_feature_frames": _STATE_FEATURE_FRAMES,
+        "min_parallax_rad": 0.0,
+    }
+    kept = asked.intersection(("min_feature_frames", "min_parallax_rad"))
+    early = {name: value for name, value in early.items() if name not in kept}
+    return algorithm.model_copy(
+        update={"cost": cost, "smoother": smoother.model_copy(update=early)}
+    )
+
+
+def motionless_samples(after_ns: int | None, until_ns: int) -> ImuData:
+    """Samples of an IMU that measures nothing, after one time and up to another."""
+    steps = np.array([until_ns])
+    if after_ns is not None:
+        steps = after_ns + (until_ns - after_ns) * np.arange(1, _STEPS + 1) // _STEPS
+        steps = np.unique(steps[steps > after_ns])
+    none = np.zeros((len(steps), 3))
+    return ImuData(steps, none, none)
+
+
+def bias_covariance(angular_rate_sigma: float) -> FloatArray:
+    """Covariance (6, 6) of the biases of a state of `constant_velocity`, accelerometer first."""
+    return np.diag(np.repeat([_NOTHING**2, angular_rate_sigma**2], 3))

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The start of an estimator: its first window, the review of it, and its place after a loss."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.arrays import IntArray
+from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.initializer import Initializer
+from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
+from slam_graph.backend.initialization.start_review import StartReview
+from slam_graph.backend.initialization.visual_start import VisualStart
+from slam_graph.backend.window import Window
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
+
+
+class StartUp:
+    """Tries to start at every frame, with an IMU or without, and looks at the start again.
+
+    Attributes:
+        outliers: ids (N,) of the features that did not fit the last start, ascending.
+        joint: how the start continues a segment before; None in the first.
+        doubtful: whether the start is still reviewed.
+    """
+
+    def __init__(self, context: EngineContext, mode: str, before: NavState | None) -> None:
+        """Begin without frames.
+
+        Args:
+            context: shared with the engine.
+            mode: which starts are tried, as in `initialization.mode`.
+            before: last good state of the segment before; None in the first.
+        """
+        self.outliers: IntArray = np.zeros(0, np.int64)
+        self.joint: SegmentJoint | None = None
+        self.doubtful = False
+        self._context, self._before = context, before
+        self._inertial = Initializer(context, mode) if context.rig.has_imu else None
+        self._visual = VisualStart(context)
+        self._review: StartReview | None = None
+
+    def try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
+        """The first window, if this frame makes a start possible.
+
+        Args:
+            stamp_ns: time of the frame on the clock of the IMU.
+            frame: its features.
+        """
+        search = self._inertial or self._visual
+        window = search.try_to_start(stamp_ns, frame)
+        if window is None:
+            return None
+        self.outliers = search.outliers
+        if self._inertial is not None:
+            scale_sigma = self._inertial.scale_sigma
+            self._review = StartReview(self._context, stamp_ns, scale_sigma)
+            self.doubtful = True
+        window = self._placed(window)
+        if self._inertial is None:  # whose start does not use the features of this frame
+            self._context.add_observations(window, frame)
+        return window
+
+    def better(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> Window | None:
+        """A new first window, if what followed a doubtful start contradicts it.
+
+        Args:
+            stamp_ns: time of the frame on the clock of the IMU.
+            frame: its features.
+            state: the estimate then.
+        """
+        review = self._review
+        assert review is not None
+        window = review.better(stamp_ns, frame, state)
+        self.doubtful = not review.done
+        if window is None:
+            return None
+        self.outliers = review.outliers
+        return self._placed(window)
+
+    def waiting_for(self, calibration: str | None) -> str:
+        """What a start still needs, and the likeliest cause of the lack.
+
+        Args:
+            calibration: what contradicts the calibration, if something does.
+        """
+        if self._inertial is None:
+            return self._visual.waiting_for()
+        return self._inertial.waiting_for(calibration)
+
+    def _placed(self, window: Window) -> Window:
+        """A window that has just begun, in the world of the segment before if there is one."""
+        if self._before is not None:
+            window, self.joint = place(window, self._before, self._context)
+        return window

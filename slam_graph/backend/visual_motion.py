@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The motion from frame to frame by the images alone, where no IMU predicts it.
+
+A body that turns to and fro at 150°/s is after one frame where constant velocity does not expect
+it, and one Gauss-Newton step from there ends beside the minimum. So the new pose is first found by
+PnP from points that are known already: features of the estimator, and those whose depth the last
+frame has by a second camera or a depth sensor. It is the point at which the new state is
+linearised, not a measurement: its images still come, and count once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.cost.feature_tracks import is_in
+from slam_graph.backend.cost.triangulation import triangulate_frames
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, Rig, RigCamera
+
+MIN_POINTS = 10
+"""Fewer known points tell no motion."""
+ERROR_PX = 4.0
+"""Largest error of a point that fits the motion."""
+_LEAST_SHARE = 0.5
+"""Part of the known points that must fit it."""
+_RANSAC_ITERATIONS = 100
+_ROUNDS = 3
+"""With a rolling shutter: its rows are undone with the rate that the round before has found."""
+_END_RATE = 1.0
+"""If white noise has turned a body by δ more than expected over a time t, then its rate has changed
+by 1.5 δ / t in the mean, and its velocity likewise: covariance t² / 2 over variance t³ / 3."""
+
+
+class VisualMotion:
+    """Finds the motion of the body since the last frame.
+
+    Args:
+        rig: the cameras; the first one is looked through.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._last: FeatureFrame | None = None
+
+    def forget(self) -> None:
+        """The next frame is the first."""
+        self._last = None
+
+    def corrected(
+        self,
+        before: NavState,
+        predicted: NavState,
+        frame: FeatureFrame,
+        known: tuple[IntArray, FloatArray],
+    ) -> NavState:
+        """The predicted state with the pose, velocity and rate that the images show.
+
+        Args:
+            before: state at the last frame.
+            predicted: state at the new one, by constant velocity.
+            frame: its features.
+            known: ids (N,) and world positions (N, 3) of features that the estimator knows.
+        """
+        ids, points = self._known(before, known)
+        self._last = frame
+        found = predicted
+        for _ in range(_ROUNDS if self._rig.rolling else 1):
+            pose = self._pose(frame, ids, points, -found.gyro_bias)
+            if pose is None:
+                return predicted
+            found = _moved(before, predicted, pose)
+        return found
+
+    def _known(
+        self, before: NavState, known: tuple[IntArray, FloatArray]
+    ) -> tuple[IntArray, FloatArray]:
+        """Known features, ascending ids, and those of the last frame with a depth."""
+        ids, points = known
+        if self._last is not None:
+            seen, local = depths_within(self._last, self._rig, -before.gyro_bias)
+            others = ~np.isin(seen, ids)
+            world = np.asarray(before.world_T_body.transformFrom(local[others].T)).T
+            ids = np.concatenate([ids, seen[others]])
+            points = np.concatenate([points, world.reshape(-1, 3)])
+        order = np.argsort(ids)
+        return ids[order], points[order]
+
+    def _pose(
+        self, frame: FeatureFrame, ids: IntArray, points: FloatArray, rate: FloatArray
+    ) -> gtsam.Pose3 | None:
+        """world_T_body by known points (ascending ids); None if they do not tell it."""
+        seen, mounted = frame.cameras[0], self._rig.cameras[0]
+        rows = is_in(seen.ids, ids)
+        if np.count_nonzero(rows) < MIN_POINTS:
+            return None
+        world = points[np.searchsorted(ids, seen.ids[rows])]
+        rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
+        solved = camera_pose(world, rays[:, :2] / rays[:, 2:], ERROR_PX / mounted.camera.fx)
+        if solved is None or np.mean(solved[1]) < _LEAST_SHARE:
+            return None
+        return solved[0].inverse().compose(mounted.body_T_camera.inverse())
+
+
+def _unrolled(
+    normalized: FloatArray, rows: FloatArray, mounted: RigCamera, rate: FloatArray
+) -> FloatArray:
+    """Rays (N, 3) of a rolling shutter as the middle row would see them.
+
+    Args:
+        normalized: (N, 2) on the plane z = 1.
+        rows: (N,) rows in pixels.
+        mounted: the camera.
+        rate: (3,) angular rate of the body, rad/s.
+    """
+    rays = np.column_stack([normalized, np.ones(len(normalized))])
+    if mounted.readout_s == 0.0:
+        return rays
+    seconds = mounted.row_times_s(rows) - mounted.middle_s
+    turn = mounted.body_T_camera.rotation().unrotate(rate)
+    return np.asarray(Rotation.from_rotvec(seconds[:, None] * turn).apply(rays))
+
+
+def depths_within(
+    frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None
+) -> tuple[IntArray, FloatArray]:
+    """Ids (N,) and positions (N, 3) in the body frame of features with a depth in one frame.
+
+    Args:
+        frame: the frame.
+        rig: its cameras.
+        rate: (3,) angular rate of the body, rad/s, by which rows of a rolling shutter differ; None
+            for none.
+    """
+    ids = frame.cameras[0].ids
+    if len(rig.cameras) < 2 or len(ids) == 0:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    found = triangulate_frames(ids, [frame], np.eye(3)[None], np.zeros((1, 3)), rig)
+    ids, points, mounted = ids[found.good], found.points[found.good], rig.cameras[0]
+    if rate is not None and mounted.readout_s != 0.0:
+        rows = frame.cameras[0].pixels[found.good, 1]
+        seconds = mounted.row_times_s(rows) - mounted.middle_s
+        points = Rotation.from_rotvec(seconds[:, None] * rate).apply(points)
+    return ids, points
+
+
+def camera_pose(
+    points: FloatArray, rays: FloatArray, error: float
+) -> tuple[gtsam.Pose3, BoolArray] | None:
+    """camera_T_points of known points that a camera sees, by PnP with RANSAC, and which fit it.
+
+    Args:
+        points: (N, 3).
+        rays: (N, 2) where the camera sees them, on its plane z = 1.
+        error: largest error on that plane of a point that fits.
+    """
+    cv2.setRNGSeed(0)  # OpenCV draws from one global generator
+    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=_RANSAC_ITERATIONS,
+        reprojectionError=error,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or inliers is None:
+        return None
+    fits = np.zeros(len(points), np.bool_)
+    fits[inliers[:, 0]] = True
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[fits], rays[fits], np.eye(3), None, rotation, translation
+    )
+    return gtsam.Pose3(gtsam.Rot3(cv2.Rodrigues(rotation)[0]), translation[:, 0]), fits
+
+
+def _moved(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:
+    """A predicted state at another pose, with the velocity and rate that lead there."""
+    seconds = (predicted.stamp_ns - before.stamp_ns) * 1e-9
+    was = predicted.world_T_body
+    turn = gtsam.Rot3.Logmap(was.rotation().between(pose.rotation()))
+    shift = pose.translation() - was.translation()
+    return replace(
+        predicted,
+        world_T_body=pose,
+        velocity=predicted.velocity + _END_RATE * shift / seconds,
+        gyro_bias=predicted.gyro_bias - _END_RATE * turn / seconds,
+    )

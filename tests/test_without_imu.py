@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings without an IMU: constant velocity as dynamics, depth as a measurement, the gauge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slam_graph import run
+from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, DynamicsConfig
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
+from slam_graph.backend.dynamics import Dynamics, model_rig, motionless_samples
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.visual_motion import camera_pose, depths_within
+from slam_graph.backend.world_gauge import gauge_motion, with_unknown_gauge, world_motion
+from slam_graph.datasets import open_dataset
+from slam_graph.errors import ConfigError, DataError
+from slam_graph.evaluation import ape
+from slam_graph.frontend.image_rotation import ImageRotation
+from slam_graph.geometry import NavState
+from slam_graph.sensors import (
+    Camera,
+    DepthSensor,
+    FeatureFrame,
+    FeatureObservations,
+    ImuData,
+    Rig,
+    RigCamera,
+)
+from slam_graph.simulation import simulate
+from slam_graph.simulation.simulated_sequence import SimulatedSequence
+
+OWN_START = "backend.initialization.mode=motion"
+"""Not the state that comes with a simulation."""
+CAMERA = Camera(500.0, 510.0, 320.0, 240.0, "none", (), 640, 480)
+
+
+def simulated(**settings: Any) -> SimulatedSequence:
+    """Tracks of a flight without an IMU."""
+    asked = {"with_imu": False, "duration_s": 8.0, "seed": 3, "trajectory": "random"}
+    return simulate(**(asked | settings))
+
+
+# --- dynamics -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.1, 0.5])
+def test_constant_velocity_has_the_covariance_of_white_noise_on_acceleration(
+    seconds: float,
+) -> None:
+    config = DynamicsConfig(accel_density=2.0, angular_accel_density=3.0)
+    rig = model_rig(Rig((RigCamera(CAMERA, gtsam.Pose3()),)), config)
+    until = motionless_samples(0, round(seconds * 1e9))
+    samples = ImuData.concatenate([motionless_samples(None, 0), until])
+    params = rig.imu.preintegration_params(0.0)
+    found = samples.preintegrated(gtsam.imuBias.ConstantBias(), params).preintMeasCov()
+    rotation, position, velocity, rate = (np.diag(found)[rows] for rows in (0, 3, 6, 12))
+    assert position == pytest.approx(2.0**2 * seconds**3 / 3.0, rel=0.01)
+    assert velocity == pytest.approx(2.0**2 * seconds, rel=1e-6)
+    assert found[3, 6] == pytest.approx(2.0**2 * seconds**2 / 2.0, rel=0.01)
+    assert rate == pytest.approx(3.0**2 * seconds, rel=1e-3)
+    assert rotation == pytest.approx(3.0**2 * seconds**3 / 3.0, rel=0.1)
+
+
+def test_a_body_that_keeps_its_velocities_is_predicted_exactly() -> None:
+    rig = model_rig(Rig((RigCamera(CAMERA, gtsam.Pose3()),)), DynamicsConfig())
+    rate, velocity = np.array([0.3, -0.8, 1.1]), np.array([1.0, 2.0, -0.5])
+    state = NavState(
+        0, gtsam.Pose3(), velocity, accel_bias=np.zeros(3), gyro_bias=-rate, covariance=None
+    )
+    samples = ImuData.concatenate([motionless_samples(None, 0), motionless_samples(0, 10**8)])
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), -rate)
+    pim = samples.preintegrated(bias, rig.imu.preintegration_params(0.0))
+    later = state.predicted(pim, 10**8)
+    expected = gtsam.Pose3(gtsam.Rot3.Expmap(0.1 * rate), 0.1 * velocity)
+    assert later.world_T_body.equals(expected, 1e-9)
+    np.testing.assert_allclose(later.velocity, velocity, atol=1e-12)
+
+
+def test_dynamics_are_those_that_the_recording_has() -> None:
+    rig, algorithm = Rig((RigCamera(CAMERA, gtsam.Pose3()),)), AlgorithmConfig(name="swf")
+    assert Dynamics.of(rig, algorithm, BackendConfig()).rig is rig
+    without = Dynamics.of(replace(rig, has_imu=False), algorithm, BackendConfig())
+    assert not without.measures_gravity
+    assert without.config.noise.gravity == 0.0
+    wanted = BackendConfig(dynamics=DynamicsConfig(model="imu"))
+    with pytest.raises(ConfigError, match="has no IMU; use constant_velocity"):
+        Dynamics.of(replace(rig, has_imu=False), algorithm, wanted)
+    offset = BackendConfig(calibration=CalibrationConfig(time_offset=True))
+    with pytest.raises(ConfigError, match="time_offset compares cameras with an IMU"):
+        Dynamics.of(replace(rig, has_imu=False), algorithm, offset)
+
+
+# --- whole runs ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "algorithm", ["msckf", "swf", "okvis", "ekf", "iekf", "fixed_lag_isam2", "fixed_lag_batch"]
+)
+def test_every_algorithm_runs_on_stereo_without_an_imu(algorithm: str) -> None:
+    recording = simulated(cameras=2)
+    result = run(recording, algorithm=algorithm, overrides=["final_ba.enabled=false", OWN_START])
+    assert result.status == "ok", result.message
+    assert result.coverage > 0.98
+    assert result.metrics["extent"]["alignment"] == "se3"
+    assert ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse < 0.05
+
+
+@pytest.mark.parametrize("depth", ["stereo", "kinect"])
+def test_a_depth_sensor_takes_the_place_of_a_second_camera(depth: str) -> None:
+    recording = simulated(cameras=1, depth={"sensor": depth})
+    result = run(recording, algorithm="msckf", overrides=[OWN_START])
+    assert result.status == "ok", result.message
+    assert result.smoothed is not None
+    causal = ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse
+    smoothed = ape(result.groundtruth, result.smoothed, "trans_part", "se3").statistics.rmse
+    assert smoothed < 0.6 * causal < 0.03
+
+
+def test_what_is_known_without_an_imu_is_what_the_covariance_says() -> None:
+    values = []
+    for seed in range(6):
+        recording = simulated(cameras=2, seed=seed)
+        result = run(recording, algorithm="msckf", overrides=[OWN_START])
+        table = result.metrics["final_ba"]["nees"]
+        assert table["alignment"] == "first_pose"
+        values.append([table[name]["mean"] for name in ("orientation", "position")])
+    # 3 is ideal; the states of a run are correlated, so six runs are six samples of 3 each
+    assert (np.mean(values, axis=0) < 7.0).all(), values
+    assert (np.mean(values, axis=0) > 1.0).all(), values
+
+
+def test_one_camera_alone_is_told_what_is_missing() -> None:
+    recording = simulated(cameras=1, duration_s=3.0)
+    result = run(recording, algorithm="msckf", overrides=[OWN_START])
+    assert result.status == "not_initialized"
+    assert "a second camera or a depth image gives the depth" in result.message
+
+
+def test_a_recording_with_an_imu_can_be_run_without_it(data_dir: Path) -> None:
+    result = run(
+        data_dir / "euroc" / "MH_01_easy_17s",
+        algorithm="msckf",
+        cameras=2,
+        duration_s=8.0,
+        overrides=["backend.dynamics.model=constant_velocity"],
+    )
+    assert result.status == "ok", result.message
+    assert ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse < 0.015
+    assert ape(result.groundtruth, result.smoothed, "trans_part", "se3").statistics.rmse < 0.01
+
+
+def test_a_real_rgbd_recording_is_run(data_dir: Path) -> None:
+    result = run(data_dir / "tum_rgbd" / "freiburg1_rpy_12s", algorithm="msckf", duration_s=3.0)
+    assert result.status == "ok", result.message
+    assert result.coverage > 0.9
+    assert ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse < 0.05
+
+
+# --- depth --------------------------------------------------------------------------------------
+
+
+def test_depth_has_the_noise_of_its_sensor() -> None:
+    sensor = DepthSensor.kinect(5000.0)
+    rig = Rig((RigCamera(CAMERA, gtsam.Pose3()),), has_imu=False, depth=sensor)
+    both = with_depth_camera(rig)
+    assert len(both.cameras) == 2
+    z, rng = 2.0, np.random.default_rng(0)
+    point = np.array([0.3, -0.2, z])
+    beside = both.cameras[1]
+    local = beside.body_T_camera.transformTo(point)
+    J = []  # of the four coordinates by the point, in pixels
+    for mounted, p in ((both.cameras[0], point), (beside, local)):
+        x, y, depth = p
+        f = np.array([mounted.camera.fx, mounted.camera.fy])
+        J.append(f[:, None] * np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) / depth)
+    covariance = np.linalg.inv(np.vstack(J).T @ np.vstack(J))
+    expected = float(sensor.sigma_m(np.array([z]))[0])
+    assert expected < np.sqrt(covariance[2, 2]) < 2.5 * expected
+    # the pixel counts once: its own noise is that of one observation, within 4 %
+    assert np.sqrt(covariance[1, 1] * (500.0 / z) ** 2) == pytest.approx(1.0, abs=0.1)
+    assert rng is not None
+
+
+def test_features_with_a_depth_are_where_it_says() -> None:
+    rig = Rig((RigCamera(CAMERA, gtsam.Pose3()),), has_imu=False, depth=DepthSensor())
+    m = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 2))
+    z = np.random.default_rng(2).uniform(0.8, 5.0, 20)
+    z[3] = np.nan
+    pixels = m * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+    seen = FeatureObservations(np.arange(20), pixels, m, None, z, rig.depth.sigma_m(z))
+    frame = with_depth_observed(FeatureFrame(0, (seen,)), rig)
+    ids, points = depths_within(frame, with_depth_camera(rig))
+    assert 3 not in ids
+    assert len(ids) == 19
+    expected = np.column_stack([m, np.ones(20)]) * z[:, None]
+    np.testing.assert_allclose(points, expected[ids], rtol=1e-6)
+
+
+# --- images and gauge ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [(0, 0, 0), (3, -6, 2), (-6, 7, -5)])
+def test_the_rotation_between_two_images_is_found(degrees: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (960, 1280)).astype(np.float32), (0, 0), 12)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    after_R_before = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    middle = np.array([[1.0, 0, -320], [0, 1, -240], [0, 0, 1]])
+    before = cv2.warpPerspective(texture, middle, (640, 480))
+    after = cv2.warpPerspective(texture, K @ after_R_before @ np.linalg.inv(K) @ middle, (640, 480))
+    found = Rotation.from_matrix(ImageRotation(CAMERA).between(before, after))
+    difference = found * Rotation.from_matrix(after_R_before).inv()
+    assert np.degrees(difference.magnitude()) < 0.25
+
+
+def test_a_camera_is_found_by_points_that_it_sees_and_outliers_are_named() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform([-2, -2, 3], [2, 2, 8], (40, 3))
+    camera_T_world = gtsam.Pose3(gtsam.Rot3.Expmap([0.1, -0.2, 0.05]), np.array([0.2, 0.1, -0.3]))
+    seen = np.asarray(camera_T_world.transformFrom(points.T)).T
+    rays = seen[:, :2] / seen[:, 2:]
+    rays[:6] += 0.2
+    found = camera_pose(points, rays, 0.005)
+    assert found is not None
+    assert found[0].equals(camera_T_world, 1e-6)
+    assert not found[1][:6].any()
+    assert found[1][6:].all()
+
+
+@pytest.mark.parametrize("level", [True, False])
+def test_the_gauge_moves_poses_as_the_world_moves(level: bool) -> None:
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap([0.4, -0.2, 0.9]), np.array([1.0, -2.0, 0.5]))
+    arm = pose.translation()
+    motion = gauge_motion(arm[None], level)[0]
+    for k in range(motion.shape[1]):
+        step = np.zeros(6)
+        step[[3, 4, 5, 2] if level else [3, 4, 5, 0, 1, 2]] = np.eye(motion.shape[1])[k] * 1e-6
+        world = gtsam.Pose3(gtsam.Rot3.Expmap(step[:3]), step[3:])
+        moved = world.compose(pose)
+        turn = gtsam.Rot3.Logmap(moved.rotation().compose(pose.rotation().inverse()))
+        shift = moved.translation() - pose.translation()
+        np.testing.assert_allclose(np.concatenate([turn, shift]) / 1e-6, motion[:, k], atol=1e-5)
+    other = gtsam.Pose3(gtsam.Rot3.Expmap([0.1, 0.3, -0.5]), np.array([3.0, 1.0, 2.0]))
+    to = world_motion(pose, other, level).compose(pose)
+    np.testing.assert_allclose(to.translation(), other.translation(), atol=1e-12)
+    assert to.equals(other, 1e-9) is (not level)
+
+
+def test_what_is_not_known_of_the_rotation_of_a_world_is_added_about_all_axes() -> None:
+    state = NavState(
+        0,
+        gtsam.Pose3(gtsam.Rot3(), np.array([10.0, 0.0, 0.0])),
+        np.array([1.0, 0.0, 0.0]),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=np.zeros((15, 15)),
+    )
+    unknown = np.diag([0.0, 0.0, 0.0, 0.0, 0.01**2, 0.0])  # about y
+    P = with_unknown_gauge(state, unknown, np.zeros(3)).covariance
+    assert P is not None
+    np.testing.assert_allclose(np.diag(P)[:9], [0, 1e-4, 0, 0, 0, 1e-2, 0, 0, 1e-4], atol=1e-12)
+
+
+def test_a_recording_that_has_an_imu_says_so(data_dir: Path) -> None:
+    sequence = open_dataset(data_dir / "tum_rgbd" / "freiburg1_rpy_12s")
+    assert not sequence.info().has_imu
+    with pytest.raises((ConfigError, DataError), match="no IMU"):
+        run(sequence, overrides=["backend.dynamics.model=imu"])
