@@ -230,7 +230,7 @@ class CalibrationConfig(Settings):
 class DynamicsConfig(Settings):
     """What predicts the state from frame to frame."""
 
-    model: Literal["auto", "imu", "constant_velocity"] = "auto"
+    model: Literal["auto", "imu", "constant_velocity"] = expert("auto")
     """imu: gyroscope and accelerometer. constant_velocity: linear and angular acceleration are
     white noise, and an IMU is not used. auto: the IMU if the recording has one."""
     accel_density: float = expert(3.0, gt=0)

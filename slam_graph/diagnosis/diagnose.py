@@ -125,8 +125,8 @@ class Diagnosis:
     def setup_faults(self) -> list[Finding]:
         """Errors and warnings of calibration, units and clocks that spoil an estimate.
 
-        A clock that is off by some milliseconds does not. Nor does a small turn of the camera count:
-        what a real IMU has of errors looks like one of two or three degrees.
+        A clock that is off by some milliseconds does not. Nor does a small turn of the camera: the
+        errors of a real IMU look like one of two or three degrees.
         """
         return [
             finding
