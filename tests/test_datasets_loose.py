@@ -26,7 +26,7 @@ from slam_graph.datasets.data_checks import check_sequence
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.pipeline.run_recording import run
@@ -272,7 +272,7 @@ def test_colour_and_sixteen_bits_become_grey_and_other_sizes_are_counted(tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["video", "images"])
-def test_without_imu_it_can_be_looked_at_but_not_run_on(tmp_path: Path, kind: str) -> None:
+def test_without_imu_and_depth_one_camera_says_what_is_missing(tmp_path: Path, kind: str) -> None:
     """The calibration then does not need to say where an IMU is."""
     if kind == "video":
         path = write_video(tmp_path)
@@ -287,8 +287,11 @@ def test_without_imu_it_can_be_looked_at_but_not_run_on(tmp_path: Path, kind: st
     tracker = build_frontend(sequence.rig, FrontendConfig(), 0, Diagnostics(), "images")
     features = [tracker.track(packet.frame).cameras[0] for packet in sequence.packets()]
     assert all(len(seen) > 0 for seen in features)
-    with pytest.raises(DataError, match="no IMU"):
-        run(sequence)
+    result = run(sequence)
+    assert result.status == "not_initialized"
+    assert "a second camera or a depth image gives the depth" in result.message
+    with pytest.raises(ConfigError, match="has no IMU; use constant_velocity"):
+        run(sequence, overrides=["backend.dynamics.model=imu"])
 
 
 def test_a_check_tells_what_was_noticed_on_opening(tmp_path: Path) -> None:
@@ -302,6 +305,7 @@ def test_a_check_tells_what_was_noticed_on_opening(tmp_path: Path) -> None:
 def test_a_refused_run_leaves_no_folder(tmp_path: Path) -> None:
     path = write_image_folder(tmp_path / "walk", inertial=False)
     arguments = ["run", str(path), "--no-progress", "--output", str(tmp_path / "results")]
+    arguments += ["--set", "backend.dynamics.model=imu"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 1
     assert "no IMU" in str(done.exception)

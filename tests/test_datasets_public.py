@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
-from slam_graph.errors import DataError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import CameraFrame
 
@@ -211,11 +211,11 @@ def test_tum_rgbd_of_an_unknown_camera_needs_a_calibration(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("write", [write_kitti_odometry, write_tum_rgbd])
-def test_a_run_without_imu_is_refused_in_one_line(tmp_path: Path, write: object) -> None:
+def test_a_run_by_an_imu_that_is_not_there_is_refused(tmp_path: Path, write: object) -> None:
     assert callable(write)
     sequence = open_dataset(write(tmp_path / "freiburg1"))
-    with pytest.raises(DataError, match="no IMU") as error:
-        run(sequence)
+    with pytest.raises(ConfigError, match="no IMU") as error:
+        run(sequence, overrides=["backend.dynamics.model=imu"])
     assert "\n" not in str(error.value)
 
 
