@@ -36,6 +36,8 @@ SETUP_KINDS = (
     "baseline_unit",
 )
 """Findings about what a run was given: calibration, units and clocks."""
+_SMALL = ("time_offset", "mounting", "focal_length")
+"""Those that count where they are errors, not where they are warnings."""
 _PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
 """Times without frames, and without samples, that end a part of what is in memory."""
 _FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
@@ -125,14 +127,14 @@ class Diagnosis:
     def setup_faults(self) -> list[Finding]:
         """Errors and warnings of calibration, units and clocks that spoil an estimate.
 
-        A clock that is off by some milliseconds does not. Nor does a small turn of the camera: the
-        errors of a real IMU look like one of two or three degrees.
+        A clock that is off by some milliseconds does not. Nor do small errors of mounting and focal
+        length: good flights look turned by three degrees, and off by two per cent.
         """
         return [
             finding
             for finding in self.faults
             if finding.kind in SETUP_KINDS
-            and (finding.severity == "error" or finding.kind not in ("time_offset", "mounting"))
+            and (finding.severity == "error" or finding.kind not in _SMALL)
         ]
 
     def best_guess(self) -> str:
