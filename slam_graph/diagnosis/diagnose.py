@@ -36,8 +36,8 @@ SETUP_KINDS = (
     "baseline_unit",
 )
 """Findings about what a run was given: calibration, units and clocks."""
-_SMALL = ("time_offset", "mounting", "focal_length")
-"""Those that count where they are errors, not where they are warnings."""
+_SURE_WARNINGS = ("baseline", "stereo_geometry")
+"""Those that count where they are warnings too; all others where they are errors."""
 _PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
 """Times without frames, and without samples, that end a part of what is in memory."""
 _FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
@@ -128,13 +128,13 @@ class Diagnosis:
         """Errors and warnings of calibration, units and clocks that spoil an estimate.
 
         A clock that is off by some milliseconds does not. Nor do small errors of mounting and focal
-        length: good flights look turned by three degrees, and off by two per cent.
+        length, or axes that fit a little less well: good flights have them.
         """
         return [
             finding
             for finding in self.faults
             if finding.kind in SETUP_KINDS
-            and (finding.severity == "error" or finding.kind not in _SMALL)
+            and (finding.severity == "error" or finding.kind in _SURE_WARNINGS)
         ]
 
     def best_guess(self) -> str:
