@@ -25,7 +25,6 @@ SETUP_KINDS = (
     "accelerometer_unit",
     "accelerometer_gravity",
     "accelerometer_sign",
-    "accelerometer_axes",
     "gyroscope_unit",
     "gyroscope_axes",
     "mounting",
