@@ -19,7 +19,7 @@ from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, 
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import Dynamics, model_rig, motionless_samples
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.backend.visual_motion import camera_pose, depths_within
+from slam_graph.backend.visual_motion import depths_within
 from slam_graph.backend.world_gauge import gauge_motion, with_unknown_gauge, world_motion
 from slam_graph.datasets import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -229,9 +229,10 @@ def test_a_camera_is_found_by_points_that_it_sees_and_outliers_are_named() -> No
     seen = np.asarray(camera_T_world.transformFrom(points.T)).T
     rays = seen[:, :2] / seen[:, 2:]
     rays[:6] += 0.2
-    found = camera_pose(points, rays, 0.005)
+    body_T_camera = gtsam.Pose3(gtsam.Rot3.Expmap([0.3, 0.1, -0.7]), np.array([0.1, 0.0, 0.05]))
+    found = RigCamera(CAMERA, body_T_camera).body_pose(points, rays, 2.5)
     assert found is not None
-    assert found[0].equals(camera_T_world, 1e-6)
+    assert found[0].compose(body_T_camera).inverse().equals(camera_T_world, 1e-6)
     assert not found[1][:6].any()
     assert found[1][6:].all()
 

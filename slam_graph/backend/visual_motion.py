@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.geometry import NavState
@@ -30,7 +29,6 @@ ERROR_PX = 4.0
 """Largest error of a point that fits the motion."""
 _LEAST_SHARE = 0.5
 """Part of the known points that must fit it."""
-_RANSAC_ITERATIONS = 100
 _ROUNDS = 3
 """With a rolling shutter: its rows are undone with the rate that the round before has found."""
 _END_RATE = 1.0
@@ -102,10 +100,10 @@ class VisualMotion:
             return None
         world = points[np.searchsorted(ids, seen.ids[rows])]
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
-        solved = camera_pose(world, rays[:, :2] / rays[:, 2:], ERROR_PX / mounted.camera.fx)
+        solved = mounted.body_pose(world, rays[:, :2] / rays[:, 2:], ERROR_PX)
         if solved is None or np.mean(solved[1]) < _LEAST_SHARE:
             return None
-        return solved[0].inverse().compose(mounted.body_T_camera.inverse())
+        return solved[0]
 
 
 def _unrolled(
@@ -148,38 +146,6 @@ def depths_within(
         seconds = mounted.row_times_s(rows) - mounted.middle_s
         points = Rotation.from_rotvec(seconds[:, None] * rate).apply(points)
     return ids, points
-
-
-def camera_pose(
-    points: FloatArray, rays: FloatArray, error: float
-) -> tuple[gtsam.Pose3, BoolArray] | None:
-    """camera_T_points of known points that a camera sees, by PnP with RANSAC, and which fit it.
-
-    Args:
-        points: (N, 3).
-        rays: (N, 2) where the camera sees them, on its plane z = 1.
-        error: largest error on that plane of a point that fits.
-    """
-    cv2.setRNGSeed(0)  # OpenCV draws from one global generator
-    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points,
-        rays,
-        np.eye(3),
-        None,
-        iterationsCount=_RANSAC_ITERATIONS,
-        reprojectionError=error,
-        confidence=0.999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
-    if not found or inliers is None:
-        return None
-    fits = np.zeros(len(points), np.bool_)
-    fits[inliers[:, 0]] = True
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[fits], rays[fits], np.eye(3), None, rotation, translation
-    )
-    return gtsam.Pose3(gtsam.Rot3(cv2.Rodrigues(rotation)[0]), translation[:, 0]), fits
 
 
 def _moved(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:

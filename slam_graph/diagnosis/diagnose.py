@@ -25,6 +25,7 @@ SETUP_KINDS = (
     "accelerometer_unit",
     "accelerometer_gravity",
     "accelerometer_sign",
+    "accelerometer_axes",
     "gyroscope_unit",
     "gyroscope_axes",
     "mounting",
@@ -124,10 +125,10 @@ class Diagnosis:
 
     @property
     def setup_faults(self) -> list[Finding]:
-        """Errors and warnings of calibration, units and clocks that spoil an estimate.
+        """Errors of calibration, units and clocks, and warnings of the stereo geometry.
 
-        A clock that is off by some milliseconds does not. Nor do small errors of mounting and focal
-        length, or axes that fit a little less well: good flights have them.
+        Other warnings do not count: small turns of the camera and errors of the focal length are
+        found in good flights too, and a clock that is off by milliseconds spoils nothing.
         """
         return [
             finding

@@ -108,11 +108,12 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     candidates = [P for handed in (1, -1) for P in signed_permutations(handed)]
     quick = {k: _score(windows[:_QUICK], P, 0) for k, P in enumerate(candidates)}
     best = sorted(quick, key=lambda k: quick[k])[:_COMPARED]
-    scores = [(_score(windows, candidates[k], 8), k) for k in best]
-    score, k = min(scores)
-    P = candidates[k]
-    usual = _score_of(nominal)
-    if np.allclose(P, np.eye(3)) or usual < _CLEARER * score:
+    solved = {k: [window.solve(candidates[k], 8) for window in windows] for k in best}
+    k = min(best, key=lambda k: _score_of(solved[k]))
+    P, score, usual = candidates[k], _score_of(solved[k]), _score_of(nominal)
+    # wrong axes spoil every window; a single one may end in a wrong minimum under right ones
+    better = np.median(_sizes_px(nominal) / _sizes_px(solved[k]))
+    if np.allclose(P, np.eye(3)) or min(better, usual / score) < _CLEARER:
         return np.eye(3), []
     values = {"axes": axes_text(P), "residual_px": score, "residual_as_it_is_px": usual}
     found = "accelerometer_axes"
@@ -132,12 +133,17 @@ def _score(windows: list[Window], P: FloatArray, steps: int) -> float:
 
 
 def _score_of(solutions: list[WindowSolution | None]) -> float:
-    """Geometric mean of the residuals in pixels; what is behind the camera is far off."""
+    """Geometric mean of the residuals in pixels."""
+    return float(np.exp(np.mean(np.log(_sizes_px(solutions)))))
+
+
+def _sizes_px(solutions: list[WindowSolution | None]) -> FloatArray:
+    """Residuals (W,) of windows in pixels; what is behind the camera is far off."""
     sizes = [
         100.0 if s is None or s.ahead < 1 - _BEHIND else min(s.residual_px, 100.0)
         for s in solutions
     ]
-    return float(np.exp(np.mean(np.log(sizes))))
+    return np.array(sizes)
 
 
 def _baseline(solutions: list[WindowSolution], rig: Rig) -> list[Finding]:

@@ -61,11 +61,8 @@ class VerificationConfig(Settings):
     """Geometric verification of candidates."""
 
     moved: ClassVar[Mapping[str, str]] = _constants(
-        "loop_closure/loop_verification.py",
-        ransac_iterations="RANSAC_ITERATIONS",
-        max_tilt_rad="MAX_TILT_RAD",
-        sigma_px="SIGMA_PX",
-    )
+        "loop_closure/loop_verification.py", max_tilt_rad="MAX_TILT_RAD", sigma_px="SIGMA_PX"
+    ) | _constants("sensors/perspective.py", ransac_iterations="RANSAC_ITERATIONS")
 
     max_descriptor_bits: int = expert(64, ge=0)
     """Largest Hamming distance of matching descriptors, bits."""

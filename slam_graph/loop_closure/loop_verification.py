@@ -14,13 +14,11 @@ import cv2
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, skew
+from slam_graph.arrays import FloatArray, IntArray, skew
 from slam_graph.loop_closure.loop_config import VerificationConfig
 from slam_graph.loop_closure.loop_keyframes import Descriptors, Keyframe
 from slam_graph.sensors import RigCamera
 
-RANSAC_ITERATIONS = 200
-"""Largest number of samples."""
 MAX_TILT_RAD = 0.05
 """Largest contradiction between the relative pose and the roll and pitch that gravity gives."""
 SIGMA_PX = 2.0
@@ -68,7 +66,7 @@ class LoopVerifier:
     """
 
     def __init__(self, mounted: RigCamera, config: VerificationConfig) -> None:
-        self._config = config
+        self._config, self._mounted = config, mounted
         self._body_T_camera = mounted.body_T_camera
         self._focal_px = float(np.sqrt(mounted.camera.fx * mounted.camera.fy))
 
@@ -90,7 +88,7 @@ class LoopVerifier:
         if len(pairs) < config.min_inliers:
             return None
         points, rays = a.points[known[pairs[:, 0]]], b.normalized[pairs[:, 1]]
-        found = self._pose(points, rays)
+        found = self._mounted.body_pose(points, rays, config.max_error_px, config.min_inliers)
         if found is None:
             return None
         pose, inliers = found
@@ -101,33 +99,6 @@ class LoopVerifier:
         covariance = self._covariance(points[inliers], pose)
         supporting = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
         return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), supporting)
-
-    def _pose(self, points: FloatArray, rays: FloatArray) -> tuple[gtsam.Pose3, BoolArray] | None:
-        """first_T_second from points (M, 3) of the first, observed at (M, 2) in the second."""
-        cv2.setRNGSeed(0)  # OpenCV draws from one global generator
-        error = self._config.max_error_px / self._focal_px
-        found, rotation, translation, rows = cv2.solvePnPRansac(
-            points,
-            rays,
-            np.eye(3),
-            None,
-            iterationsCount=RANSAC_ITERATIONS,
-            reprojectionError=error,
-            confidence=0.999,
-            flags=cv2.SOLVEPNP_AP3P,
-        )
-        if not found or rows is None or len(rows) < self._config.min_inliers:
-            return None
-        chosen = rows[:, 0]
-        rotation, translation = cv2.solvePnPRefineLM(
-            points[chosen], rays[chosen], np.eye(3), None, rotation, translation
-        )
-        seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
-        matrix = cv2.Rodrigues(rotation)[0]
-        ahead = (points @ matrix.T + translation.T)[:, 2] > 0
-        camera_T_first = gtsam.Pose3(gtsam.Rot3(matrix), translation[:, 0])
-        first_T_second = camera_T_first.inverse().compose(self._body_T_camera.inverse())
-        return first_T_second, (np.linalg.norm(seen - rays, axis=1) < error) & ahead
 
     def _covariance(self, points: FloatArray, pose: gtsam.Pose3) -> FloatArray:
         """(6, 6) covariance of the relative pose from the points (M, 3) of its inliers."""

@@ -14,10 +14,11 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.depth import DepthSensor
+from slam_graph.sensors.perspective import camera_pose
 
 _STAMPED_ROWS = {"first": 0.0, "middle": 0.5, "last": 1.0}
 """Rows of a rolling shutter that a stamp may be the time of, as parts of the height."""
@@ -99,6 +100,27 @@ class RigCamera:
     readout_s: float = 0.0
     stamped_row: Literal["first", "middle", "last"] = "first"
     rotation_known: bool = True
+
+    def body_pose(
+        self, points: FloatArray, rays: FloatArray, error_px: float, least: int = 4
+    ) -> tuple[gtsam.Pose3, BoolArray] | None:
+        """world_T_body by points that this camera sees (PnP with RANSAC), and which of them fit it.
+
+        Args:
+            points: (N, 3) in the world, m.
+            rays: (N, 2) where the camera sees them, on its plane z = 1.
+            error_px: largest error of a point that fits.
+            least: how many points must fit.
+
+        Returns:
+            The pose, and (N,) which points are in front of the camera and fit; None without a pose.
+        """
+        focal_px = float(np.sqrt(self.camera.fx * self.camera.fy))
+        found = camera_pose(points, rays, error_px / focal_px, least)
+        if found is None:
+            return None
+        camera_T_world, fits = found
+        return camera_T_world.inverse().compose(self.body_T_camera.inverse()), fits
 
     def row_times_s(self, rows: FloatArray) -> FloatArray:
         """Times (N,) of the exposure of rows (N,), in pixels, since the stamp of the frame."""

@@ -16,7 +16,7 @@ from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.start_diagnosis import Refusal
-from slam_graph.backend.visual_motion import ERROR_PX, MIN_POINTS, camera_pose, depths_within
+from slam_graph.backend.visual_motion import ERROR_PX, MIN_POINTS, depths_within
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
@@ -94,10 +94,9 @@ class VisualStart:
             )
         order = np.argsort(ids)
         known = points[order][np.searchsorted(ids[order], seen.ids[rows])]
-        error = ERROR_PX / rig.cameras[0].camera.fx
-        solved = camera_pose(known, seen.normalized[rows], error)
+        solved = rig.cameras[0].body_pose(known, seen.normalized[rows], ERROR_PX)
         if solved is None or 2 * np.count_nonzero(solved[1]) < count:
             return Refusal("fit", "features that fit one motion from one frame to the next")
-        camera_T_before, fits = solved
+        before_T_now, fits = solved
         self.outliers = np.sort(seen.ids[rows][~fits])
-        return camera_T_before.inverse().compose(rig.cameras[0].body_T_camera.inverse())
+        return before_T_now

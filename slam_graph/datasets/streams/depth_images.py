@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.images import Fault, FileImages, find_damage
+from slam_graph.datasets.streams.images import Fault, FileImages, decoded
 from slam_graph.datasets.streams.pairing import ABSENT
 from slam_graph.errors import DataError
 from slam_graph.sensors import Camera, DepthSensor, Rig
@@ -199,15 +199,9 @@ def decode_depth(data: bytes, where: str) -> NDArray[Any] | Fault:
     Returns:
         (height, width) uint16 or float32, or a fault of kind `depth_unreadable`.
     """
-    damage = find_damage(data)
-    if damage is not None:
-        return Fault("depth_unreadable", f"{where}: {damage}")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        return Fault("depth_unreadable", f"{where}: {error.err}")
-    if image is None:
-        return Fault("depth_unreadable", f"{where}: not an image that OpenCV can read")
+    image = decoded(data, cv2.IMREAD_UNCHANGED)
+    if isinstance(image, str):
+        return Fault("depth_unreadable", f"{where}: {image}")
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
         what = f"{where}: {image.dtype} {image.shape}; depth is one channel of uint16 or float32"
         return Fault("depth_unreadable", what)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -112,16 +112,27 @@ def decode_grey(data: bytes, where: str) -> Image | Fault:
     Returns:
         (height, width) uint8, or a fault of kind `image_unreadable`.
     """
+    image = decoded(data, cv2.IMREAD_GRAYSCALE)
+    if isinstance(image, str):
+        return Fault("image_unreadable", f"{where}: {image}")
+    return image.astype(np.uint8, copy=False)
+
+
+def decoded(data: bytes, flags: int) -> NDArray[Any] | str:
+    """The image in the bytes of a file, or what is wrong with them.
+
+    Args:
+        data: bytes of the file.
+        flags: OpenCV's, of `cv2.imdecode`.
+    """
     damage = find_damage(data)
     if damage is not None:
-        return Fault("image_unreadable", f"{where}: {damage}")
+        return damage
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        return Fault("image_unreadable", f"{where}: {error.err}")
-    if image is None:
-        return Fault("image_unreadable", f"{where}: not an image that OpenCV can read")
-    return image.astype(np.uint8, copy=False)
+        return str(error.err)
+    return "not an image that OpenCV can read" if image is None else image
 
 
 def find_damage(data: bytes) -> str | None:

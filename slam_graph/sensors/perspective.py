@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of a camera by points that it sees: PnP with RANSAC (OpenCV), the same for all."""
+
+from __future__ import annotations
+
+import cv2
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import BoolArray, FloatArray
+
+RANSAC_ITERATIONS = 200
+_CONFIDENCE = 0.999
+
+
+def camera_pose(
+    points: FloatArray, rays: FloatArray, error: float, least: int = 4
+) -> tuple[gtsam.Pose3, BoolArray] | None:
+    """camera_T_points of known points that a camera sees, and which of them fit it.
+
+    Samples of three points and one (AP3P: Ke & Roumeliotis 2017), then Levenberg-Marquardt over
+    the inliers.
+
+    Args:
+        points: (N, 3) m.
+        rays: (N, 2) where the camera sees them, on its plane z = 1.
+        error: largest error on that plane of a point that fits.
+        least: how many points must fit the best sample.
+
+    Returns:
+        The pose, and (N,) which points are in front of the camera and fit; None without a pose.
+    """
+    cv2.setRNGSeed(0)  # OpenCV draws from one global generator
+    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)
+    found, rotation, translation, rows = cv2.solvePnPRansac(
+        points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=RANSAC_ITERATIONS,
+        reprojectionError=error,
+        confidence=_CONFIDENCE,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or rows is None or len(rows) < least:
+        return None
+    chosen = rows[:, 0]
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[chosen], rays[chosen], np.eye(3), None, rotation, translation
+    )
+    seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
+    matrix = cv2.Rodrigues(rotation)[0]
+    ahead = (points @ matrix.T + translation.T)[:, 2] > 0
+    pose = gtsam.Pose3(gtsam.Rot3(matrix), translation[:, 0])
+    return pose, (np.linalg.norm(seen - rays, axis=1) < error) & ahead
