@@ -89,7 +89,7 @@ def test_dynamics_are_those_that_the_recording_has() -> None:
     rig, algorithm = Rig((RigCamera(CAMERA, gtsam.Pose3()),)), AlgorithmConfig(name="swf")
     assert Dynamics.of(rig, algorithm, BackendConfig()).rig is rig
     without = Dynamics.of(replace(rig, has_imu=False), algorithm, BackendConfig())
-    assert not without.measures_gravity
+    assert not without.rig.has_imu
     assert without.config.noise.gravity == 0.0
     wanted = BackendConfig(dynamics=DynamicsConfig(model="imu"))
     with pytest.raises(ConfigError, match="has no IMU; use constant_velocity"):

@@ -49,7 +49,7 @@ class NoiseConfig(Settings):
     take it where it is clearly larger than `pixel_sigma`, up to four times that. any: also where
     it is smaller, down to a quarter; covariances are then more often too small. never: take
     `pixel_sigma`, as GTSAM's smoothers always do."""
-    gravity: float = expert(9.81, ge=0)
+    gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""
     max_imu_gap_s: float = expert(0.03, gt=0)

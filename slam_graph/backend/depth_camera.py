@@ -3,9 +3,9 @@
 """Depth as a measurement: what a depth sensor says of a feature, as a second camera would.
 
 A camera beside the first one, at a distance b along its x axis, sees a point of depth z at
-x - b / z on its plane z = 1. So a depth is an observation of a camera that does not exist, and its
+x - b / z on its plane z = 1. So a depth is an observation of a virtual camera, and its
 noise, which grows with z², is that of a disparity. The observation repeats the pixel of the real
-camera, which must not count twice: so the noise of the camera that does not exist is r times as
+camera, which must not count twice: so the noise of the virtual camera is r times as
 large, by a focal length that is r times as small, and the distance b is such that z has the noise
 of the sensor. What is counted twice of the pixel is then 1 / r².
 """
@@ -30,7 +30,7 @@ from slam_graph.sensors import (
 )
 
 _NOISIER = 4.0
-"""r: how many times noisier the camera that does not exist is."""
+"""r: how many times noisier the virtual camera is."""
 _NEAR_M = 0.7
 """The constant part of a depth's noise counts as it does at this depth; nearer it counts less."""
 _MAX_SIGMAS = 3.0
@@ -99,7 +99,7 @@ def _square_noise_per_m(sensor: DepthSensor) -> float:
 
 
 def _baseline_m(sensor: DepthSensor, camera: Camera) -> float:
-    """Distance of the camera that does not exist.
+    """Distance of the virtual camera.
 
     The inverse depth has the standard deviation k of `_square_noise_per_m`, and b times it is the
     difference of two coordinates, of 1 and r pixels.

@@ -67,11 +67,6 @@ class Dynamics:
             model_rig(rig, config.dynamics), without_prediction(algorithm), without_imu(config)
         )
 
-    @property
-    def measures_gravity(self) -> bool:
-        """Whether roll and pitch in the world are known."""
-        return self.rig.has_imu
-
     def extend(self, imu: ImuBuffer, until_ns: int) -> None:
         """Add to the samples of an IMU what the model says of the time up to a frame."""
 

@@ -31,9 +31,6 @@ _LEAST_SHARE = 0.5
 """Part of the known points that must fit it."""
 _ROUNDS = 3
 """With a rolling shutter: its rows are undone with the rate that the round before has found."""
-_END_RATE = 1.0
-"""If white noise has turned a body by δ more than expected over a time t, then its rate has changed
-by 1.5 δ / t in the mean, and its velocity likewise: covariance t² / 2 over variance t³ / 3."""
 
 
 class VisualMotion:
@@ -46,10 +43,6 @@ class VisualMotion:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._last: FeatureFrame | None = None
-
-    def forget(self) -> None:
-        """The next frame is the first."""
-        self._last = None
 
     def corrected(
         self,
@@ -149,7 +142,11 @@ def depths_within(
 
 
 def _moved(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:
-    """A predicted state at another pose, with the velocity and rate that lead there."""
+    """A predicted state at another pose, with the mean velocity and rate that lead there.
+
+    White noise would let both change by half as much again; but with a rolling shutter the rate
+    moves the rows, and so the pose that PnP finds: the two then overshoot in turn.
+    """
     seconds = (predicted.stamp_ns - before.stamp_ns) * 1e-9
     was = predicted.world_T_body
     turn = gtsam.Rot3.Logmap(was.rotation().between(pose.rotation()))
@@ -157,6 +154,6 @@ def _moved(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState
     return replace(
         predicted,
         world_T_body=pose,
-        velocity=predicted.velocity + _END_RATE * shift / seconds,
-        gyro_bias=predicted.gyro_bias - _END_RATE * turn / seconds,
+        velocity=predicted.velocity + shift / seconds,
+        gyro_bias=predicted.gyro_bias - turn / seconds,
     )
