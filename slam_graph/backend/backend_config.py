@@ -254,11 +254,44 @@ class DynamicsConfig(Settings):
         return has_imu and self.model != "constant_velocity"
 
 
+class GnssConfig(Settings):
+    """Position fixes, of GNSS or any other kind."""
+
+    enabled: bool = True
+    """Use the fixes of the recording, and report the trajectory in their world: east, north, up
+    from the datum. Switch it off to compare."""
+    lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
+    """Position of the antenna in the body frame, in metres."""
+    time_offset_s: float = expert(0.0, ge=-10, le=10)
+    """Added to the times of the fixes to get them on the clock of the IMU, or of the cameras where
+    there is no IMU."""
+
+
+class OdometryConfig(Settings):
+    """Odometry of wheels or legs: the motion of the body from frame to frame."""
+
+    enabled: bool = True
+    """Use the odometry of the recording. Switch it off if wheels slip much."""
+    position_noise: float = expert(0.02, gt=0)
+    """Standard deviation of the position on each axis after one metre, m/√m."""
+    position_noise_per_rad: float = expert(0.01, ge=0)
+    """What a turn adds to it, m/rad."""
+    rotation_noise: float = expert(0.01, gt=0)
+    """Standard deviation of the rotation about each axis after one metre, rad/√m. Odometry of
+    wheels knows neither roll nor pitch: on uneven ground raise it."""
+    rotation_noise_per_rad: float = expert(0.02, ge=0)
+    """What a turn adds to it, rad/rad."""
+
+
 class BackendConfig(Settings):
     """Settings of the back end that do not depend on the algorithm."""
 
     dynamics: DynamicsConfig = DynamicsConfig()
     """What predicts the state from frame to frame."""
+    gnss: GnssConfig = GnssConfig()
+    """Position fixes."""
+    odometry: OdometryConfig = OdometryConfig()
+    """Odometry of wheels or legs."""
     noise: NoiseConfig = NoiseConfig()
     """Noise of the sensors."""
     triangulation: TriangulationConfig = TriangulationConfig()

@@ -17,6 +17,8 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.aiding import Aiding
+from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.imu_factor import Propagation
@@ -26,6 +28,7 @@ from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observ
 from slam_graph.backend.dynamics import Dynamics
 from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
+from slam_graph.backend.estimator_knowledge import EstimatorKnowledge
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.segment_joint import SegmentJoint
@@ -50,7 +53,7 @@ _MAX_AHEAD_NS = 10_000_000_000
 """A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
 
-class Estimator:
+class Estimator(EstimatorKnowledge):
     """A visual-inertial estimator under the policies of one algorithm.
 
     Feed it IMU samples and feature frames in the order of time; every frame gives the state then.
@@ -62,6 +65,7 @@ class Estimator:
         states: all that the last frame led to: one, none, or several where frames have waited.
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
         report: what is known of the last step besides the state.
+        aiding: takes position fixes and odometry up to the next frame.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class Estimator:
         if algorithm.engine != "square_root":
             self._make_engine = SmootherEngine
         self._check = StartCalibration(rig, config)
+        self.aiding = Aiding(config, dynamics.measures_gravity)
         self._given: NavState | None = None
         self._before: NavState | None = None
         self._held: deque[FeatureFrame] | None = None
@@ -117,6 +122,8 @@ class Estimator:
         self._engine: Engine = self._make_engine(context)
         self._context = context
         self._start_up = StartUp(context, self._start_mode, self._before)
+        propagation.aiding = self.aiding
+        self.aiding.restart()
         self._standstill = StandstillDetector(config.zero_velocity)
         self._latest_ns = np.iinfo(np.int64).min
         self.window: Window | None = None
@@ -139,6 +146,7 @@ class Estimator:
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
+        self.aiding.restart()
 
     def begin_segment(self, before: NavState | None) -> None:
         """Forget the state, which is lost, and start again with the frames that follow.
@@ -194,6 +202,18 @@ class Estimator:
             return self.states
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
+        """The state at a frame; all of them anew once fixes tell where their world is."""
+        state = self._solve(frame)
+        found = None if self.window is None else self.aiding.alignment(state)
+        if self.window is None or found is None:
+            return state
+        self.window, self._engine = regauged(self.window, found), self._make_engine(self._context)
+        self._context.propagation.restart()
+        self._start_up.settle()
+        self.replayed = self.states = self.aiding.settle(found)
+        return self.replayed[-1]
+
+    def _solve(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
         self.report = StepReport()
         self.solved_ns = frame.stamp_ns
@@ -276,7 +296,7 @@ class Estimator:
             corrected = self.replayed
             state = self._take(held.popleft())
             if self.replayed is not corrected:  # what came before is superseded
-                states.clear()
+                states[:] = (self.replayed or [])[:-1]
             if state is not None:
                 states.append(state)
         if self.replayed is not None:
@@ -304,6 +324,7 @@ class Estimator:
         self._standstill.dynamic = self._start_up.outliers
         self.window, self._engine = window, self._make_engine(self._context)
         self._context.propagation.restart()
+        self.aiding.restart()
         self.replayed = self.states = [self.window.current(self.window.prior)]
         return self.replayed[0]
 
@@ -359,41 +380,3 @@ class Estimator:
             return None
         information = self._engine.information(self.window)
         return variables.estimate(self.window.stamp_ns, self.window.state, information)
-
-    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
-        """The joint covariance (n, n) of variables after the last step.
-
-        Args:
-            keys: of past poses X(i), of the current state X(i), V(i), B(i), of features L(j) of the
-                state, or of the calibration; tangents are GTSAM's.
-
-        Raises:
-            EstimationError: if there is no state yet, or a key is not of a variable now.
-        """
-        if self.window is None:
-            raise EstimationError("there is no state yet")
-        information = self._engine.information(self.window)
-        missing = [gtsam.DefaultKeyFormatter(k) for k in keys if k not in information.layout]
-        if missing:
-            raise EstimationError(f"not variables of the last step: {', '.join(missing)}")
-        return information.covariance_of(keys)
-
-    def factor_graph(self) -> WindowGraph:
-        """The cost of the last step as a factor graph of GTSAM with its values.
-
-        For this package's engine: marginal prior, dynamics, and a projection factor for each
-        observation, after the Gauss-Newton steps and before marginalization. For GTSAM's smoothers:
-        what they hold.
-
-        Raises:
-            EstimationError: if there is no state yet.
-        """
-        if self.window is None:
-            raise EstimationError("there is no state yet, and so no factor graph")
-        return self._engine.factor_graph(self.window)
-
-    def landmarks(self) -> tuple[IntArray, FloatArray]:
-        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
-        if self.window is None:
-            return np.zeros(0, np.int64), np.zeros((0, 3))
-        return self._engine.landmarks(self.window)

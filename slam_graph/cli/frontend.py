@@ -184,7 +184,7 @@ def _watch(
         assert isinstance(packet.frame, CameraFrame)
         pictures.show(packet.frame, features)
         if recorder is not None:
-            recorder.write(packet.imu, features)
+            recorder.write(packet.imu, features, packet.aiding)
 
     return watch
 

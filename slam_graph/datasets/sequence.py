@@ -24,10 +24,11 @@ from slam_graph.datasets.groundtruth import (
     resolve_groundtruth,
 )
 from slam_graph.datasets.packets import packetize, packetize_alone
+from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 _HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""
@@ -310,15 +311,32 @@ class RecordedSequence(Displayed, ABC):
             end_ns: last frame time to deliver.
         """
         if not self.has_imu:
-            return packetize_alone(self.frames(start_ns, end_ns))
+            alone = packetize_alone(self.frames(start_ns, end_ns))
+            return with_aiding(alone, self.aiding.within(start_ns, None))
         after_ns = None if start_ns is None else start_ns - _HISTORY_NS
-        return packetize(
+        packets = packetize(
             self.frames(start_ns, end_ns),
             self.imu_blocks(after_ns),
             self.diagnostics,
             None if start_ns is None else _HISTORY_NS,
             max(0, round(self.rig.end_offset_s * 1e9)),
         )
+        return with_aiding(packets, self.aiding.within(start_ns, None))
+
+    @cached_property
+    def aiding(self) -> AidingData:
+        """Position fixes and odometry of the whole recording."""
+        return self.read_aiding()
+
+    def read_aiding(self) -> AidingData:
+        """Read them; here those in files beside the recording (`streams/aiding_files.py`)."""
+        path = getattr(self, "path", None)
+        if not isinstance(path, Path):
+            return AidingData.empty()
+        folder = path if path.is_dir() else path.parent
+        folders = [folder, folder.parent] if folder.name == "mav0" else [folder]
+        found = (read_aiding(place, self.diagnostics) for place in folders)
+        return next((data for data in found if len(data)), AidingData.empty())
 
     def imu(self) -> ImuData:
         """All IMU samples at once; none without an IMU."""

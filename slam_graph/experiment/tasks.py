@@ -195,7 +195,8 @@ class RecordTask(Settings):
         truth, start = sequence.groundtruth(), sequence.initial_state()
         with TrackRecorder(self.folder, sequence.rig, self.source.name, truth, start) as recorder:
             for packet in sequence.packets(start_ns if config.start_s > 0 else None, end_ns):
-                recorder.write(packet.imu, frontend.track(packet.frame, packet.imu))
+                features = frontend.track(packet.frame, packet.imu)
+                recorder.write(packet.imu, features, packet.aiding)
 
 
 class RunTask(Settings):

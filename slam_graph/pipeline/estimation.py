@@ -164,6 +164,7 @@ class Estimation:
             estimator.solved_ns != features.stamp_ns,
             tracked.clock.milliseconds,
             tracked.frame_stats,
+            estimator.georeferenced,
         )
         self._note(frame, tracked)
         return frame
@@ -194,6 +195,8 @@ class Estimation:
         if not estimator.initialized:
             self._start_from_known_state(tracked.packet.frame.stamp_ns)
         estimator.add_imu(tracked.packet.imu)
+        if tracked.packet.aiding is not None:
+            estimator.add_aiding(tracked.packet.aiding)
         self._recovery.check_recorded(stamp_ns, tracked.packet.imu)
         try:
             state = estimator.add_frame(features)

@@ -18,7 +18,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.pipeline.stage import EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame, ImuData, Rig
+from slam_graph.sensors import AidingData, FeatureFrame, ImuData, Rig
 
 _SNAPSHOT_PERIOD_S, _SNAPSHOT_SHARE = 10.0, 0.02
 """The estimate so far is written no more often, and takes no more of the time of a run."""
@@ -145,7 +145,9 @@ class Progress(Protocol):
 class Recorder(Protocol):
     """Records feature tracks, for a replay."""
 
-    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+    def write(
+        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
+    ) -> None:
         """Called after each frame.
 
         Args:
@@ -184,7 +186,9 @@ class NullProgress:
 class NullRecorder:
     """Records nothing."""
 
-    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+    def write(
+        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
+    ) -> None:
         """Record nothing."""
 
 
@@ -200,7 +204,7 @@ class Observers(Stage):
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Record and report a frame."""
-        self._recorder.write(frame.packet.imu, frame.features)
+        self._recorder.write(frame.packet.imu, frame.features, frame.packet.aiding)
         self._progress.advance(frame.features.stamp_ns, frame.initialized)
 
 

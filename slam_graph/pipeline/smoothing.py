@@ -58,7 +58,9 @@ class Smoothing(Stage):
         if self._log is None:
             return
         try:
-            self._log.add(frame.packet.imu, frame.features, frame.imu_noise)
+            packet = frame.packet
+            self._log.add(packet.imu, frame.features, frame.imu_noise, packet.aiding)
+            self._log.georeferenced = frame.georeferenced
         except (OSError, SlamGraphError) as error:
             self._give_up(error)
 

@@ -51,6 +51,7 @@ class EstimatedFrame:
         waits: whether this frame waits for IMU samples, and the state is that of an earlier one.
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
+        georeferenced: whether the world of the estimate is that of position fixes.
     """
 
     packet: Packet
@@ -66,6 +67,7 @@ class EstimatedFrame:
     waits: bool = False
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
+    georeferenced: bool = False
 
     @property
     def image(self) -> np.ndarray | None:

@@ -20,7 +20,7 @@ import numpy as np
 from slam_graph.datasets import Sequence
 from slam_graph.frontend import Feedback, Frontend
 from slam_graph.results import RunInput
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet
 
 _LEAD_MARGIN_NS = 10_000_000
 """Packets lead by so much more than the time offset wants: it is estimated on."""
@@ -88,6 +88,7 @@ class _LeadingPackets:
         self._packets = packets
         self._frames: deque[CameraFrame | FeatureFrame] = deque()
         self._imu: list[ImuData] = []
+        self._aiding: list[AidingData] = []
         self._newest_ns = np.iinfo(np.int64).min
 
     def __iter__(self) -> _LeadingPackets:
@@ -105,12 +106,16 @@ class _LeadingPackets:
                 break
             self._frames.append(packet.frame)
             self._imu.append(packet.imu)
+            if packet.aiding is not None:
+                self._aiding.append(packet.aiding)
             if len(packet.imu):
                 self._newest_ns = int(packet.imu.stamps_ns[-1])
         if not self._frames:
             raise StopIteration
         imu, self._imu = ImuData.concatenate(self._imu), []
-        return Packet(imu, self._frames.popleft())
+        aiding = AidingData.concatenate(self._aiding) if self._aiding else None
+        self._aiding = []
+        return Packet(imu, self._frames.popleft(), aiding)
 
 
 class Tracking:
@@ -189,7 +194,7 @@ def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
     count = len(asked.rig.cameras)
     for packet in packets:
         imu = packet.imu if asked.rig.has_imu else ImuData.empty()
-        yield Packet(imu, _first_cameras(packet.frame, count))
+        yield Packet(imu, _first_cameras(packet.frame, count), packet.aiding)
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:

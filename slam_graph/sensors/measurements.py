@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.sensors.aiding import AidingData
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +220,10 @@ class Packet:
             or after `frame.stamp_ns` (if there is one). So consecutive packets partition the IMU
             stream, and the IMU can be interpolated at the time of the frame.
         frame: images, or features that were found in them before.
+        aiding: fixes and odometry after the frame before, up to and including the first sample of
+            the odometry at or after this one; None where there are none.
     """
 
     imu: ImuData
     frame: CameraFrame | FeatureFrame
+    aiding: AidingData | None = None

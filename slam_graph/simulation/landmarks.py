@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.simulation.motion import Motion
@@ -58,14 +60,27 @@ class Landmarks:
         points: (P, 3) static landmarks, in random order.
         normals: (P, 3) of the walls that they are on, zero where there is none.
         box: dynamic landmarks, numbered from P on; or None.
+        reach_m: how far from a place static landmarks are looked for; None for everywhere.
     """
 
     points: FloatArray
     normals: FloatArray
     box: _MovingBox | None = None
+    reach_m: float | None = None
 
     def __len__(self) -> int:
         return len(self.points) + (0 if self.box is None else len(self.box.points))
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.points[:, :2])
+
+    def around(self, place: FloatArray) -> IntArray:
+        """Numbers (N,) of the landmarks within reach of a place (3,), in random order."""
+        if self.reach_m is None:
+            return np.arange(len(self))
+        near = self._tree.query_ball_point(place[:2], self.reach_m, return_sorted=True)
+        return np.array(near, np.int64)
 
     def at(self, index: IntArray, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Positions and normals (N, 3) of landmarks by their numbers (N,)."""

@@ -26,7 +26,8 @@ from slam_graph.datasets import (
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.simulation.aiding_simulation import simulated_aiding
 from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.imu_simulation import ImuSource
 from slam_graph.simulation.landmarks import Landmarks, MovingBoard
@@ -103,6 +104,14 @@ class SimulatedSequence(RecordedSequence):
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU samples from `after_ns` on."""
         return self.flight.imu.blocks(after_ns)
+
+    def read_aiding(self) -> AidingData:
+        """Position fixes and odometry, as far as there are any."""
+        stamps, config = self.flight.exposures_ns, self.config
+        span_ns = int(stamps[0]), int(stamps[-1])
+        return simulated_aiding(
+            self.flight.motion, span_ns, config.gnss, config.odometry, config.seed
+        )
 
     def groundtruth(self) -> Trajectory:
         """The ground truth at the times of the frames, on the clock of the IMU."""
@@ -206,7 +215,7 @@ class SimulatedTracks(SimulatedSequence):
         with TrackRecorder(path, self.rig, self.name, truth, start, notes) as recorder:
             for packet in self.packets():
                 assert isinstance(packet.frame, FeatureFrame)
-                recorder.write(packet.imu, packet.frame)
+                recorder.write(packet.imu, packet.frame, packet.aiding)
                 progress(packet.frame.stamp_ns)
 
 
@@ -251,10 +260,11 @@ class SimulatedImages(SimulatedSequence):
             yield self.renderer.frame(self.flight.motion, exposure_ns, self._offset_ns)
 
     def _write(self, path: Path, notes: Mapping[str, str], progress: Progress) -> None:
-        truth, rate_hz = self.groundtruth(), self.config.rate_hz
+        truth, rate_hz = self.groundtruth(), self.config.frame_rate_hz
         with EurocWriter(
             path, self.rig, truth, "simulated", rate_hz, with_imu=self.has_imu, notes=notes
         ) as writer:
+            writer.write_aiding(self.aiding)
             for packet in self.packets():
                 assert isinstance(packet.frame, CameraFrame)
                 writer.write_imu(packet.imu)

@@ -13,7 +13,7 @@ from pydantic import Field
 from slam_graph.errors import ConfigError
 from slam_graph.settings import ConfigTree, Settings, expert
 
-TRAJECTORIES = ("figure8", "rooms", "random")
+TRAJECTORIES = ("figure8", "rooms", "random", "car")
 """Names of the generated trajectories; any other text is the path of a recorded one."""
 
 
@@ -147,6 +147,35 @@ class MovingObjectConfig(Settings):
     """Time at which it has come into view from the side; 0: it is there in the first frame."""
 
 
+class SimulatedGnssConfig(Settings):
+    """Simulated position fixes; their world is that of the ground truth."""
+
+    sigma_m: float | None = Field(None, gt=0)
+    """Standard deviation of a fix on each axis, in metres; no fixes if not given."""
+    rate_hz: float = expert(1.0, gt=0)
+    """Fixes per second."""
+    multipath: float = expert(0.0, ge=0, lt=1)
+    """Share of fixes that are off by reflections."""
+    multipath_m: float = expert(10.0, ge=0)
+    """How far they are off, in any horizontal direction, in metres."""
+    lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
+    """Position of the antenna in the body frame, in metres; a run must be told the same
+    (`backend.gnss.lever_arm_m`)."""
+
+
+class SimulatedOdometryConfig(Settings):
+    """Simulated odometry, which drifts."""
+
+    enabled: bool = Field(default=False)
+    """Whether the recording has odometry."""
+    rate_hz: float = expert(50.0, gt=0)
+    """Samples per second."""
+    position_noise: float = expert(0.02, ge=0)
+    """Standard deviation of the position on each axis after one metre, m/√m."""
+    rotation_noise: float = expert(0.003, ge=0)
+    """Standard deviation of the rotation about each axis after one metre, rad/√m."""
+
+
 class StartConfig(Settings):
     """The start state that comes with the data, and its standard deviations."""
 
@@ -169,6 +198,9 @@ _REAL_START = StartConfig(
 )
 """Uncertainty of the ground truth of a real flight, used with `real_imu` unless `start` is set."""
 
+_CAR_SPEED, _CAR_RATE_HZ = 10.0, 10.0
+"""Speed of a car (m/s), and frames per second of its cameras."""
+
 
 class SimulationConfig(Settings):
     """All settings of a simulation.
@@ -184,8 +216,9 @@ class SimulationConfig(Settings):
     """tracks: feature tracks, made in seconds, for questions about the back end; images: rendered
     images, some 0.1 s each, for questions about the front end."""
     trajectory: str = Field("figure8")
-    """figure8, rooms (through three rooms and back, for loop closure), random, or the path of a
-    recorded trajectory (a ground-truth file or EuRoC folder)."""
+    """figure8, rooms (through three rooms and back, for loop closure), random, car (on plane roads at
+    10 m/s, with the cameras of KITTI at 10 Hz; tracks only), or the path of a recorded trajectory
+    (a ground-truth file or EuRoC folder)."""
     real_imu: bool = Field(False)
     """Use the IMU samples recorded with the trajectory, with their vibration, instead of simulated
     ones. Needs an EuRoC folder as `trajectory`."""
@@ -225,6 +258,10 @@ class SimulationConfig(Settings):
     """The depth of what the first camera sees, as images or with the features."""
     moving_object: MovingObjectConfig | None = expert(None)
     """A board that moves in front of the cameras, in rendered images; none if not given."""
+    gnss: SimulatedGnssConfig = SimulatedGnssConfig()
+    """Position fixes."""
+    odometry: SimulatedOdometryConfig = SimulatedOdometryConfig()
+    """Odometry of wheels."""
     start: StartConfig | None = expert(None)
     """The start state that comes with the data; with a real IMU it is less certain by default."""
 
@@ -234,6 +271,20 @@ class SimulationConfig(Settings):
         if self.start is not None:
             return self.start
         return _REAL_START if self.real_imu else StartConfig()
+
+    @property
+    def flown(self) -> FlightConfig:
+        """How the trajectory is flown, with the defaults of a car for a car."""
+        if self.trajectory != "car":
+            return self.flight
+        given = {name: getattr(self.flight, name) for name in self.flight.model_fields_set}
+        return FlightConfig(**({"speed": _CAR_SPEED, "hover_s": 0.0} | given))
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames per second, with the default of a car for a car."""
+        slow = self.trajectory == "car" and "rate_hz" not in self.model_fields_set
+        return _CAR_RATE_HZ if slow else self.rate_hz
 
     @property
     def place_seed(self) -> int:
@@ -264,7 +315,7 @@ def load_simulation_config(
     """
     tree = ConfigTree()
     if isinstance(config, SimulationConfig):
-        tree.merge(ConfigTree(config.model_dump()))
+        tree.merge(ConfigTree(config.model_dump(exclude_unset=True)))
     elif config in TRAJECTORIES:
         raise ConfigError(f"'{config}' is no file of settings; write trajectory='{config}'")
     elif config is not None:

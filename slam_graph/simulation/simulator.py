@@ -25,6 +25,7 @@ from slam_graph.simulation.imu_simulation import ImuSource, RecordedImu, Simulat
 from slam_graph.simulation.landmarks import Landmarks, ahead, moving_box, on_walls
 from slam_graph.simulation.motion import Motion, SplineMotion
 from slam_graph.simulation.recorded_flight import LEAD_NS, RecordedFlight
+from slam_graph.simulation.roads import beside_the_road, kitti_rig
 from slam_graph.simulation.simulated_sequence import (
     Flight,
     SimulatedImages,
@@ -116,6 +117,8 @@ def simulate(
         raise ConfigError(
             "moving_object is for images; for tracks set landmarks.moving_points instead"
         )
+    if config.trajectory == "car" and config.kind == "images":
+        raise ConfigError("trajectory 'car' has tracks only; remove kind, or choose another one")
     if config.real_imu and not config.with_imu:
         raise ConfigError("real_imu is for recordings with an IMU; remove it, or set with_imu")
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
@@ -168,7 +171,7 @@ def _fly(config: SimulationConfig, rig: Rig, seed: int, duration_s: float) -> Sp
     """A flight along a generated path."""
     rng = np.random.default_rng(random_stream(seed, "trajectory"))
     total_s = duration_s + 2e-9 * LEAD_NS
-    return fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flight, rng)
+    return fly(config.trajectory, total_s, rig.cameras[0].body_T_camera, config.flown, rng)
 
 
 def _world(config: SimulationConfig, rig: Rig, motion: SplineMotion) -> World:
@@ -179,6 +182,8 @@ def _world(config: SimulationConfig, rig: Rig, motion: SplineMotion) -> World:
     """
     if config.trajectory == "rooms":
         return three_rooms()
+    if config.trajectory == "car":
+        return World(())
     if config.world_seed is not None:
         motion = _fly(config, rig, config.world_seed, _DEFAULT_DURATION_S)
     return room_around(_positions(motion), config.landmarks.margin_m)
@@ -187,7 +192,9 @@ def _world(config: SimulationConfig, rig: Rig, motion: SplineMotion) -> World:
 def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:
     rng = np.random.default_rng(random_stream(config.place_seed, "landmarks"))
     settings = config.landmarks
-    if settings.kind == "ahead":
+    if config.trajectory == "car":
+        static = beside_the_road(flight.motion, rng)
+    elif settings.kind == "ahead":
         views = [View.of(mounted) for mounted in flight.rig.cameras]
         leaders = [views[group[0]] for group in camera_groups(flight.rig, views)]
         static = ahead(flight.motion, leaders, config.tracks.features, rng)
@@ -196,7 +203,7 @@ def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:
     if settings.moving_points == 0:
         return static
     box = moving_box(_positions(flight.motion), flight.motion.start_ns, settings.moving_points, rng)
-    return Landmarks(static.points, static.normals, box)
+    return Landmarks(static.points, static.normals, box, static.reach_m)
 
 
 def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
@@ -204,7 +211,8 @@ def _rig(config: SimulationConfig, recorded: Rig | None) -> Rig:
     if config.calibration is not None:
         rig = read_kalibr(config.calibration)
     else:
-        rig = recorded if recorded is not None else euroc_rig()
+        own = kitti_rig if config.trajectory == "car" else euroc_rig
+        rig = recorded if recorded is not None else own()
     if config.cameras is not None:
         rig = rig.select(config.cameras)
     if config.depth.sensor != "rig":
@@ -232,7 +240,7 @@ def _exposures(motion: Motion, config: SimulationConfig) -> IntArray:
         raise DataError("the trajectory is too short: it needs 0.2 s and the time of one frame")
     if config.duration_s is not None:
         end_ns = min(end_ns, start_ns + round(config.duration_s * 1e9))
-    return stamps_between(start_ns, end_ns, config.rate_hz)
+    return stamps_between(start_ns, end_ns, config.frame_rate_hz)
 
 
 def _name(path: Path) -> str:

@@ -15,7 +15,7 @@ from slam_graph.sensors import Camera, DepthSensor, FeatureFrame, FeatureObserva
 from slam_graph.simulation.landmarks import Landmarks
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.simulation_config import TrackConfig, random_stream
-from slam_graph.simulation.views import View, camera_groups
+from slam_graph.simulation.views import MAX_DEPTH_M, View, camera_groups
 from slam_graph.simulation.world import World
 
 GRID = (8, 5)
@@ -103,7 +103,8 @@ class TrackSimulator:
         place_seed: int | None = None,
         depth_noise: float = 1.0,
     ) -> None:
-        self.views = [View.of(mounted) for mounted in rig.cameras]
+        reach_m = landmarks.reach_m or MAX_DEPTH_M
+        self.views = [View.of(mounted, reach_m) for mounted in rig.cameras]
         self.groups = camera_groups(rig, self.views)
         self._middle_s = rig.cameras[0].middle_s
         self._world = world
@@ -191,11 +192,12 @@ class TrackSimulator:
 
     def _begin(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
         """Start tracks of landmarks without one, in the cells with the fewest features."""
-        total, searched = len(self._landmarks), 0
+        near = self._landmarks.around(pose.position)
+        total, searched = len(near), 0
         taken = [t.landmarks for t in self._tracks]
         while searched < total and len(tracks.ids) < self._config.features:
             count = min(_LANDMARKS_AT_ONCE, total - searched)
-            block = (self._next_landmark + np.arange(count)) % total
+            block = near[(self._next_landmark + np.arange(count)) % total]
             self._next_landmark, searched = (self._next_landmark + count) % total, searched + count
             block = block[~np.isin(block, np.concatenate(taken))]
             index, pixels = self._see(leader, pose, block)

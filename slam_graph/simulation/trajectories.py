@@ -139,6 +139,12 @@ _WOBBLE_LENGTHS_M = ((1.3, 3.7), (1.7, 2.9))
 MIN_LEG_M, SHARPEST_TURN = 2.0, 0.0
 """Shortest distance to the next random point, and the smallest cosine of the turn towards it."""
 
+_CAMERA_HEIGHT_M, _CAR_RADIUS_M, _CAR_STEP_M = 1.65, 25.0, 5.0
+_STRAIGHTS_M = (40.0, 160.0)
+"""Height of a car's camera, radius of its turns, distance of control points, lengths of roads."""
+_CAR_WOBBLE_RAD, _CAR_WAVES = 0.006, 8.0
+"""Amplitude of its pitch and roll, and how many times longer their waves are than in flight."""
+
 START_NS = 1_000_000_000
 """Time at which generated motions begin."""
 
@@ -186,10 +192,28 @@ def _random(length_m: float, rng: np.random.Generator) -> FloatArray:
     return np.array(points)
 
 
+def _car(length_m: float, rng: np.random.Generator) -> FloatArray:
+    """Control points (M, 3) of a drive on plane roads: straight ones, and arcs between them."""
+    points, place, heading = [np.array([0.0, 0.0, _CAMERA_HEIGHT_M])], np.zeros(2), 0.0
+    driven = 0.0
+    while driven < length_m + 3.0 * _CAR_STEP_M:
+        turn = rng.choice([-1.0, 1.0]) * np.radians(rng.uniform(45.0, 100.0))
+        straight, arc = rng.uniform(*_STRAIGHTS_M), abs(turn) * _CAR_RADIUS_M
+        steps = max(2, round(straight / _CAR_STEP_M)), max(2, round(arc / _CAR_STEP_M))
+        headings = np.concatenate([np.full(steps[0], 0.0), turn * (np.arange(steps[1]) + 0.5) / steps[1]])
+        lengths = np.repeat([straight / steps[0], arc / steps[1]], steps)
+        for angle, metres in zip(heading + headings, lengths, strict=True):
+            place = place + metres * np.array([np.cos(angle), np.sin(angle)])
+            points.append(np.append(place, _CAMERA_HEIGHT_M))
+        heading, driven = heading + turn, driven + straight + arc
+    return np.array(points)
+
+
 _SHAPES: dict[str, Callable[[float, np.random.Generator], FloatArray]] = {
     "figure8": _figure8,
     "rooms": _rooms,
     "random": _random,
+    "car": _car,
 }
 """By name, a function that gives control points (M, 3) of a path of at least that many metres."""
 
@@ -204,7 +228,7 @@ def fly(
     """A flight along a generated path.
 
     Args:
-        shape: figure8, rooms or random.
+        shape: figure8, rooms, random or car.
         duration_s: of the flight.
         body_T_camera: the camera that looks ahead, with its image upright.
         config: speed and stops.
@@ -214,7 +238,8 @@ def fly(
     times_s = np.arange(waypoints, dtype=np.float64) * _WAYPOINT_PERIOD_S
     flown_m = _distance_flown(times_s, config)
     path = _by_arc_length(_SHAPES[shape](float(flown_m[-1]) + 2.0, rng))
-    view = _view_angles(path, flown_m, rng)
+    wobble = (_CAR_WOBBLE_RAD, _CAR_WAVES) if shape == "car" else (WOBBLE_RAD, 1.0)
+    view = _view_angles(path, flown_m, rng, wobble)
     # the view frame (x ahead, y left, z up) seen from a camera (x right, y down, z ahead)
     camera_R_view = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     view_R_body = Rotation.from_matrix(camera_R_view.T @ body_T_camera.rotation().matrix().T)
@@ -251,14 +276,22 @@ def _by_arc_length(points: FloatArray) -> CubicSpline:
     return CubicSpline(np.concatenate([[0.0], np.cumsum(steps)]), dense)
 
 
-def _view_angles(path: CubicSpline, flown_m: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Yaw along the path, and oscillating pitch and roll (N, 3), at distances `flown_m` (N,)."""
+def _view_angles(
+    path: CubicSpline, flown_m: FloatArray, rng: np.random.Generator, wobble: tuple[float, float]
+) -> FloatArray:
+    """Yaw along the path, and oscillating pitch and roll (N, 3), at distances `flown_m` (N,).
+
+    `wobble` has the amplitude (rad) of the oscillations and a factor on their wavelengths.
+    """
     dense = np.arange(0.0, flown_m[-1] + 2.0 * _HEADING_SMOOTHING_M, _PATH_STEP_M)
     tangent = path(dense, 1)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     heading = gaussian_filter1d(heading, _HEADING_SMOOTHING_M / _PATH_STEP_M, mode="nearest")
     angles = [np.interp(flown_m, dense, heading)]
     for lengths in _WOBBLE_LENGTHS_M:
-        waves = [np.sin(2 * np.pi * flown_m / x + rng.uniform(0, 2 * np.pi)) for x in lengths]
-        angles.append(WOBBLE_RAD * np.mean(waves, axis=0))
+        waves = [
+            np.sin(2 * np.pi * flown_m / (wobble[1] * x) + rng.uniform(0, 2 * np.pi))
+            for x in lengths
+        ]
+        angles.append(wobble[0] * np.mean(waves, axis=0))
     return np.column_stack(angles)

@@ -34,6 +34,7 @@ class View:
         position: (3,) of the camera in the body.
         reach: largest norm of a normalised point in the image; beyond it the distortion polynomial
             may fold points back into the image.
+        max_depth_m: points farther away are not seen.
     """
 
     camera: Camera
@@ -41,16 +42,17 @@ class View:
     body_R_camera: FloatArray
     position: FloatArray
     reach: float
+    max_depth_m: float = MAX_DEPTH_M
 
     @staticmethod
-    def of(mounted: RigCamera) -> View:
+    def of(mounted: RigCamera, max_depth_m: float = MAX_DEPTH_M) -> View:
         """The view of a camera of a rig."""
         camera, pose = mounted.camera, mounted.body_T_camera
         plane, valid = camera.visible(_border(camera))
         reach = float(np.max(np.linalg.norm(plane[valid], axis=1), initial=0.0))
         reach = reach if valid.all() else camera.max_tangent
         R, p = pose.rotation().matrix(), np.asarray(pose.translation())
-        return View(camera, mounted, R, p, 1.001 * reach)
+        return View(camera, mounted, R, p, 1.001 * reach, max_depth_m)
 
     def pose(self, world_R_body: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """world_R_camera (3, 3) and position (3,) of the camera, for a pose of the body."""
@@ -79,7 +81,7 @@ class View:
         R, eye = self.pose(world_R_body, position)
         from_eye = points - eye
         depth = from_eye @ R[:, 2]
-        near = np.flatnonzero((depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M))
+        near = np.flatnonzero((depth > MIN_DEPTH_M) & (depth < self.max_depth_m))
         plane = (from_eye[near] @ R[:, :2]) / depth[near, None]
         inside = np.einsum("ij,ij->i", plane, plane) < self.reach**2
         near, plane = near[inside], plane[inside]

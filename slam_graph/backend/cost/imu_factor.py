@@ -17,6 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.aiding import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise, MotionChange
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
@@ -73,12 +74,14 @@ class Propagation:
 
     Attributes:
         noise: of the IMU; it adapts to the innovations where the settings ask for it.
+        aiding: fixes and odometry between the frames; None for none.
     """
 
     def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
         self.config = config
         self.diagnostics = diagnostics
         self.noise = DynamicsNoise(imu, config.noise)
+        self.aiding: Aiding | None = None
         self._density = config.noise.imu_scale * imu.accel_noise_density
         self.restart()
 
@@ -127,6 +130,16 @@ class Propagation:
         self._still = still
         if still:
             window.factors += zero_velocity_factors(i, j)
+        if self.aiding is not None:
+            self._append_aiding(self.aiding, window, (i, j), (previous.stamp_ns, stamp_ns))
+
+    def _append_aiding(
+        self, aiding: Aiding, window: Window, frames: tuple[int, int], stamps_ns: tuple[int, int]
+    ) -> None:
+        """Append what fixes and odometry say of the motion to the new frame."""
+        known = self._predicted or self._last
+        covariance = None if known is None or known.covariance is None else known.covariance[:6, :6]
+        window.factors += aiding.factors(window.state, frames, stamps_ns, covariance)
 
     def _predict_covariance(
         self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window

@@ -52,6 +52,11 @@ class SegmentJoint:
             return gauge_covariance(self.predicted, self.level)
         return np.diag([_UNKNOWN_M**2] * 3 + [np.pi**2] * (1 if self.level else 3))
 
+    def superseded(self) -> SegmentJoint:
+        """The joint of a segment whose place is measured: nothing of it is unknown any more."""
+        known = replace(self.predicted, covariance=np.zeros((15, 15)))
+        return replace(self, predicted=known, holds=True)
+
     def added_to(self, state: NavState) -> NavState:
         """A state of the new segment with a covariance relative to the segment before."""
         return with_unknown_gauge(state, self.covariance, self.predicted.world_T_body.translation())

@@ -80,6 +80,11 @@ class StartUp:
         self.outliers = review.outliers
         return self._placed(window)
 
+    def settle(self) -> None:
+        """The place of the segment is measured: nothing of its start is in doubt any more."""
+        self.doubtful, self._review = False, None
+        self.joint = None if self.joint is None else self.joint.superseded()
+
     def waiting_for(self, calibration: str | None) -> str:
         """What a start still needs, and the likeliest cause of the lack.
 

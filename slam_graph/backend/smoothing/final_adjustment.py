@@ -22,6 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
 from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
 from slam_graph.backend.smoothing.recording_problem import (
     AdjustedSegment,
@@ -138,7 +139,8 @@ def adjust_recording(
     Args:
         log: all its frames.
         causal: the initial estimate, with velocities and biases, on the clock of the IMU. Its first
-            pose keeps its position and yaw, so that both trajectories are in the same world.
+            pose keeps its position and yaw, so that both trajectories are in the same world; where
+            that is the world of position fixes, these are used and the first pose is free.
         rig: the best calibration available.
         backend: noise and triangulation.
         config: settings.
@@ -175,6 +177,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         stamps_ns = segment.keyframe_stamps_ns
         if not _overlaps(causal, stamps_ns):
             continue
+        aiding = aiding_of_keyframes(stamps_ns, log.aiding, causal, task.backend)
+        segment, absolute = replace(segment, aiding=aiding), len(aiding.fixes) > 0
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
             task, start = replace(task, causal=causal), with_angular_rates(start)
@@ -188,15 +192,18 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             for state in states[:joint]:
                 history.append(state)
             link = states[joint]
-            start = _aligned(start, start[anchor], link, level)
+            if not absolute:
+                start = _aligned(start, start[anchor], link, level)
         steps = sum(part.figures.iterations for part in solved)
         own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
         adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
         found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
         held = found[int(segment.keyframes[anchor])]
-        states = _aligned(found, held, start[anchor], level)[begin:]
-        if link is not None:
+        states = found[begin:]
+        if not absolute:
+            states = _aligned(found, held, start[anchor], level)[begin:]
+        if link is not None and not absolute:
             states = in_gauge_of(link, states, level)
         solved.append(replace(adjusted, states=[]))
     if not solved:

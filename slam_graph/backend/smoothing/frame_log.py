@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,14 @@ from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Packet, Rig
+from slam_graph.sensors import (
+    AidingData,
+    FeatureFrame,
+    FeatureObservations,
+    ImuData,
+    Packet,
+    Rig,
+)
 
 _MAX_BEYOND_NS = 100_000_000
 """Frames farther outside of the IMU samples than this are left out."""
@@ -49,6 +57,7 @@ class FrameLog:
 
     Attributes:
         rig: the calibration with which the frames were undistorted.
+        georeferenced: whether the causal estimate is in the world of the position fixes.
     """
 
     def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
@@ -65,6 +74,8 @@ class FrameLog:
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
+        self._aiding: list[AidingData] = []
+        self.georeferenced = False
 
     @classmethod
     @contextmanager
@@ -80,14 +91,23 @@ class FrameLog:
         with log._recorder:
             yield log
 
-    def add(self, imu: ImuData, frame: FeatureFrame, noise: tuple[float, float]) -> None:
+    def add(
+        self,
+        imu: ImuData,
+        frame: FeatureFrame,
+        noise: tuple[float, float],
+        aiding: AidingData | None = None,
+    ) -> None:
         """Add a frame; one out of order, or without IMU samples around it, is left out.
 
         Args:
             imu: the samples since the last frame.
             frame: the observations of all cameras.
             noise: factors on the white noise of gyroscope and accelerometer around this time.
+            aiding: position fixes and odometry since the last frame.
         """
+        if aiding is not None:
+            self._aiding.append(aiding)
         if not self.rig.has_imu:
             newest_ns = None if self._imu_ns is None else self._imu_ns[1]
             imu = motionless_samples(newest_ns, frame.stamp_ns + self._lead_ns)
@@ -125,6 +145,12 @@ class FrameLog:
         inside = [k - first for k in self._keyframes if first <= k < stop]
         part._keyframes = array("q", inside if inside[:1] == [0] or stop <= first else [0, *inside])
         return part
+
+    @cached_property
+    def aiding(self) -> AidingData:
+        """Odometry of the whole run, and position fixes if the estimate is in their world."""
+        data = AidingData.concatenate(self._aiding)
+        return data if self.georeferenced else data.without_fixes()
 
     @property
     def frames_ns(self) -> IntArray:

@@ -121,6 +121,8 @@ DEFINED_SIGMA = 1e-5
 """The same where position and yaw of the anchor define the world."""
 _UNKNOWN_TILT_RAD = 10.0
 """Prior on roll and pitch of the anchor, which gravity determines: none."""
+_UNKNOWN_GAUGE = 1e3
+"""Prior on position and rotation of the anchor where position fixes determine them: none."""
 GYRO_BIAS_SIGMA = 0.05
 """Prior on the first gyroscope bias, rad/s: loose, as the estimate of a filter after its start."""
 ACCEL_BIAS_SIGMA = 0.3
@@ -159,7 +161,9 @@ class RecordingFactors:
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
-        return _graph(self._prior(values) + self._dynamics(values))
+        aiding = self._segment.aiding
+        other = [*aiding.fixes, *aiding.odometry]
+        return _graph(self._prior(values) + self._dynamics(values) + other)
 
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
         """A prior that fixes position and yaw of the anchor, or all of its pose without an IMU.
@@ -167,7 +171,10 @@ class RecordingFactors:
         Args:
             values: with the pose of the anchor.
             sigma: of position (m) and yaw (rad); by default so small that they define the world.
+                Where position fixes do, nothing is known of them.
         """
+        if self._segment.aiding.fixes:
+            sigma = _UNKNOWN_GAUGE
         pose = values.atPose3(X(self._anchor))
         tilt = _UNKNOWN_TILT_RAD if self._rig.has_imu else sigma
         sigmas = np.diag([tilt, tilt, sigma])

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.online_calibration import rolling_motion
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_aiding import KeyframeAiding
 from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
@@ -55,6 +56,7 @@ class RecordingSegment:
         still: (N,) whether the platform stands still.
         imu: all IMU samples.
         seen: all observations; its frame indices are those of the frames.
+        aiding: factors of position fixes and odometry on the keyframes.
     """
 
     stamps_ns: IntArray
@@ -63,6 +65,7 @@ class RecordingSegment:
     still: BoolArray
     imu: ImuBuffer
     seen: Observations
+    aiding: KeyframeAiding = field(default_factory=KeyframeAiding)
 
     @property
     def keyframe_stamps_ns(self) -> IntArray:

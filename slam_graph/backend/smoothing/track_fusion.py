@@ -85,7 +85,9 @@ def with_fused_features(
     def adjusted(segment: RecordingSegment, states: list[NavState]) -> list[NavState]:
         nonlocal steps, rounds
         before = steps
-        thin = replace(segment, keyframes=segment.keyframes[chosen])
+        keyframes = segment.keyframes[chosen]
+        aiding = segment.aiding.at(segment.stamps_ns[keyframes])
+        thin = replace(segment, keyframes=keyframes, aiding=aiding)
         start = SegmentStart(thin, [states[k] for k in chosen], fixed)
         problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds))
         states = problem.solve_loosely(segment.keyframe_stamps_ns)

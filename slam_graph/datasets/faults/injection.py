@@ -23,7 +23,7 @@ from slam_graph.datasets.sequence import (
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.errors import ConfigError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import ImuData
+from slam_graph.sensors import AidingData, ImuData
 from slam_graph.settings import ConfigTree
 
 
@@ -124,6 +124,10 @@ class FaultySequence(RecordedSequence):
             blocks = fault.imu(blocks, self._around)
         named = ((partial(_sample, block), block) for block in blocks)
         return clean_blocks(named, self.diagnostics, after_ns)
+
+    def read_aiding(self) -> AidingData:
+        """Fixes and odometry of the recording, without faults."""
+        return self.recording.aiding
 
     def groundtruth(self) -> Trajectory | None:
         """The true trajectory at the times that the recording says."""

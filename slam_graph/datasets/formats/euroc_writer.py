@@ -27,10 +27,11 @@ from slam_graph.datasets.calibration.euroc_calibration import camera_entry, shut
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.euroc import DEPTH_FOLDER
 from slam_graph.datasets.sequence import RecordedSequence
+from slam_graph.datasets.streams.aiding_files import aiding_texts
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import CameraFrame, ImuData, ImuNoise, Rig, RigCamera
+from slam_graph.sensors import AidingData, CameraFrame, ImuData, ImuNoise, Rig, RigCamera
 
 CALIBRATION = "calibration.yaml"
 """The calibration in Kalibr's format, beside ``mav0``."""
@@ -159,6 +160,10 @@ class EurocWriter:
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
+    def write_aiding(self, data: AidingData) -> None:
+        """Position fixes and odometry of the whole recording."""
+        self._notes |= aiding_texts(data)
+
     def write_imu(self, imu: ImuData) -> None:
         """The next samples."""
         if len(imu) == 0:
@@ -221,6 +226,7 @@ class EurocWriter:
         comment = f"converted from {info.format}"
         rig, truth, has_imu = sequence.rig, sequence.groundtruth(), sequence.has_imu
         with EurocWriter(Path(path), rig, truth, comment, rate_hz, force, has_imu) as writer:
+            writer.write_aiding(sequence.aiding)
             for block in sequence.imu_blocks():
                 writer.write_imu(block)
             for frame in sequence.frames():

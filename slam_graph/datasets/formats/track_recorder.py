@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
+from slam_graph.datasets.streams.aiding_files import aiding_texts
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
+from slam_graph.sensors import AidingData, FeatureFrame, FeatureObservations, ImuData, Rig
 
 
 class TrackRecorder:
@@ -60,6 +61,7 @@ class TrackRecorder:
         self._initial_state = initial_state
         self._notes = dict(notes or {})
         self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
+        self._aiding: list[AidingData] = []
         self._latest_ns: int | None = None
         self._descriptor_bytes: int | None = None
         self._depth_camera = None if rig.depth is None else rig.depth.camera
@@ -97,12 +99,15 @@ class TrackRecorder:
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+    def write(
+        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
+    ) -> None:
         """Append a packet.
 
         Args:
             imu: the samples since the packet before, as in `Packet`.
             frame: the features found at a time later than that of the frame before.
+            aiding: fixes and odometry since the packet before.
 
         Raises:
             DataError: if the frame is not later, has another number of cameras than the rig, or
@@ -118,6 +123,8 @@ class TrackRecorder:
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
+        if aiding is not None:
+            self._aiding.append(aiding)
         with Files.writing(self.path):
             self._append(imu, frame)
 
@@ -177,7 +184,8 @@ class TrackRecorder:
         if self._initial_state is not None:
             layout.save_state(self._folder / layout.INITIAL_STATE, self._initial_state)
         (self._folder / layout.META).write_text(yaml.safe_dump(meta, sort_keys=False))
-        for name, text in self._notes.items():
+        texts = self._notes | aiding_texts(AidingData.concatenate(self._aiding))
+        for name, text in texts.items():
             (self._folder / name).write_text(text, encoding="utf-8")
         self._folder.chmod(0o755)
         self._folder.rename(self.path)

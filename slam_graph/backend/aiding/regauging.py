@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A window in a world that is moved, with what is not known of the motion added to its prior.
+
+The prior ‖R δ - d‖² is relative to the first state. A world that is moved by an error g of the
+gauge moves all variables by N g, with N the directions that no image measures. So the prior of the
+moved variables is min over g of ‖R (δ - N g) - d‖² + ‖Γ^-½ g‖², by a QR whose columns begin with g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.world_alignment import WorldAlignment
+from slam_graph.backend.initialization.segment_joint import moved
+from slam_graph.backend.marginalization.landmark_store import LandmarkStore
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import letter_and_index
+from slam_graph.backend.window import Window
+from slam_graph.backend.world_gauge import turned_axes
+
+
+def regauged(window: Window, found: WorldAlignment) -> Window:
+    """The same window in the world of the fixes.
+
+    Features that are not tracked any more are forgotten.
+
+    Args:
+        window: between two steps.
+        found: how the worlds are to one another.
+    """
+    motion, covariance, centre = found.motion, found.covariance, found.centre
+    there = moved(window, motion)
+    rotation = motion.rotation().matrix()
+    ids, points = window.kept_points
+    prior = there.prior
+    N = gauge_directions(there.state.first, prior.layout, centre, level=len(covariance) == 4)
+    store = LandmarkStore()
+    store.open = window.lost_features.open
+    return replace(
+        there,
+        prior=with_free_gauge(prior, N, covariance),
+        kept_points=(ids, points @ rotation.T + motion.translation()),
+        lost_features=store,
+    )
+
+
+def with_free_gauge(
+    prior: SquareRootInformation, directions: FloatArray, covariance: FloatArray
+) -> SquareRootInformation:
+    """A prior with an independent error along some directions added.
+
+    Args:
+        prior: over n variables.
+        directions: (n, k).
+        covariance: (k, k) of the error along them.
+    """
+    count = len(covariance)
+    rows = np.zeros((len(prior.Rd) + count, count + len(prior.Rd)))
+    rows[: len(directions), :count] = -prior.R @ directions
+    rows[: len(prior.Rd), count:] = prior.Rd
+    rows[len(prior.Rd) :, :count] = np.linalg.inv(np.linalg.cholesky(covariance))
+    return SquareRootInformation(prior.layout, triangularize(rows)[count:, count:])
+
+
+def gauge_directions(
+    values: gtsam.Values, layout: Layout, centre: FloatArray, level: bool
+) -> FloatArray:
+    """Tangents (n, 4 or 6) of variables when the world shifts (m) and turns (rad) about a point.
+
+    Args:
+        values: of the variables.
+        layout: their columns.
+        centre: (3,) the point.
+        level: whether the world turns about the vertical only.
+    """
+    axes = turned_axes(level)
+    directions = np.zeros((layout.size, 3 + len(axes)))
+    for key, columns in layout.columns.items():
+        kind, block = letter_and_index(key)[0], directions[columns]
+        if kind == "x":
+            pose = values.atPose3(key)
+            body_R_world = pose.rotation().matrix().T
+            block[:3, 3:] = body_R_world @ axes.T
+            block[3:, :3] = body_R_world
+            block[3:, 3:] = body_R_world @ np.cross(axes, pose.translation() - centre).T
+        elif kind == "v":
+            block[:, 3:] = np.cross(axes, values.atVector(key)).T
+        elif kind == "l":
+            block[:, :3] = np.eye(3)
+            block[:, 3:] = np.cross(axes, values.atPoint3(key) - centre).T
+    return directions

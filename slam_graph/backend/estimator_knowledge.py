@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What an estimator knows beyond the states that it reports: covariances, graph, landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.engine_protocol import Engine
+from slam_graph.backend.window import Window
+from slam_graph.backend.window_graph import WindowGraph
+from slam_graph.errors import EstimationError
+
+
+class EstimatorKnowledge:
+    """The part of an estimator that answers questions.
+
+    Attributes:
+        window: the variables and what is known of them; None as long as there is no state.
+    """
+
+    window: Window | None
+    _engine: Engine
+
+    def covariance_of(self, keys: Sequence[int]) -> FloatArray:
+        """The joint covariance (n, n) of variables after the last step.
+
+        Args:
+            keys: of past poses X(i), of the current state X(i), V(i), B(i), of features L(j) of the
+                state, or of the calibration; tangents are GTSAM's.
+
+        Raises:
+            EstimationError: if there is no state yet, or a key is not of a variable now.
+        """
+        if self.window is None:
+            raise EstimationError("there is no state yet")
+        information = self._engine.information(self.window)
+        missing = [gtsam.DefaultKeyFormatter(k) for k in keys if k not in information.layout]
+        if missing:
+            raise EstimationError(f"not variables of the last step: {', '.join(missing)}")
+        return information.covariance_of(keys)
+
+    def factor_graph(self) -> WindowGraph:
+        """The cost of the last step as a factor graph of GTSAM with its values.
+
+        For this package's engine: marginal prior, dynamics, and a projection factor for each
+        observation, after the Gauss-Newton steps and before marginalization. For GTSAM's smoothers:
+        what they hold.
+
+        Raises:
+            EstimationError: if there is no state yet.
+        """
+        if self.window is None:
+            raise EstimationError("there is no state yet, and so no factor graph")
+        return self._engine.factor_graph(self.window)
+
+    def landmarks(self) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
+        if self.window is None:
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        return self._engine.landmarks(self.window)

@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of position fixes and odometry beside a recording, and how packets come to carry them.
+
+``gnss.csv`` has a row for each fix, with one of these headers:
+
+- ``#timestamp [ns],latitude [deg],longitude [deg],altitude [m],sigma_east [m],sigma_north [m],
+  sigma_up [m]``; the first fix is the origin of the local world;
+- ``#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]``, with an
+  optional line ``# datum: latitude, longitude, altitude`` before the rows;
+- NMEA sentences GGA, each after a time stamp: ``1403636579763555584,$GPGGA,…``.
+
+``odometry.csv`` has a row for each sample: ``#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw``, the
+pose of the body in the frame of the odometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.datasets.streams.csv_rows import Rows, read_rows
+from slam_graph.datasets.streams.geodesy import Datum, local_positions
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import DataError
+from slam_graph.sensors import AidingData, Packet
+
+FIXES, ODOMETRY = "gnss.csv", "odometry.csv"
+
+_FIX_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("sigma", "f8", (3,))]
+_ODOMETRY_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("quaternion", "f8", (4,))]
+_LOCAL_HEADER = "#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]"
+_DATUM = "# datum:"
+_NMEA_SIGMA_M = 2.5
+"""Standard deviation of a position whose dilution of precision (HDOP) is 1, of a code receiver."""
+_NMEA_QUALITY_SIGMA_M = {"4": 0.02, "5": 0.3}
+"""The same of a carrier-phase solution: integers fixed, or not."""
+_VERTICAL = 2.0
+"""Heights are so much less accurate."""
+
+
+def read_aiding(folder: Path, diagnostics: Diagnostics) -> AidingData:
+    """Fixes and odometry in the files of a folder; nothing where there are none.
+
+    Raises:
+        DataError: if a row cannot be read.
+    """
+    data = AidingData.empty()
+    if (folder / FIXES).is_file():
+        data = read_fixes(folder / FIXES, diagnostics)
+    if (folder / ODOMETRY).is_file():
+        data = data.with_odometry(*_read_odometry(folder / ODOMETRY, diagnostics))
+    return data
+
+
+def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
+    """The fixes of a file; see the module.
+
+    Args:
+        path: of the file.
+        diagnostics: counts `gnss_dropped`: fixes that are not finite, have no solution, or are not
+            in the order of time.
+
+    Raises:
+        DataError: if a row cannot be read.
+    """
+    header, datum = _header(path)
+    stamps: list[IntArray] = []
+    positions: list[FloatArray] = []
+    sigmas: list[FloatArray] = []
+    nmea = False
+    for rows in read_rows(path):
+        nmea = nmea or "GGA," in rows.lines[0]
+        if nmea:
+            parsed = [_gga(rows, k) for k in range(len(rows.lines))]
+            stamps.append(np.array([row[0] for row in parsed], np.int64))
+            positions.append(np.array([row[1] for row in parsed]))
+            sigmas.append(np.array([row[2] for row in parsed]))
+            continue
+        table = rows.parse(_FIX_ROW, "stamp [ns], three coordinates, three sigmas")
+        stamps.append(table["stamp"])
+        positions.append(table["position"])
+        sigmas.append(table["sigma"])
+    if not stamps:
+        raise DataError(f"{path}: no fixes in this file")
+    found = tuple(np.concatenate(part) for part in (stamps, positions, sigmas))
+    local = not nmea and "latitude" not in header
+    return fixes_from(found[0], found[1], found[2], path, diagnostics, (local, datum))
+
+
+def fixes_from(
+    stamps_ns: IntArray,
+    positions: FloatArray,
+    sigmas: FloatArray,
+    path: Path,
+    diagnostics: Diagnostics,
+    frame: tuple[bool, Datum | None] = (False, None),
+) -> AidingData:
+    """The fixes that can be used, in a local world.
+
+    Args:
+        stamps_ns: (N,) of the fixes.
+        positions: (N, 3) latitude, longitude and height, or local ones.
+        sigmas: (N, 3) east, north, up, m.
+        path: of the file, for messages.
+        diagnostics: as for `read_fixes`.
+        frame: whether positions are local, and the datum; the first fix if None.
+    """
+    good = np.isfinite(positions).all(axis=1) & np.isfinite(sigmas).all(axis=1)
+    good &= (sigmas > 0).all(axis=1)
+    kept = np.flatnonzero(good)
+    kept = kept[np.concatenate([[True], stamps_ns[kept][1:] > np.maximum.accumulate(stamps_ns[kept])[:-1]])]
+    if len(kept) < len(stamps_ns):
+        dropped = f"{path}: {len(stamps_ns) - len(kept)} fixes dropped (no solution, or not in order)"
+        diagnostics.warn("gnss_dropped", dropped)
+    stamps_ns, positions, sigmas = stamps_ns[kept], positions[kept], sigmas[kept]
+    local, datum = frame
+    if not local and len(positions):
+        datum = datum or (float(positions[0, 0]), float(positions[0, 1]), float(positions[0, 2]))
+        positions = local_positions(positions, datum)
+    covariances = sigmas[:, :, None] ** 2 * np.eye(3)
+    return AidingData.of_fixes(stamps_ns, positions, covariances, datum)
+
+
+def _header(path: Path) -> tuple[str, Datum | None]:
+    """The first line of a file in small letters, and the datum in its comments."""
+    first, datum = "", None
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file):
+            first = first or line.lower()
+            if line.startswith(_DATUM):
+                try:
+                    datum = tuple(float(cell) for cell in line[len(_DATUM) :].split(","))
+                except ValueError:
+                    datum = ()
+                if len(datum) != 3:
+                    raise DataError(
+                        f"{path}:{number + 1}: expected '{_DATUM} latitude, longitude, altitude'"
+                    )
+            if "timestamp" in line.lower():
+                first = line.lower()
+            elif not line.startswith("#"):
+                break
+    return first, datum
+
+
+def _gga(rows: Rows, index: int) -> tuple[int, FloatArray, FloatArray]:
+    """Time, geodetic position and sigmas of a row of a stamp and a GGA sentence of NMEA 0183.
+
+    A sentence without a solution gives NaN.
+    """
+    stamp, *cells = rows.lines[index].strip().split(",")
+    nothing = np.full(3, np.nan)
+    try:
+        stamp_ns = int(stamp)
+        if cells[6] == "0" or not cells[2]:
+            return stamp_ns, nothing, nothing
+        position = np.array(
+            [
+                _degrees(cells[2]) * (-1.0 if cells[3] == "S" else 1.0),
+                _degrees(cells[4]) * (-1.0 if cells[5] == "W" else 1.0),
+                float(cells[9]) + float(cells[11] or 0.0),  # of the sea, and of the geoid
+            ]
+        )
+        hdop = float(cells[8] or 1.0)
+        sigma = _NMEA_QUALITY_SIGMA_M.get(cells[6], _NMEA_SIGMA_M) * hdop
+        return stamp_ns, position, sigma * np.array([1.0, 1.0, _VERTICAL])
+    except (ValueError, IndexError):
+        raise DataError(
+            f"{rows.where(index)}: expected a stamp [ns] and a GGA sentence: "
+            f"'{rows.lines[index].strip()[:80]}'"
+        ) from None
+
+
+def _degrees(text: str) -> float:
+    """Degrees of NMEA's dddmm.mmmm."""
+    point = text.index(".") - 2
+    return float(text[:point] or 0.0) + float(text[point:]) / 60.0
+
+
+def _read_odometry(
+    path: Path, diagnostics: Diagnostics
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Stamps, positions and quaternions of the odometry in a file."""
+    what = "stamp [ns], x, y, z, qx, qy, qz, qw"
+    tables = [rows.parse(_ODOMETRY_ROW, what) for rows in read_rows(path)]
+    if not tables:
+        raise DataError(f"{path}: no odometry in this file")
+    table = np.concatenate(tables)
+    stamps, lengths = table["stamp"], np.linalg.norm(table["quaternion"], axis=1)
+    good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
+    good[1:] &= stamps[1:] > np.maximum.accumulate(stamps)[:-1]
+    if not good.all():
+        dropped = f"{path}: {np.count_nonzero(~good)} samples dropped (not finite, or not in order)"
+        diagnostics.warn("odometry_dropped", dropped)
+    table, lengths = table[good], lengths[good]
+    return table["stamp"], table["position"], table["quaternion"] / lengths[:, None]
+
+
+def aiding_texts(data: AidingData) -> dict[str, str]:
+    """The contents of ``gnss.csv`` and ``odometry.csv`` by name; nothing of what there is not."""
+    texts = {}
+    if len(data.fix_stamps_ns):
+        lines = [] if data.datum is None else [f"{_DATUM} " + ", ".join(map(repr, data.datum))]
+        lines.append(_LOCAL_HEADER)
+        sigmas = np.sqrt(np.diagonal(data.fix_covariances, axis1=1, axis2=2))
+        numbers = np.hstack([data.fix_positions, sigmas])
+        lines += _rows(data.fix_stamps_ns, numbers)
+        texts[FIXES] = "\n".join(lines) + "\n"
+    if len(data.odometry_stamps_ns):
+        numbers = np.hstack([data.odometry_positions, data.odometry_quaternions])
+        lines = ["#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw"]
+        lines += _rows(data.odometry_stamps_ns, numbers)
+        texts[ODOMETRY] = "\n".join(lines) + "\n"
+    return texts
+
+
+def _rows(stamps_ns: IntArray, numbers: FloatArray) -> list[str]:
+    """Rows of a stamp and numbers, exact to the last bit."""
+    pairs = zip(stamps_ns.tolist(), numbers.tolist(), strict=True)
+    return [",".join([str(stamp), *map(repr, row)]) for stamp, row in pairs]
+
+
+def with_aiding(packets: Iterator[Packet], data: AidingData) -> Iterator[Packet]:
+    """Packets that carry what was measured up to their frames; unchanged if there is nothing."""
+    if not len(data):
+        yield from packets
+        return
+    fixes_ns = odometry_ns = None
+    for packet in packets:
+        stamp_ns = packet.frame.stamp_ns
+        beyond = int(np.searchsorted(data.odometry_stamps_ns, stamp_ns))
+        until_ns = stamp_ns
+        if beyond < len(data.odometry_stamps_ns):
+            until_ns = int(data.odometry_stamps_ns[beyond])
+        fixes, odometry = data.within(fixes_ns, stamp_ns), data.within(odometry_ns, until_ns)
+        part = fixes.with_odometry(
+            odometry.odometry_stamps_ns, odometry.odometry_positions, odometry.odometry_quaternions
+        )
+        fixes_ns, odometry_ns = stamp_ns, until_ns
+        yield replace(packet, aiding=part) if len(part) else packet
