@@ -49,6 +49,10 @@ class Format:
     fallback: bool = False
 
 
+_AIDING = ("gnss", "odometry")
+"""Sensors that any recording may have, or a file beside it."""
+
+
 def _is_euroc(path: Path) -> bool:
     return (path / "mav0").is_dir() or (path / "imu0").is_dir()
 
@@ -121,7 +125,8 @@ def open_dataset(
         groundtruth: EuRoC CSV, TUM file or EuRoC folder to use instead of the recording's own.
         diagnostics: where faults are counted.
         sources: where each sensor is, in formats that leave it open: topics of a ROS bag or files
-            beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``.
+            beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``; in every format
+            the files or topics of ``gnss`` and ``odometry``.
         faults: to put into it on purpose, such as ``imu_missing:at_s=6,duration_s=1``.
         imu: False to read it as if it had no IMU.
 
@@ -136,6 +141,8 @@ def open_dataset(
         raise DataError(f"{path}: no such file or folder")
     name = _guess(path) if format is None else format
     chosen = DATASETS[name]
+    aiding = {key: text for key, text in (sources or {}).items() if key in _AIDING}
+    sources = {key: text for key, text in (sources or {}).items() if key not in _AIDING}
     if sources and not chosen.takes_sources:
         given = ", ".join(f"{sensor}={place}" for sensor, place in sources.items())
         raise DataError(f"{path}: format '{name}' knows its sensors; remove '{given}'")
@@ -143,9 +150,10 @@ def open_dataset(
         cameras,
         None if calibration is None else Path(calibration),
         None if groundtruth is None else Path(groundtruth),
-        sources or {},
+        sources,
         diagnostics if diagnostics is not None else Diagnostics(),
         imu,
+        aiding,
     )
     recording = chosen.open(path, options)
     if not faults:

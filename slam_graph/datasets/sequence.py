@@ -117,6 +117,8 @@ class ReaderOptions:
         sources: where each sensor is, in formats that leave it open.
         diagnostics: where faults are counted.
         imu: whether the IMU is used; False reads the recording as if it had none.
+        aiding: where ``gnss`` and ``odometry`` are, files or topics, if not where they are looked
+            for.
     """
 
     cameras: int | None = None
@@ -125,6 +127,7 @@ class ReaderOptions:
     sources: Mapping[str, str] = field(default_factory=dict)
     diagnostics: Diagnostics = field(default_factory=Diagnostics)
     imu: bool = True
+    aiding: Mapping[str, str] = field(default_factory=dict)
 
     def select(self, rig: Rig) -> Rig:
         """The rig with the cameras that are to be used.
@@ -154,6 +157,7 @@ class RecordedSequence(Displayed, ABC):
         content: whether frames carry images or feature tracks.
         name: of the recording.
         rig: its calibrated sensors.
+        named_aiding: where ``gnss`` and ``odometry`` are, as far as it was said.
         groundtruth_path: the file that ground truth is read from; None where there is none.
         diagnostics: where faults are counted.
     """
@@ -173,6 +177,7 @@ class RecordedSequence(Displayed, ABC):
         self.name = name
         self.rig = rig if options.imu and rig.has_imu else rig.without_imu()
         self.groundtruth_path: Path | None = None
+        self.named_aiding = dict(options.aiding)
         self.diagnostics = options.diagnostics
         rolling = [c.name for c in rig.cameras if c.rolling_shutter and not c.readout_s]
         if rolling:
@@ -329,14 +334,13 @@ class RecordedSequence(Displayed, ABC):
         return self.read_aiding()
 
     def read_aiding(self) -> AidingData:
-        """Read them; here those in files beside the recording (`streams/aiding_files.py`)."""
+        """Read them; here those in files that were named, or are beside the recording."""
         path = getattr(self, "path", None)
-        if not isinstance(path, Path):
-            return AidingData.empty()
-        folder = path if path.is_dir() else path.parent
-        folders = [folder, folder.parent] if folder.name == "mav0" else [folder]
-        found = (read_aiding(place, self.diagnostics) for place in folders)
-        return next((data for data in found if len(data)), AidingData.empty())
+        folders = []
+        if isinstance(path, Path):
+            folder = path if path.is_dir() else path.parent
+            folders = [folder, folder.parent] if folder.name == "mav0" else [folder]
+        return read_aiding(folders, self.named_aiding, self.diagnostics)
 
     def imu(self) -> ImuData:
         """All IMU samples at once; none without an IMU."""

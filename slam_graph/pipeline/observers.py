@@ -145,9 +145,7 @@ class Progress(Protocol):
 class Recorder(Protocol):
     """Records feature tracks, for a replay."""
 
-    def write(
-        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
-    ) -> None:
+    def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Called after each frame.
 
         Args:
@@ -186,9 +184,7 @@ class NullProgress:
 class NullRecorder:
     """Records nothing."""
 
-    def write(
-        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
-    ) -> None:
+    def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Record nothing."""
 
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "AidingData",
     "CAMERA_MODELS",
+    "AidingData",
     "CalibrationEstimate",
     "Camera",
     "CameraFrame",

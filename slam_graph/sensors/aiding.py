@@ -117,9 +117,7 @@ class AidingData:
         """The same with fixes that are later by so much."""
         return replace(self, fix_stamps_ns=self.fix_stamps_ns + fixes_ns)
 
-    def odometry_between(
-        self, from_ns: int, to_ns: int
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def odometry_between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """How the body moved by its odometry; None where that does not cover both times.
 
         Returns:
@@ -128,7 +126,10 @@ class AidingData:
         stamps, ends = self.odometry_stamps_ns, np.array([from_ns, to_ns])
         if len(stamps) < 2 or from_ns < stamps[0] or to_ns > stamps[-1]:
             return None
-        first, last = np.searchsorted(stamps, ends[0], "right") - 1, np.searchsorted(stamps, ends[1])
+        first, last = (
+            np.searchsorted(stamps, ends[0], "right") - 1,
+            np.searchsorted(stamps, ends[1]),
+        )
         if np.diff(stamps[first : last + 1]).max(initial=0) > _MAX_ODOMETRY_GAP_S * 1e9:
             return None
         near = slice(int(first), int(last) + 1)

@@ -36,7 +36,9 @@ def simulated_aiding(
     """
     data = AidingData.empty()
     if gnss.sigma_m is not None:
-        data = AidingData.of_fixes(*_fixes(motion, stamps_between(*span_ns, gnss.rate_hz), gnss, seed))
+        data = AidingData.of_fixes(
+            *_fixes(motion, stamps_between(*span_ns, gnss.rate_hz), gnss, seed)
+        )
     if odometry.enabled:
         stamps = stamps_between(*span_ns, odometry.rate_hz)
         data = data.with_odometry(stamps, *_drifting(motion, stamps, odometry, seed))
@@ -68,7 +70,9 @@ def _drifting(
     shifts = rotations[:-1].inv().apply(np.diff(positions, axis=0))
     roots = np.sqrt(np.linalg.norm(shifts, axis=1))[:, None]
     shifts = shifts + config.position_noise * roots * rng.normal(size=shifts.shape)
-    turns = turns * Rotation.from_rotvec(config.rotation_noise * roots * rng.normal(size=shifts.shape))
+    turns = turns * Rotation.from_rotvec(
+        config.rotation_noise * roots * rng.normal(size=shifts.shape)
+    )
     place, attitude = np.zeros(3), Rotation.identity()
     places, attitudes = [place], [attitude.as_quat()]
     for shift, turn in zip(shifts, turns, strict=True):

@@ -200,7 +200,9 @@ def _car(length_m: float, rng: np.random.Generator) -> FloatArray:
         turn = rng.choice([-1.0, 1.0]) * np.radians(rng.uniform(45.0, 100.0))
         straight, arc = rng.uniform(*_STRAIGHTS_M), abs(turn) * _CAR_RADIUS_M
         steps = max(2, round(straight / _CAR_STEP_M)), max(2, round(arc / _CAR_STEP_M))
-        headings = np.concatenate([np.full(steps[0], 0.0), turn * (np.arange(steps[1]) + 0.5) / steps[1]])
+        headings = np.concatenate(
+            [np.full(steps[0], 0.0), turn * (np.arange(steps[1]) + 0.5) / steps[1]]
+        )
         lengths = np.repeat([straight / steps[0], arc / steps[1]], steps)
         for angle, metres in zip(heading + headings, lengths, strict=True):
             place = place + metres * np.array([np.cos(angle), np.sin(angle)])

@@ -13,7 +13,13 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.fix_factors import FixGate, antenna, between_poses, fix_factor, pose_key
+from slam_graph.backend.aiding.fix_factors import (
+    FixGate,
+    antenna,
+    between_poses,
+    fix_factor,
+    pose_key,
+)
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
@@ -65,7 +71,11 @@ class Aiding:
     # --- factors ---------------------------------------------------------------------------------
 
     def factors(
-        self, state: State, frames: tuple[int, int], stamps_ns: tuple[int, int], known: FloatArray | None
+        self,
+        state: State,
+        frames: tuple[int, int],
+        stamps_ns: tuple[int, int],
+        known: FloatArray | None,
     ) -> list[gtsam.NonlinearFactor]:
         """Factors of what was measured from one frame to the next.
 

@@ -35,19 +35,20 @@ from slam_graph.datasets.formats.kitti_files import (
 )
 from slam_graph.datasets.formats.tum_rgbd import rectifier
 from slam_graph.datasets.sequence import ReaderOptions
+from slam_graph.datasets.streams.aiding_files import fixes_from
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera
+from slam_graph.sensors import AidingData, ImuData, ImuNoise, Rig, RigCamera
 
 _EARTH_RADIUS_M = 6_378_137.0
 
 _VALUES = 30
 POSITION, ANGLES, ACCEL, GYRO = slice(0, 3), slice(3, 6), slice(11, 14), slice(17, 20)
-_EAST_NORTH_UP = [7, 6, 10]
+_EAST_NORTH_UP, _ACCURACY = [7, 6, 10], 23
 
 _FILES_PER_BLOCK = 256
 
@@ -100,6 +101,12 @@ class _Oxts:
             values = np.array([self._read(begin + k) for k in range(len(stamps))])
             data = ImuData(stamps, values[:, GYRO].copy(), values[:, ACCEL].copy())
             yield partial(_file_name, files), data
+
+    def fixes(self, diagnostics: Diagnostics) -> AidingData:
+        """The positions of the unit as fixes, with the accuracy that it says (value 23), m."""
+        values = np.array([self._read(k) for k in range(len(self.stamps_ns))])
+        sigmas = np.repeat(values[:, _ACCURACY, None], 3, axis=1)
+        return fixes_from(self.stamps_ns, values[:, POSITION], sigmas, self.folder, diagnostics)
 
     def trajectory(self, diagnostics: Diagnostics) -> Trajectory:
         """Poses of the unit in a frame east, north, up with its origin at the first pose.
@@ -155,6 +162,10 @@ def _mercator(places: FloatArray) -> FloatArray:
     north = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
     return np.column_stack([scale * longitude, north, places[:, 2]])
 
+
+_OXTS = "oxts"
+"""The source of ``gnss`` that takes the positions of the navigation unit; its poses are the ground
+truth, so they are not taken unasked."""
 
 GREY = ("00", "01")
 """The grey cameras; 02 and 03 are in colour."""
@@ -227,12 +238,23 @@ class KittiRawSequence(ImageSequence):
             lambda: self._oxts.trajectory(self.diagnostics),
             STEREO_TOLERANCE_S,
         )
+        self._has_fixes = self.named_aiding.get("gnss") == _OXTS
+        if self._has_fixes:
+            del self.named_aiding["gnss"]
         if self._oxts.rate_hz < _SLOW_IMU_HZ:
             what = f"{self._oxts.folder}: the IMU has {self._oxts.rate_hz:.0f} Hz only"
             better = self.path.name.replace("_sync", "_extract")
             options.diagnostics.warn(
                 "imu_slow", f"{what}; {better} has 100 Hz, put it beside this drive"
             )
+
+    def read_aiding(self) -> AidingData:
+        """Fixes of the navigation unit if ``gnss=oxts`` was asked for, or those of files."""
+        data = super().read_aiding()
+        if not self._has_fixes:
+            return data
+        odometry = data.without_fixes()
+        return AidingData.concatenate([odometry, self._oxts.fixes(self.diagnostics)])
 
 
 def _find_oxts(drive: Path) -> _Oxts:

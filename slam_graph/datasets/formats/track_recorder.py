@@ -99,9 +99,7 @@ class TrackRecorder:
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def write(
-        self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None
-    ) -> None:
+    def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Append a packet.
 
         Args:

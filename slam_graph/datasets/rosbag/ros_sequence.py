@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
+from slam_graph.datasets.rosbag.ros_aiding import BagAiding
 from slam_graph.datasets.rosbag.ros_depth import depth_of, find_depth
 from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions, SequenceInfo
@@ -34,7 +35,7 @@ from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, ImuNoise
+from slam_graph.sensors import AidingData, ImuData, ImuNoise
 
 SAMPLES_PER_BLOCK = 256
 
@@ -159,6 +160,13 @@ class RosBagSequence(GroupedSequence):
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The cleaned IMU stream from `after_ns` on."""
         return clean_blocks(self._samples_in_blocks(), self.diagnostics, after_ns)
+
+    def read_aiding(self) -> AidingData:
+        """Fixes and odometry on topics of the bag, or in files."""
+        body = self._cameras[0] if self._imu_topic is None else self._imu_topic
+        aiding = BagAiding(self._bag, self.named_aiding, body, self.diagnostics)
+        self.named_aiding = aiding.in_files
+        return aiding.read(super().read_aiding(), self._until_damage, self._stamp_ns)
 
     def _samples_in_blocks(self) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         if self._imu_topic is None:

@@ -16,7 +16,7 @@ pose of the body in the frame of the odometry.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +33,9 @@ FIXES, ODOMETRY = "gnss.csv", "odometry.csv"
 
 _FIX_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("sigma", "f8", (3,))]
 _ODOMETRY_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("quaternion", "f8", (4,))]
-_LOCAL_HEADER = "#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]"
+_LOCAL_HEADER = (
+    "#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]"
+)
 _DATUM = "# datum:"
 _NMEA_SIGMA_M = 2.5
 """Standard deviation of a position whose dilution of precision (HDOP) is 1, of a code receiver."""
@@ -43,18 +45,37 @@ _VERTICAL = 2.0
 """Heights are so much less accurate."""
 
 
-def read_aiding(folder: Path, diagnostics: Diagnostics) -> AidingData:
-    """Fixes and odometry in the files of a folder; nothing where there are none.
+def read_aiding(
+    folders: Sequence[Path], named: Mapping[str, str], diagnostics: Diagnostics
+) -> AidingData:
+    """Fixes and odometry in files; nothing where there are none.
+
+    Args:
+        folders: where the files are looked for.
+        named: files of ``gnss`` and ``odometry`` instead.
+        diagnostics: as for `read_fixes`.
 
     Raises:
-        DataError: if a row cannot be read.
+        DataError: if a file that was named is missing, or a row cannot be read.
     """
     data = AidingData.empty()
-    if (folder / FIXES).is_file():
-        data = read_fixes(folder / FIXES, diagnostics)
-    if (folder / ODOMETRY).is_file():
-        data = data.with_odometry(*_read_odometry(folder / ODOMETRY, diagnostics))
+    fixes = _find("gnss", FIXES, folders, named)
+    odometry = _find("odometry", ODOMETRY, folders, named)
+    if fixes is not None:
+        data = read_fixes(fixes, diagnostics)
+    if odometry is not None:
+        data = data.with_odometry(*_read_odometry(odometry, diagnostics))
     return data
+
+
+def _find(sensor: str, name: str, folders: Sequence[Path], named: Mapping[str, str]) -> Path | None:
+    """The file of a sensor."""
+    if sensor in named:
+        path = Path(named[sensor])
+        if not path.is_file():
+            raise DataError(f"{path}: no such file of '{sensor}'")
+        return path
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
@@ -113,9 +134,13 @@ def fixes_from(
     good = np.isfinite(positions).all(axis=1) & np.isfinite(sigmas).all(axis=1)
     good &= (sigmas > 0).all(axis=1)
     kept = np.flatnonzero(good)
-    kept = kept[np.concatenate([[True], stamps_ns[kept][1:] > np.maximum.accumulate(stamps_ns[kept])[:-1]])]
+    kept = kept[
+        np.concatenate([[True], stamps_ns[kept][1:] > np.maximum.accumulate(stamps_ns[kept])[:-1]])
+    ]
     if len(kept) < len(stamps_ns):
-        dropped = f"{path}: {len(stamps_ns) - len(kept)} fixes dropped (no solution, or not in order)"
+        dropped = (
+            f"{path}: {len(stamps_ns) - len(kept)} fixes dropped (no solution, or not in order)"
+        )
         diagnostics.warn("gnss_dropped", dropped)
     stamps_ns, positions, sigmas = stamps_ns[kept], positions[kept], sigmas[kept]
     local, datum = frame
@@ -182,9 +207,7 @@ def _degrees(text: str) -> float:
     return float(text[:point] or 0.0) + float(text[point:]) / 60.0
 
 
-def _read_odometry(
-    path: Path, diagnostics: Diagnostics
-) -> tuple[IntArray, FloatArray, FloatArray]:
+def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, FloatArray, FloatArray]:
     """Stamps, positions and quaternions of the odometry in a file."""
     what = "stamp [ns], x, y, z, qx, qy, qz, qw"
     tables = [rows.parse(_ODOMETRY_ROW, what) for rows in read_rows(path)]
