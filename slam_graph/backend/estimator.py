@@ -10,13 +10,12 @@ step of its engine: this package's own loop (`engine.py`) or one of GTSAM's smoo
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-import gtsam
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import IntArray
 from slam_graph.backend.aiding.aiding import Aiding
 from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
@@ -37,7 +36,6 @@ from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.window import Window
-from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState

@@ -13,7 +13,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.frontend import epipolar_error
 from slam_graph.geometry import Trajectory, interpolate
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData, Rig
+from slam_graph.sensors import AidingData, FeatureFrame, FeatureObservations, ImuData, Rig
 
 _GAP_FRAMES = 5
 """Features are compared with themselves so many frames before: over one frame the true motion is
@@ -69,7 +69,7 @@ class TrackQuality:
         self._stereo_px: list[FloatArray] = []
         self._recent: deque[tuple[FeatureFrame, gtsam.Pose3 | None]] = deque(maxlen=_GAP_FRAMES)
 
-    def write(self, imu: ImuData, frame: FeatureFrame) -> None:
+    def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Take note of the next frame; the IMU is not looked at."""
         ids = np.unique(np.concatenate([seen.ids for seen in frame.cameras]))
         self._lengths.update(ids.tolist())

@@ -164,7 +164,7 @@ class Estimation:
             estimator.solved_ns != features.stamp_ns,
             tracked.clock.milliseconds,
             tracked.frame_stats,
-            estimator.georeferenced,
+            estimator.aiding.aligned,
         )
         self._note(frame, tracked)
         return frame
@@ -196,7 +196,7 @@ class Estimation:
             self._start_from_known_state(tracked.packet.frame.stamp_ns)
         estimator.add_imu(tracked.packet.imu)
         if tracked.packet.aiding is not None:
-            estimator.add_aiding(tracked.packet.aiding)
+            estimator.aiding.add(tracked.packet.aiding)
         self._recovery.check_recorded(stamp_ns, tracked.packet.imu)
         try:
             state = estimator.add_frame(features)

@@ -151,6 +151,7 @@ class Recorder(Protocol):
         Args:
             imu: the samples since the frame before.
             frame: what the front end found.
+            aiding: position fixes and odometry since the frame before.
         """
         ...
 

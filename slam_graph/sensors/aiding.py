@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements that aid cameras and IMU: fixes of the position (GNSS) and odometry of wheels or legs.
+"""Measurements that aid cameras and IMU: position fixes (GNSS) and odometry of wheels or legs.
 
 Both are few beside images and samples of an IMU, and come with the packet of the first frame that
 is not earlier. Their times are on the clock of the IMU, or of the cameras where there is no IMU.
@@ -59,8 +59,13 @@ class AidingData:
         datum: tuple[float, float, float] | None = None,
     ) -> AidingData:
         """Position fixes alone; see the attributes."""
-        fixes = {"fix_stamps_ns": stamps_ns, "fix_positions": positions}
-        return replace(AidingData.empty(), **fixes, fix_covariances=covariances, datum=datum)
+        return replace(
+            AidingData.empty(),
+            fix_stamps_ns=stamps_ns,
+            fix_positions=positions,
+            fix_covariances=covariances,
+            datum=datum,
+        )
 
     def with_odometry(
         self, stamps_ns: IntArray, positions: FloatArray, quaternions: FloatArray

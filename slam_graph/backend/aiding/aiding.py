@@ -43,6 +43,7 @@ class Aiding:
 
     Attributes:
         aligned: whether the world is that of the fixes.
+        used: whether there was anything to take so far.
     """
 
     def __init__(self, config: BackendConfig, level: bool) -> None:
@@ -50,7 +51,7 @@ class Aiding:
         self._arm = np.array(config.gnss.lever_arm_m)
         self._offset_ns = round(config.gnss.time_offset_s * 1e9)
         self._data = AidingData.empty()
-        self.gate = FixGate()
+        self.gate, self.used = FixGate(), False
         self.restart()
 
     def restart(self) -> None:
@@ -61,7 +62,8 @@ class Aiding:
         self._pairs: list[tuple[FloatArray, FloatArray, FloatArray, float]] = []
 
     def add(self, data: AidingData) -> None:
-        """Take measurements that follow those before."""
+        """Take measurements that follow those before; none say that there will be some."""
+        self.used = True
         if not self._config.gnss.enabled:
             data = data.without_fixes()
         self._data = AidingData.concatenate([self._data, data.shifted(self._offset_ns)])
@@ -109,13 +111,15 @@ class Aiding:
 
     # --- the world -------------------------------------------------------------------------------
 
-    def alignment(self, state: NavState) -> WorldAlignment | None:
+    def alignment(self, state: NavState | None) -> WorldAlignment | None:
         """Note the state of a frame; where its world is, as soon as the fixes tell it.
 
         Args:
-            state: of the newest frame.
+            state: of the newest frame; None without one.
         """
-        if self.aligned or (self._states and state.stamp_ns <= self._states[-1].stamp_ns):
+        if state is None or not self.used or self.aligned:
+            return None
+        if self._states and state.stamp_ns <= self._states[-1].stamp_ns:
             return None
         self._states.append(state)
         if not self._pair(state):
@@ -129,7 +133,7 @@ class Aiding:
         return align_world(places, fixes, covariances, now, self._level)
 
     def _pair(self, state: NavState) -> bool:
-        """Note the fixes up to a state with the place of the antenna then; whether there are any."""
+        """Note the fixes up to a state with the antenna's place then; whether there are any."""
         if len(self._states) < 2:
             self._waiting = self._waiting.within(state.stamp_ns, None)
             return False

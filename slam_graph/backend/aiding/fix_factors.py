@@ -42,7 +42,7 @@ def fix_factor(
         arm: (3,) of the antenna in the body, m.
         robust: whether a Cauchy loss lets it count less the farther it is off.
     """
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
     if robust:
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
         noise = gtsam.noiseModel.Robust.Create(cauchy, noise)

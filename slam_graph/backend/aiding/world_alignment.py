@@ -94,7 +94,7 @@ def align_world(
         distances = _distances(motion, places, fixes, roots)
     if np.linalg.cond(information) > 1e12:
         return None
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     if np.sqrt(np.diag(covariance)[3:].max()) > _ROTATION_SIGMA_RAD:
         return None
     return WorldAlignment(motion, covariance, _moved(motion, centre[None])[0], fits)
@@ -111,7 +111,7 @@ def _distances(
 ) -> FloatArray:
     """Residuals (N,) in σ."""
     residuals = fixes - _moved(motion, places)
-    return np.linalg.norm(np.einsum("nij,nj->ni", roots, residuals), axis=1)
+    return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", roots, residuals), axis=1))
 
 
 def _step(

@@ -130,7 +130,7 @@ class Propagation:
         self._still = still
         if still:
             window.factors += zero_velocity_factors(i, j)
-        if self.aiding is not None:
+        if self.aiding is not None and self.aiding.used:
             self._append_aiding(self.aiding, window, (i, j), (previous.stamp_ns, stamp_ns))
 
     def _append_aiding(

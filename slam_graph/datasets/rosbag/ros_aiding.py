@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import pose_of
@@ -119,7 +120,7 @@ class BagAiding:
             pose = gtsam.Pose3(rotation, np.array([x, y, z])).compose(base_T_body)
             stamps.append(at_ns)
             positions.append(pose.translation())
-            quaternions.append(pose.rotation().toQuaternion().coeffs())
+            quaternions.append(Rotation.from_matrix(pose.rotation().matrix()).as_quat())
         return data.with_odometry(
             np.array(stamps, np.int64),
             np.array(positions).reshape(-1, 3),

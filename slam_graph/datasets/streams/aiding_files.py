@@ -108,9 +108,9 @@ def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
         sigmas.append(table["sigma"])
     if not stamps:
         raise DataError(f"{path}: no fixes in this file")
-    found = tuple(np.concatenate(part) for part in (stamps, positions, sigmas))
     local = not nmea and "latitude" not in header
-    return fixes_from(found[0], found[1], found[2], path, diagnostics, (local, datum))
+    found = np.concatenate(stamps), np.concatenate(positions), np.concatenate(sigmas)
+    return fixes_from(*found, path, diagnostics, (local, datum))
 
 
 def fixes_from(
@@ -153,19 +153,22 @@ def fixes_from(
 
 def _header(path: Path) -> tuple[str, Datum | None]:
     """The first line of a file in small letters, and the datum in its comments."""
-    first, datum = "", None
+    first = ""
+    datum: Datum | None = None
+    cells: list[float]
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file):
             first = first or line.lower()
             if line.startswith(_DATUM):
                 try:
-                    datum = tuple(float(cell) for cell in line[len(_DATUM) :].split(","))
+                    cells = [float(cell) for cell in line[len(_DATUM) :].split(",")]
                 except ValueError:
-                    datum = ()
-                if len(datum) != 3:
+                    cells = []
+                if len(cells) != 3:
                     raise DataError(
                         f"{path}:{number + 1}: expected '{_DATUM} latitude, longitude, altitude'"
                     )
+                datum = cells[0], cells[1], cells[2]
             if "timestamp" in line.lower():
                 first = line.lower()
             elif not line.startswith("#"):
@@ -265,4 +268,4 @@ def with_aiding(packets: Iterator[Packet], data: AidingData) -> Iterator[Packet]
             odometry.odometry_stamps_ns, odometry.odometry_positions, odometry.odometry_quaternions
         )
         fixes_ns, odometry_ns = stamp_ns, until_ns
-        yield replace(packet, aiding=part) if len(part) else packet
+        yield replace(packet, aiding=part)
