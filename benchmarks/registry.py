@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from benchmarks import (
     bal,
+    car,
     consistency_real,
     cost_over_time,
     elimination,
@@ -54,6 +55,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **real_imu.BENCHMARKS,
     **mono_real_imu.BENCHMARKS,
     **consistency_real.BENCHMARKS,
+    **car.BENCHMARKS,
     **starts.BENCHMARKS,
     **stream_rates.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,

@@ -66,7 +66,7 @@ class VisualMotion:
             pose = self._pose(frame, ids, points, -found.gyro_bias)
             if pose is None:
                 return predicted
-            found = _moved(before, predicted, pose)
+            found = moved_to(before, predicted, pose)
         return found
 
     def _known(
@@ -141,7 +141,7 @@ def depths_within(
     return ids, points
 
 
-def _moved(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:
+def moved_to(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:
     """A predicted state at another pose, with the mean velocity and rate that lead there.
 
     White noise would let both change by half as much again; but with a rolling shutter the rate

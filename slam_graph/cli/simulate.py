@@ -31,7 +31,7 @@ def simulate(
         str | None,
         typer.Option(
             "--trajectory",
-            metavar="figure8|rooms|random|PATH",
+            metavar="figure8|rooms|random|car|PATH",
             help="A made-up trajectory, or a ground truth or EuRoC folder to fly along.",
         ),
     ] = None,
@@ -54,6 +54,15 @@ def simulate(
     shutter_readout: Annotated[
         float | None,
         typer.Option("--shutter-readout", help="Readout time of rolling shutters, seconds."),
+    ] = None,
+    gnss: Annotated[
+        float | None, typer.Option("--gnss", help="Position fixes with this sigma, metres.")
+    ] = None,
+    multipath: Annotated[
+        float | None, typer.Option("--multipath", help="Share of fixes that are off by 10 m.")
+    ] = None,
+    odometry: Annotated[
+        bool | None, typer.Option("--odometry", help="Odometry of wheels.", show_default=False)
     ] = None,
     start: Annotated[
         float | None, typer.Option("--start", help="Seconds into a recorded trajectory.")
@@ -107,6 +116,8 @@ def simulate(
         "calibration": calibration,
         "depth": None if depth is None else {"sensor": depth},
         "with_imu": imu,
+        "gnss": {"sigma_m": gnss, "multipath": multipath or 0.0} if gnss or multipath else None,
+        "odometry": None if odometry is None else {"enabled": odometry},
         "shutter_readout_s": shutter_readout,
         "start_s": start,
         "duration_s": duration,

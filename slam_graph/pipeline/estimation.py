@@ -208,6 +208,7 @@ class Estimation:
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
+            result.georeferenced = estimator.aiding.aligned
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
         if state is not None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slam_graph.config import RunConfig, load_config
-from slam_graph.datasets import Sequence, open_dataset
+from slam_graph.datasets import RecordedSequence, Sequence, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
@@ -179,7 +179,8 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     rig = replace(rig, has_imu=config.backend.dynamics.uses_imu(recorded))
     if not rig.has_imu:  # gravity is not known
         config = config.with_overrides(["loop_closure.degrees_of_freedom=6"])
-    return RunInput(info, config, rig, start_ns, end_ns, sequence.groundtruth())
+    datum = sequence.aiding.datum if isinstance(sequence, RecordedSequence) else None
+    return RunInput(info, config, rig, start_ns, end_ns, sequence.groundtruth(), datum)
 
 
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:

@@ -60,6 +60,8 @@ class RunInput:
         rig: the sensors that were used.
         start_ns, end_ns: times of the first and the last frame that were asked for.
         truth: ground truth of the whole recording, or None.
+        datum: latitude, longitude (degrees) and height (m) of the origin of the position fixes, or
+            None.
     """
 
     info: SequenceInfo
@@ -68,6 +70,7 @@ class RunInput:
     start_ns: int
     end_ns: int
     truth: Trajectory | None = None
+    datum: tuple[float, float, float] | None = None
 
     @property
     def recorded_s(self) -> float:
@@ -105,6 +108,7 @@ class RunResult(RunSummary):
         history: the causal estimate of every frame, with covariances.
         segments: stretches of it, each from a start to where the estimate was lost.
         start_was_given: whether the first state came with the data, in the world of the truth.
+        georeferenced: whether the world is that of the position fixes.
         corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
         logs: what was noted at every frame.
@@ -121,6 +125,7 @@ class RunResult(RunSummary):
     history: StateHistory = field(default_factory=StateHistory)
     segments: Segments = field(default_factory=Segments)
     start_was_given: bool = False
+    georeferenced: bool = False
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
     logs: RunLogs = field(default_factory=RunLogs)
@@ -282,6 +287,7 @@ class RunResult(RunSummary):
                 "algorithm": self.config.algorithm.name,
                 "cameras": len(asked.rig.cameras),
                 "seed": self.config.seed,
+                "world": {"of_fixes": self.georeferenced, "datum": asked.datum},
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(self.segments, self.trajectory, truth),
                 "accuracy": tables.accuracy_table(truth, self.trajectory),

@@ -131,10 +131,8 @@ class AidingData:
         stamps, ends = self.odometry_stamps_ns, np.array([from_ns, to_ns])
         if len(stamps) < 2 or from_ns < stamps[0] or to_ns > stamps[-1]:
             return None
-        first, last = (
-            np.searchsorted(stamps, ends[0], "right") - 1,
-            np.searchsorted(stamps, ends[1]),
-        )
+        first = np.searchsorted(stamps, from_ns, "right") - 1
+        last = np.searchsorted(stamps, to_ns)
         if np.diff(stamps[first : last + 1]).max(initial=0) > _MAX_ODOMETRY_GAP_S * 1e9:
             return None
         near = slice(int(first), int(last) + 1)

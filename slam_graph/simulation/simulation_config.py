@@ -216,9 +216,9 @@ class SimulationConfig(Settings):
     """tracks: feature tracks, made in seconds, for questions about the back end; images: rendered
     images, some 0.1 s each, for questions about the front end."""
     trajectory: str = Field("figure8")
-    """figure8, rooms (through three rooms and back, for loop closure), random, car (on plane roads at
-    10 m/s, with the cameras of KITTI at 10 Hz; tracks only), or the path of a recorded trajectory
-    (a ground-truth file or EuRoC folder)."""
+    """figure8, rooms (through three rooms and back, for loop closure), random, car (on plane roads
+    at 10 m/s, with the cameras of KITTI at 10 Hz; tracks only), or the path of a recorded
+    trajectory (a ground-truth file or EuRoC folder)."""
     real_imu: bool = Field(False)
     """Use the IMU samples recorded with the trajectory, with their vibration, instead of simulated
     ones. Needs an EuRoC folder as `trajectory`."""

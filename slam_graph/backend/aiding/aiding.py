@@ -24,6 +24,7 @@ from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.state import State
+from slam_graph.backend.visual_motion import moved_to
 from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData
@@ -108,6 +109,21 @@ class Aiding:
                 key = pose_key(frames[1])
                 factors.append(fix_factor(key, position, covariance / weight, self._arm))
         return factors
+
+    def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
+        """A predicted state where the odometry has it; None without odometry of this time.
+
+        Args:
+            before: the last state.
+            predicted: the new one, by constant velocity.
+        """
+        if not self.used or not self._config.odometry.enabled:
+            return None
+        moved = self._data.odometry_between(before.stamp_ns, predicted.stamp_ns)
+        if moved is None:
+            return None
+        motion = gtsam.Pose3(gtsam.Rot3.Expmap(moved[0]), moved[1])
+        return moved_to(before, predicted, before.world_T_body.compose(motion))
 
     # --- the world -------------------------------------------------------------------------------
 

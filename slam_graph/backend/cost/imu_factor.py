@@ -120,6 +120,8 @@ class Propagation:
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
         first = predicted if corrected is None else corrected(previous, predicted)
+        if corrected is not None and self.aiding is not None:
+            first = self.aiding.by_odometry(previous, predicted) or first
         window.state.insert_imu_state(j, first)
         window.past.append(i)
         window.moving.append(i)

@@ -223,8 +223,8 @@ def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, Floa
     if not good.all():
         dropped = f"{path}: {np.count_nonzero(~good)} samples dropped (not finite, or not in order)"
         diagnostics.warn("odometry_dropped", dropped)
-    table, lengths = table[good], lengths[good]
-    return table["stamp"], table["position"], table["quaternion"] / lengths[:, None]
+    table = table[good]
+    return table["stamp"], table["position"], table["quaternion"]
 
 
 def aiding_texts(data: AidingData) -> dict[str, str]:
