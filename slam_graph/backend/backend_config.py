@@ -270,7 +270,7 @@ class GnssConfig(Settings):
 class OdometryConfig(Settings):
     """Odometry of wheels or legs: the motion of the body from frame to frame."""
 
-    enabled: bool = True
+    enabled: bool = expert(True)
     """Use the odometry of the recording. Switch it off if wheels slip much."""
     position_noise: float = expert(0.02, gt=0)
     """Standard deviation of the position on each axis after one metre, m/√m."""

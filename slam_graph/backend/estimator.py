@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.aiding.aiding import Aiding
+from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection

@@ -60,8 +60,7 @@ class RunInput:
         rig: the sensors that were used.
         start_ns, end_ns: times of the first and the last frame that were asked for.
         truth: ground truth of the whole recording, or None.
-        datum: latitude, longitude (degrees) and height (m) of the origin of the position fixes, or
-            None.
+        datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
     """
 
     info: SequenceInfo
@@ -392,13 +391,9 @@ class RunResult(RunSummary):
         histories = {CAUSAL: self.history}
         if self.final_ba is not None:
             histories[SMOOTHED] = self.final_ba.history
-        view = RunView(
-            {name: PoseEstimate.of_history(history) for name, history in histories.items()},
-            self._paths_of_loops(),
-            self.groundtruth,
-            self.points,
-            self.input.start_ns,
-        )
+        estimates = {name: PoseEstimate.of_history(found) for name, found in histories.items()}
+        loops, truth, began_ns = self._paths_of_loops(), self.groundtruth, self.input.start_ns
+        view = RunView(estimates, loops, truth, self.points, began_ns)
         view = with_covariances_after_alignment(
             view, histories, self.start_was_given, self.final_ba
         )

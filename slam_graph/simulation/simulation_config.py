@@ -150,7 +150,7 @@ class MovingObjectConfig(Settings):
 class SimulatedGnssConfig(Settings):
     """Simulated position fixes; their world is that of the ground truth."""
 
-    sigma_m: float | None = Field(None, gt=0)
+    sigma_m: float | None = expert(None, gt=0)
     """Standard deviation of a fix on each axis, in metres; no fixes if not given."""
     rate_hz: float = expert(1.0, gt=0)
     """Fixes per second."""
@@ -166,7 +166,7 @@ class SimulatedGnssConfig(Settings):
 class SimulatedOdometryConfig(Settings):
     """Simulated odometry, which drifts."""
 
-    enabled: bool = Field(default=False)
+    enabled: bool = expert(False)
     """Whether the recording has odometry."""
     rate_hz: float = expert(50.0, gt=0)
     """Samples per second."""

@@ -17,7 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.aiding import Aiding
+from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise, MotionChange
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
