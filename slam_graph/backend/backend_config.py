@@ -257,7 +257,7 @@ class DynamicsConfig(Settings):
 class GnssConfig(Settings):
     """Position fixes, of GNSS or any other kind."""
 
-    enabled: bool = True
+    enabled: bool = expert(True)
     """Use the fixes of the recording, and report the trajectory in their world: east, north, up
     from the datum. Switch it off to compare."""
     lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
