@@ -92,7 +92,7 @@ class Estimator(EstimatorKnowledge):
         if algorithm.engine != "square_root":
             self._make_engine = SmootherEngine
         self._check = StartCalibration(rig, config)
-        self.aiding = Aiding(config, dynamics.measures_gravity)
+        self.aiding = Aiding(config, rig.has_imu)
         self._given: NavState | None = None
         self._before: NavState | None = None
         self._held: deque[FeatureFrame] | None = None

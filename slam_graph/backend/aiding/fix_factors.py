@@ -14,13 +14,13 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.geometry import Trajectory, interpolate
 
-_GATE = float(np.sqrt(chi2.ppf(0.999, 3)))
-_HUBER = float(np.sqrt(chi2.ppf(0.95, 3)))
+_GATE = float(np.sqrt(chdtri(3, 0.001)))
+_HUBER = float(np.sqrt(chdtri(3, 0.05)))
 """Mahalanobis distances of an innovation beyond which a fix is rejected, and counts less."""
 _CAUCHY = 4.0
 """Width of the Cauchy loss (σ): a good fix counts for 0.84, one that is off by 10 σ for 0.14."""
