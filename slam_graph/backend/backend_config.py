@@ -239,6 +239,8 @@ class DynamicsConfig(Settings):
     slow platforms."""
     angular_accel_density: float = expert(4.0, gt=0)
     """The same for the angular acceleration, rad/s²/√Hz."""
+    min_points: int = expert(10, ge=4)
+    """Fewest points of a known depth that tell the motion between two images."""
 
     def uses_imu(self, has_imu: bool) -> bool:
         """Whether an IMU predicts the states, of a rig that has one or not.

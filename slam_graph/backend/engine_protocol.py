@@ -92,7 +92,7 @@ class EngineContext:
 
     @cached_property
     def _motion(self) -> VisualMotion:
-        return VisualMotion(self.rig)
+        return VisualMotion(self.rig, self.config.dynamics.min_points)
 
     def by_images(
         self, frame: FeatureFrame, known: Callable[[], tuple[IntArray, FloatArray]]

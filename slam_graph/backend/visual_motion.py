@@ -23,8 +23,6 @@ from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 
-MIN_POINTS = 10
-"""Fewer known points tell no motion."""
 ERROR_PX = 4.0
 """Largest error of a point that fits the motion."""
 _LEAST_SHARE = 0.5
@@ -38,10 +36,12 @@ class VisualMotion:
 
     Args:
         rig: the cameras; the first one is looked through.
+        min_points: fewer known points tell no motion.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, min_points: int) -> None:
         self._rig = rig
+        self._min_points = min_points
         self._last: FeatureFrame | None = None
 
     def corrected(
@@ -89,7 +89,7 @@ class VisualMotion:
         """world_T_body by known points (ascending ids); None if they do not tell it."""
         seen, mounted = frame.cameras[0], self._rig.cameras[0]
         rows = is_in(seen.ids, ids)
-        if np.count_nonzero(rows) < MIN_POINTS:
+        if np.count_nonzero(rows) < self._min_points:
             return None
         world = points[np.searchsorted(ids, seen.ids[rows])]
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)

@@ -16,7 +16,7 @@ from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.start_diagnosis import Refusal
-from slam_graph.backend.visual_motion import ERROR_PX, MIN_POINTS, depths_within
+from slam_graph.backend.visual_motion import ERROR_PX, depths_within
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
@@ -85,11 +85,11 @@ class VisualStart:
         rig, seen = self._context.rig, now.cameras[0]
         ids, points = depths_within(before, rig)
         rows = np.isin(seen.ids, ids)
-        count = np.count_nonzero(rows)
-        if count < MIN_POINTS:
+        count, least = np.count_nonzero(rows), self._context.config.dynamics.min_points
+        if count < least:
             return Refusal(
                 "tracks",
-                f"{MIN_POINTS} features with a depth that last from one frame to the next; there "
+                f"{least} features with a depth that last from one frame to the next; there "
                 f"are {count} of {len(seen)} (a second camera or a depth image gives the depth)",
             )
         order = np.argsort(ids)

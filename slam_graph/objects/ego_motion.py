@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of the cameras over the last frames, as far as the estimator knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend import Estimator
+from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState
+
+
+@dataclass(frozen=True, eq=False)
+class EgoMotion:
+    """Poses of the last F frames, and how well the motion between them is known.
+
+    Attributes:
+        stamps_ns: (F,) of the frames, on the clock of the cameras, ascending.
+        poses: world_T_body of each.
+        state: of the last one.
+        velocity_covariance: (3, 3) of the mean velocity over the frames, m²/s², world axes.
+        rate_covariance: (3, 3) of the mean angular rate over them, rad²/s², world axes.
+        step_covariance: (6, 6) of the motion from the last but one frame to the last, in the
+            tangent of the last pose: rotation (rad), translation (m).
+    """
+
+    stamps_ns: tuple[int, ...]
+    poses: tuple[gtsam.Pose3, ...]
+    state: NavState
+    velocity_covariance: FloatArray
+    rate_covariance: FloatArray
+    step_covariance: FloatArray
+
+    @property
+    def seconds(self) -> FloatArray:
+        """(F,) times of the frames since the last one, s, not positive."""
+        return (np.array(self.stamps_ns) - self.stamps_ns[-1]) * 1e-9
+
+    def covariance_over(self, since: int) -> FloatArray:
+        """(6, 6) of the motion since an earlier frame, in the tangent of the last pose."""
+        R = self.poses[-1].rotation().matrix()
+        seconds = -self.seconds[since]
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = R.T @ self.rate_covariance @ R * seconds**2
+        covariance[3:, 3:] = R.T @ self.velocity_covariance @ R * seconds**2
+        return covariance
+
+    def arrays(self) -> tuple[FloatArray, FloatArray]:
+        """Rotations (F, 3, 3) and positions (F, 3) of the body."""
+        return pose_arrays(self.poses)
+
+
+def pose_arrays(poses: tuple[gtsam.Pose3, ...]) -> tuple[FloatArray, FloatArray]:
+    """Rotations (F, 3, 3) and positions (F, 3) of poses."""
+    matrices = np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4)
+    return np.ascontiguousarray(matrices[:, :3, :3]), np.ascontiguousarray(matrices[:, :3, 3])
+
+
+class EgoWindow:
+    """Keeps the poses of the last frames, and takes later estimates of them where there are any.
+
+    Args:
+        length_s: how long frames are kept.
+    """
+
+    def __init__(self, length_s: float) -> None:
+        self._length_ns = round(length_s * 1e9)
+        self._poses: dict[int, gtsam.Pose3] = {}
+        self._frames: dict[int, int] = {}  # stamp of the frame with an index in the estimator
+        self._started = False
+
+    def forget(self) -> None:
+        """Forget all frames: the world is another one from now on."""
+        self._poses.clear()
+        self._frames.clear()
+        self._started = False
+
+    def add(self, stamp_ns: int, state: NavState, estimator: Estimator) -> EgoMotion | None:
+        """The motion up to a new frame; None at the first one, whose pose no image has corrected.
+
+        Args:
+            stamp_ns: of the frame.
+            state: of the platform then.
+            estimator: after the frame.
+        """
+        window = estimator.window
+        assert window is not None
+        if not self._started:
+            self._started = True
+            return None
+        self._frames[window.frame] = stamp_ns
+        self._poses[stamp_ns] = state.world_T_body
+        for stamp in [s for s in self._poses if s < stamp_ns - self._length_ns]:
+            del self._poses[stamp]
+        self._frames = {i: s for i, s in self._frames.items() if s in self._poses}
+        past = [i for i in window.past if i in self._frames and i != window.frame]
+        for i in past:
+            if window.state.estimate.exists(X(i)):
+                self._poses[self._frames[i]] = window.state.estimate.atPose3(X(i))
+        stamps = tuple(self._poses)
+        known = _known(estimator, window.frame, past, self._frames)
+        velocity, rate, step = known or _by_state(state, stamps)
+        return EgoMotion(stamps, tuple(self._poses.values()), state, velocity, rate, step)
+
+
+def _known(
+    estimator: Estimator, now: int, past: list[int], frames: dict[int, int]
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Covariances of velocity, rate and last step by the poses in the state; None without any."""
+    if not past:
+        return None
+    first, last = min(past), max(past)
+    keys = sorted({first, last})
+    try:
+        joint = estimator.covariance_of([*(X(i) for i in keys), X(now)])
+    except EstimationError:
+        return None
+    window = estimator.window
+    assert window is not None
+    at = window.state.estimate.atPose3
+    pose = at(X(now))
+
+    def relative(i: int) -> FloatArray:
+        """Covariance (6, 6) of the motion since a frame, in the tangent of the pose now."""
+        rows = 6 * keys.index(i)
+        adjoint = pose.between(at(X(i))).AdjointMap()
+        J = np.hstack([-adjoint, np.eye(6)])
+        both = np.r_[rows : rows + 6, len(joint) - 6 : len(joint)]
+        P: FloatArray = J @ joint[np.ix_(both, both)] @ J.T
+        return P
+
+    R = pose.rotation().matrix()
+    P, seconds = relative(first), (frames[now] - frames[first]) * 1e-9
+    step = relative(last)
+    between_s = (frames[now] - frames[last]) * 1e-9
+    before_s = (frames[now] - max(s for i, s in frames.items() if i != now)) * 1e-9
+    return (
+        R @ P[3:, 3:] @ R.T / seconds**2,
+        R @ P[:3, :3] @ R.T / seconds**2,
+        step * (before_s / between_s) ** 2,
+    )
+
+
+def _by_state(
+    state: NavState, stamps: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same by the velocity and rate of the state alone."""
+    P = state.covariance
+    assert P is not None
+    R = state.world_T_body.rotation().matrix()
+    seconds = (stamps[-1] - stamps[-2]) * 1e-9 if len(stamps) > 1 else 1.0
+    velocity, rate = P[6:9, 6:9], P[12:15, 12:15]
+    step = np.zeros((6, 6))
+    step[:3, :3] = rate * seconds**2
+    step[3:, 3:] = R.T @ velocity @ R * seconds**2
+    return velocity, R @ rate @ R.T, step

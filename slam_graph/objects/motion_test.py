@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Error or motion? A test of every track over the last frames.
+
+Under H0 the point of a track is static, under H1 it has a constant velocity u. With the poses as
+they are estimated, both are least squares over the observations, and twice the logarithm of the
+ratio of their likelihoods is uᵀ Σ⁻¹ u, which under H0 has a χ² distribution of three degrees of
+freedom (Neyman and Pearson 1933; Wald 1943). Errors of the poses over the window are those of a
+velocity and an angular rate of the cameras. A point at r from the cameras seems to move with the
+velocity error, and with the rate's times r; so their covariances add to Σ.
+
+What the cameras do not see does not count: along the ray a stereo pair hardly sees a motion, Σ is
+large there, and the test cannot tell. A track is called static only if Σ is small in all
+directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from scipy.special import chdtri
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import BackendConfig, RigProjection
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.objects.ego_motion import EgoMotion
+from slam_graph.objects.objects_config import ObjectsConfig
+
+_STEPS = 3
+"""Gauss-Newton steps for position and velocity."""
+_MAX_SPEED = 20.0
+"""Standard deviation of the velocity before any observation, m/s: it keeps the equations regular
+where a camera sees nothing of it."""
+_OBJECT_SPEED = 1.0
+"""Standard deviation of each component of the velocity of what moves, m/s, for its probability."""
+_PRIOR_ODDS = 0.05
+"""Tracks that move to tracks that are static, before they are tested."""
+_MISFIT = 1e-6
+"""Probability of a track's errors under the better of the two below which it is a wrong match."""
+
+
+class Verdict(IntEnum):
+    """What the test says of a track."""
+
+    UNKNOWN = 0
+    STATIC = 1
+    MOVING = 2
+    WRONG = 3
+    """It fits neither: a wrong match, or it does not move evenly."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTest:
+    """The result for J tracks.
+
+    Attributes:
+        ids: (J,) ascending.
+        points: (J, 3) where they are now in the world.
+        velocities: (J, 3) m/s.
+        covariances: (J, 3, 3) of the velocities, with the errors of the poses.
+        statistics: (J,) uᵀ Σ⁻¹ u.
+        probabilities: (J,) that it moves.
+        verdicts: (J,) each a `Verdict`.
+    """
+
+    ids: IntArray
+    points: FloatArray
+    velocities: FloatArray
+    covariances: FloatArray
+    statistics: FloatArray
+    probabilities: FloatArray
+    verdicts: IntArray
+
+    def of(self, verdict: Verdict) -> IntArray:
+        """Ids (N,) of the tracks with a verdict, ascending."""
+        return self.ids[self.verdicts == verdict]
+
+
+def test_motion(
+    obs: Observations,
+    rig: RigProjection,
+    ego: EgoMotion,
+    sigma_px: float,
+    backend: BackendConfig,
+    config: ObjectsConfig,
+) -> MotionTest:
+    """Test tracks.
+
+    Args:
+        obs: of frames of `ego`, by their numbers there; each feature at least twice.
+        rig: the cameras.
+        ego: the poses.
+        sigma_px: standard deviation of the observations.
+        backend: thresholds of triangulation.
+        config: error rate and speed.
+    """
+    frames = np.array(obs.frames)
+    rotations, positions = (a[frames] for a in ego.arrays())
+    seconds = ego.seconds[frames]
+    count = len(obs.ids)
+    points = triangulate(obs, rig, rotations, positions, backend.triangulation).points
+    points = np.where(np.isfinite(points), points, 0.0)
+    fit = _fit(obs, rig, rotations, positions, seconds, points, sigma_px)
+    points, velocities, Sigma, squares = fit
+    offset = points - ego.state.world_T_body.translation()
+    arm = _cross_matrices(offset)
+    Sigma = Sigma + ego.velocity_covariance + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
+    statistics = np.einsum(
+        "ji,ji->j", velocities, np.linalg.solve(Sigma, velocities[:, :, None])[:, :, 0]
+    )
+    dof = np.maximum(2 * obs.counts - 6, 1)
+    verdicts = np.full(count, int(Verdict.UNKNOWN))
+    largest = np.sqrt(np.linalg.eigvalsh(Sigma)[:, -1])
+    moving = statistics > chdtri(3, config.false_alarm)
+    speed = np.linalg.norm(velocities, axis=1)
+    verdicts[~moving & (speed + 2.0 * largest < config.min_speed)] = Verdict.STATIC
+    verdicts[moving] = Verdict.MOVING
+    verdicts[squares > chdtri(dof, _MISFIT)] = Verdict.WRONG
+    return MotionTest(
+        obs.ids, points, velocities, Sigma, statistics, _probabilities(velocities, Sigma), verdicts
+    )
+
+
+def _fit(
+    obs: Observations,
+    rig: RigProjection,
+    rotations: FloatArray,
+    positions: FloatArray,
+    seconds: FloatArray,
+    points: FloatArray,
+    sigma_px: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Position now and velocity (J, 3), its covariance (J, 3, 3), squared errors (J,) over σ²."""
+    J, N = len(obs.ids), len(obs)
+    alone = replace(obs, feature=np.arange(N))  # every observation has a point of its own
+    since = seconds[obs.frame]
+    starts = obs.starts[:-1]
+    x = np.hstack([points, np.zeros((J, 3))])
+    prior = np.diag(np.repeat([1e-6, _MAX_SPEED**-2], 3))
+    squares = np.zeros(J)
+    for step in range(_STEPS + 1):
+        seen = x[obs.feature, :3] + since[:, None] * x[obs.feature, 3:]
+        at = Geometry(rotations, positions, seen)
+        views = rig.views(alone, at)
+        residuals = (obs.pixels - views.pixels) / sigma_px
+        squares = np.add.reduceat(np.sum(residuals**2, axis=1), starts)
+        by_point = rig.derivatives(alone, at, views)[1] / sigma_px
+        A = np.concatenate([by_point, by_point * since[:, None, None]], axis=2)
+        lhs = np.add.reduceat(A.transpose(0, 2, 1) @ A, starts) + prior
+        rhs = np.add.reduceat(np.einsum("nij,ni->nj", A, residuals), starts)
+        rhs[:, 3:] -= prior[3:, 3:].diagonal() * x[:, 3:]
+        if step < _STEPS:
+            x = x + np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
+    covariance = np.linalg.inv(lhs)[:, 3:, 3:]
+    return x[:, :3], x[:, 3:], covariance, squares
+
+
+def _probabilities(velocities: FloatArray, Sigma: FloatArray) -> FloatArray:
+    """(J,) that a track moves, by the Bayes factor of the two hypotheses."""
+    wide = Sigma + _OBJECT_SPEED**2 * np.eye(3)
+    u = velocities[:, :, None]
+
+    def log_density(P: FloatArray) -> FloatArray:
+        squares = np.einsum("ji,ji->j", velocities, np.linalg.solve(P, u)[:, :, 0])
+        return np.asarray(-0.5 * (squares + np.linalg.slogdet(P)[1]))
+
+    log_odds = np.log(_PRIOR_ODDS) + log_density(wide) - log_density(Sigma)
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
+    result[:, 1, 0], result[:, 2, 0], result[:, 2, 1] = z, -y, x
+    return result

@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of an object at one time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.objects.relative_motion import RelativeStep
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMotion:
+    """The motion of an object between two frames.
+
+    Attributes:
+        before_ns, now_ns: their times, on the clock of the cameras.
+        motion: before_T_now of the object's own frame, L_before⁻¹ L_now.
+        covariance: (6, 6) of its tangent: rotation (rad), translation (m), axes of the object now.
+    """
+
+    before_ns: int
+    now_ns: int
+    motion: gtsam.Pose3
+    covariance: FloatArray
+
+    @property
+    def seconds(self) -> float:
+        """Time between the frames."""
+        return (self.now_ns - self.before_ns) * 1e-9
+
+    @property
+    def statistic(self) -> float:
+        """Squared Mahalanobis distance from no motion: χ² of six degrees of freedom if it rests."""
+        tangent = gtsam.Pose3.Logmap(self.motion)
+        return float(tangent @ np.linalg.solve(self.covariance, tangent))
+
+    @staticmethod
+    def of(
+        step: RelativeStep,
+        object_T_start: gtsam.Pose3,
+        ego: gtsam.Pose3,
+        ego_covariance: FloatArray,
+    ) -> ObjectMotion:
+        """The motion in the world: of the platform in the frame of the object, and in the world.
+
+        With Y = object_T_body and the motion U of the platform, M = Y₀ U Y₁⁻¹. Errors on the right
+        of each, a of Y₀, e of U and b of Y₁, are one of M: Ad(Y₁) (Ad(U⁻¹) a + e - b).
+
+        Args:
+            step: in the frame of the object's estimator.
+            object_T_start: of that frame in the object's.
+            ego: before_T_now of the platform.
+            ego_covariance: (6, 6) of its tangent.
+        """
+        before, now = object_T_start.compose(step.before), object_T_start.compose(step.now)
+        motion = before.compose(ego).compose(now.inverse())
+        J = np.hstack([ego.inverse().AdjointMap(), -np.eye(6)])
+        inner = J @ step.covariance @ J.T + ego_covariance
+        outer = now.AdjointMap()
+        covariance = outer @ inner @ outer.T
+        return ObjectMotion(step.before_ns, step.now_ns, motion, 0.5 * (covariance + covariance.T))
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectState:
+    """An object at one time.
+
+    Attributes:
+        stamp_ns: time of the frame, on the clock of the cameras.
+        number: of the object.
+        label: of its mask; 0 without one.
+        world_T_object: its pose. The frame of an object has the axes of the world and its origin in
+            the middle of the points where the object was found first.
+        covariance: (6, 6) of the tangent of the pose.
+        step: motion since the frame before; None where it is not known.
+        velocity: (3,) of its origin, mean over the last frames, m/s, in the world.
+        velocity_covariance: (3, 3).
+        moving: whether it is known to move.
+        points: number of its tracks in this frame.
+    """
+
+    stamp_ns: int
+    number: int
+    label: int
+    world_T_object: gtsam.Pose3
+    covariance: FloatArray
+    step: ObjectMotion | None
+    velocity: FloatArray
+    velocity_covariance: FloatArray
+    moving: bool
+    points: int

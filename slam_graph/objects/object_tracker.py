@@ -1,0 +1,279 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All moving objects of a recording: found, followed, and told apart, frame by frame.
+
+In every frame: the objects take their tracks; the other tracks are tested for motion of their own
+(`motion_test.py`); those that fit the motion of an object join it; those that are left and move
+together begin a new one (`motion_segmentation.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy.special import chdtri
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import AlgorithmConfig, BackendConfig
+from slam_graph.errors import EstimationError
+from slam_graph.objects.ego_motion import EgoMotion
+from slam_graph.objects.motion_segmentation import rigid_groups
+from slam_graph.objects.motion_test import MotionTest, Verdict, test_motion
+from slam_graph.objects.object_state import ObjectState
+from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.objects.track_window import TrackWindow
+from slam_graph.objects.tracked_object import TrackedObject
+from slam_graph.sensors import FeatureFrame, FeatureObservations, Rig
+
+_LEAST_FRAMES = 3
+"""Frames of a track before it is tested."""
+_MARGIN = 12.0
+"""Twice the logarithm of the ratio of likelihoods from which a track is of one world and not of
+another: 1 in 400."""
+_FITS = 1e-4
+"""Probability of the errors of a track that fits."""
+_SAME_PLACE_M = 0.5
+"""An object that appears again is no farther than this from where it is expected, or its own
+size."""
+
+
+def _no_ids() -> IntArray:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectFrame:
+    """What became of the tracks of one frame.
+
+    Attributes:
+        states: of the objects that are seen.
+        moving: ids (N,) of the features that must not count as static, ascending.
+        static: ids (N,) of the features that are known to be static, ascending.
+        probabilities: ids (J,) and the probability (J,) that each moves by itself.
+        members: number of the object by feature.
+        hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
+            camera.
+    """
+
+    states: list[ObjectState] = field(default_factory=list)
+    moving: IntArray = field(default_factory=_no_ids)
+    static: IntArray = field(default_factory=_no_ids)
+    probabilities: tuple[IntArray, FloatArray] = field(
+        default_factory=lambda: (_no_ids(), np.zeros(0))
+    )
+    members: dict[int, int] = field(default_factory=dict)
+    hulls: list[tuple[int, FloatArray]] = field(default_factory=list)
+
+
+class ObjectTracker:
+    """Finds moving objects and estimates their motion.
+
+    Args:
+        rig: the cameras.
+        algorithm: the policies, the same for objects as for the platform.
+        backend: settings of the estimator.
+        config: of objects.
+
+    Attributes:
+        objects: those that are seen, or were a short time ago.
+    """
+
+    def __init__(
+        self, rig: Rig, algorithm: AlgorithmConfig, backend: BackendConfig, config: ObjectsConfig
+    ) -> None:
+        self._policies = (algorithm, backend)
+        self._config = config
+        self._window = TrackWindow(rig, backend)
+        self._rig = rig
+        self._next = 1
+        self.objects: list[TrackedObject] = []
+        self._hidden: list[TrackedObject] = []
+
+    def add(self, frame: FeatureFrame, ego: EgoMotion, sigma_px: float) -> ObjectFrame:
+        """Take the features of one frame.
+
+        Args:
+            frame: all of them, with those that are known to move.
+            ego: the motion of the platform up to it.
+            sigma_px: standard deviation of the observations.
+        """
+        self._window.add(frame, ego.stamps_ns[0])
+        states = self._follow(ego)
+        own = _members(self.objects)
+        others = np.setdiff1d(self._window.seen, own, assume_unique=True)
+        test = self._tested(others, ego, sigma_px)
+        self._join(test, ego, sigma_px)
+        self._leave(ego, sigma_px)
+        self._begin(test, ego)
+        self._merge(sigma_px)
+        return self._described(states, test)
+
+    # --- objects that are known ------------------------------------------------------------------
+
+    def _follow(self, ego: EgoMotion) -> list[ObjectState]:
+        states: list[ObjectState] = []
+        now = ego.stamps_ns[-1]
+        for item in list(self.objects):
+            try:
+                state = item.add(self._window, ego)
+            except EstimationError:
+                self.objects.remove(item)
+                continue
+            if state is not None and item.confirmed:
+                states.append(state)
+            if state is None:
+                self.objects.remove(item)
+                if item.confirmed:
+                    self._hidden.append(item)
+            elif item.confirmed and not item.moving and item.frames == _LEAST_FRAMES:
+                self.objects.remove(item)  # it was found by errors of the platform's motion
+                states.remove(state)
+        oldest = now - round(self._config.max_occlusion_s * 1e9)
+        self._hidden = [item for item in self._hidden if item.seen_ns >= oldest]
+        return states
+
+    def _join(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
+        """Tracks that fit the motion of an object, and are not static, join it."""
+        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+        candidates = test.ids[test.verdicts != Verdict.STATIC]
+        for item in self.objects:
+            fit, squares, dof = self._window.misfit(candidates, item.poses, sigma_px)
+            same, alone, _ = self._window.misfit(
+                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
+            )
+            alone = _for(fit, same, alone)
+            joins = fit[(squares < chdtri(dof, _FITS)) & (alone - squares > _MARGIN)]
+            item.members = np.union1d(item.members, joins)
+            candidates = np.setdiff1d(candidates, joins)
+
+    def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
+        """Tracks of an object that are static leave it, if the object moves."""
+        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+        for item in self.objects:
+            if not item.moving:
+                continue
+            fit, squares, _ = self._window.misfit(item.members, item.poses, sigma_px)
+            same, alone, dof = self._window.misfit(
+                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
+            )
+            alone, dof = _for(fit, same, alone), _for(fit, same, dof)
+            leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(dof, _FITS))]
+            item.members = np.setdiff1d(item.members, leaves)
+
+    def _merge(self, sigma_px: float) -> None:
+        """Objects that move as one become one: the older stays (BIC; Schwarz 1978)."""
+        for younger in list(self.objects)[::-1]:
+            for older in self.objects:
+                if older.number >= younger.number or not older.confirmed:
+                    continue
+                ids, theirs, _ = self._window.misfit(younger.members, older.poses, sigma_px)
+                again, own, dof = self._window.misfit(ids, younger.poses, sigma_px)
+                if len(again) < self._config.min_points or len(again) < len(ids):
+                    continue
+                frames = len(older.poses.keys() & younger.poses.keys())
+                saved = 6 * max(frames - 1, 1) * np.log(max(int(np.sum(dof)), 2))
+                if frames >= _LEAST_FRAMES and float(np.sum(theirs) - np.sum(own)) < saved:
+                    older.members = np.union1d(older.members, younger.members)
+                    self.objects.remove(younger)
+                    break
+
+    # --- new objects -----------------------------------------------------------------------------
+
+    def _tested(self, ids: IntArray, ego: EgoMotion, sigma_px: float) -> MotionTest:
+        stamps = list(ego.stamps_ns)
+        obs = self._window.observations(ids, _LEAST_FRAMES, stamps)
+        return test_motion(
+            obs, self._window.projection, ego, sigma_px, self._policies[1], self._config
+        )
+
+    def _begin(self, test: MotionTest, ego: EgoMotion) -> None:
+        """Tracks that move together begin an object."""
+        own = _members(self.objects)
+        free = np.setdiff1d(test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))], own)
+        config = self._config
+        groups = [(0, group) for group in self._groups(free)]
+        for label, group in groups:
+            item = TrackedObject(
+                self._next, label, group, self._window, ego, self._policies, config
+            )
+            if not item.begun:
+                continue
+            self._recognise(item, ego)
+            if item.number == self._next:
+                self._next += 1
+            self.objects.append(item)
+
+    def _groups(self, ids: IntArray) -> list[IntArray]:
+        config = self._config
+        if len(ids) < config.min_points or len(self._window.frames) < _LEAST_FRAMES:
+            return []
+        frames = list(self._window.frames)
+        return rigid_groups(ids, frames, self._rig, config.min_points, config.ransac_px)
+
+    def _recognise(self, item: TrackedObject, ego: EgoMotion) -> None:
+        """Give an object its old number if one that was hidden is expected there."""
+        now = ego.stamps_ns[-1]
+        for hidden in sorted(self._hidden, key=lambda other: -other.seen_ns):
+            expected = hidden.predicted(now)
+            if expected is None or hidden.label != item.label:
+                continue
+            far = np.linalg.norm(item.middle(ego) - expected.transformFrom(hidden.shape_middle()))
+            if far < max(_SAME_PLACE_M, hidden.size()):
+                item.number, item.moving = hidden.number, hidden.moving
+                item.continue_from(expected, ego)
+                self._hidden.remove(hidden)
+                return
+
+    def _described(self, states: list[ObjectState], test: MotionTest) -> ObjectFrame:
+        moving = [item for item in self.objects if item.moving or not item.confirmed]
+        members = {int(i): item.number for item in self.objects for i in item.members}
+        own = _members(self.objects)
+        free = ~np.isin(test.ids, own)
+        ids = np.concatenate([test.ids[free], own])
+        known = np.concatenate(
+            [
+                test.probabilities[free],
+                np.isin(own, _members(moving)).astype(np.float64),
+            ]
+        )
+        order = np.argsort(ids)
+        by_itself = test.ids[free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
+        return ObjectFrame(
+            states,
+            np.union1d(own, by_itself),
+            test.of(Verdict.STATIC),
+            (ids[order], known[order]),
+            members,
+            [(item.number, item.hull(self._window)) for item in self.objects if item.confirmed],
+        )
+
+
+def _members(objects: Sequence[TrackedObject]) -> IntArray:
+    """Ids (N,) of the tracks of objects, ascending."""
+    return np.unique(np.concatenate([_no_ids(), *(item.members for item in objects)]))
+
+
+def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> FloatArray:
+    """Values (N,) for ids (N,) where some were found (both ascending); infinite for the others."""
+    result = np.full(len(ids), np.inf)
+    result[np.isin(ids, found)] = values
+    return result
+
+
+def merged_frame(frame: FeatureFrame, moving: tuple[FeatureObservations, ...]) -> FeatureFrame:
+    """A frame with the features that the front end keeps apart because they move."""
+    if not moving:
+        return frame
+    cameras = tuple(_joined(a, b) for a, b in zip(frame.cameras, moving, strict=True))
+    return FeatureFrame(frame.stamp_ns, cameras)
+
+
+def _joined(a: FeatureObservations, b: FeatureObservations) -> FeatureObservations:
+    return FeatureObservations(
+        np.concatenate([a.ids, b.ids]),
+        np.concatenate([a.pixels, b.pixels]),
+        np.concatenate([a.normalized, b.normalized]),
+    )

@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of the platform relative to one object, by the engine that estimates the platform.
+
+The points of a rigid object are static in its own frame. There it is the platform that moves, with
+the pose Y = L⁻¹ X, where X is its pose in the world and L that of the object. So an object is
+estimated by an estimator of its own, without an IMU, whose world is the object: every algorithm is
+the same for both. The observations depend on Y and on the points alone, not on X. So what the
+images say of Y is independent of what they say of X, and L = X Y⁻¹ has the errors of both.
+
+In the hybrid formulation of Bârsan et al. and DynoSAM the same observation is written as
+π(X⁻¹ L m), with X and L for variables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import AlgorithmConfig, BackendConfig, Estimator
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.errors import EstimationError
+from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.sensors import FeatureFrame, Rig
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeStep:
+    """The platform in the frame of an object, at two times.
+
+    Attributes:
+        before_ns, now_ns: times of the two frames, on the clock of the cameras.
+        before, now: object_T_body.
+        covariance: (12, 12) of both, before first, in their tangents: rotation (rad), translation
+            (m), body axes.
+    """
+
+    before_ns: int
+    now_ns: int
+    before: gtsam.Pose3
+    now: gtsam.Pose3
+    covariance: FloatArray
+
+
+class RelativeMotion:
+    """Estimates the motion of the platform in the frame of one object.
+
+    Args:
+        rig: the cameras.
+        algorithm: the policies.
+        backend: settings of the estimator; those of IMU and calibration do not count.
+        config: the noise of the object's acceleration.
+        length_s: how long past poses are kept.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        algorithm: AlgorithmConfig,
+        backend: BackendConfig,
+        config: ObjectsConfig,
+        length_s: float,
+    ) -> None:
+        self._estimator = Estimator(
+            rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
+        )
+        self._length_ns = round(length_s * 1e9)
+        self._frames: dict[int, int] = {}  # index in the estimator of the frame with a stamp
+        self.poses: dict[int, gtsam.Pose3] = {}  # object_T_body by stamp, as known now
+
+    @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
+        return self._estimator.rejected
+
+    def add(self, frame: FeatureFrame) -> bool:
+        """Take the features of the object in the next frame.
+
+        Returns:
+            Whether there is a pose for it.
+
+        Raises:
+            EstimationError: if the equations cannot be solved: the object is lost.
+        """
+        try:
+            state = self._estimator.add_frame(frame)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            raise EstimationError(
+                f"the motion of an object cannot be solved for: {error}"
+            ) from None
+        window = self._estimator.window
+        if state is None or window is None:
+            return False
+        self._frames[frame.stamp_ns] = window.frame
+        self.poses[frame.stamp_ns] = state.world_T_body
+        for stamp in [s for s in self.poses if s < frame.stamp_ns - self._length_ns]:
+            del self.poses[stamp]
+            del self._frames[stamp]
+        values, past = window.state.estimate, set(window.past)
+        for stamp, i in self._frames.items():
+            if i in past:
+                self.poses[stamp] = values.atPose3(X(i))
+        return True
+
+    def points(self) -> tuple[IntArray, FloatArray]:
+        """Ids (N,) and positions (N, 3) of its points, in the frame of the object."""
+        return self._estimator.landmarks()
+
+    def step(self, now_ns: int, before_ns: int) -> RelativeStep | None:
+        """The motion between two frames, the later one being the last; None if it is not known."""
+        if not {now_ns, before_ns} <= self.poses.keys():
+            return None
+        keys = [X(self._frames[before_ns]), X(self._frames[now_ns])]
+        try:
+            covariance = self._estimator.covariance_of(keys)
+        except EstimationError:  # an algorithm without past poses: as if they were independent
+            covariance = np.kron(np.eye(2), self.covariance(now_ns))
+        return RelativeStep(
+            before_ns, now_ns, self.poses[before_ns], self.poses[now_ns], covariance
+        )
+
+    def covariance(self, now_ns: int) -> FloatArray:
+        """(6, 6) of the tangent of the pose in the last frame."""
+        return self._estimator.covariance_of([X(self._frames[now_ns])])
+
+
+def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
+    """Settings of the estimator of an object."""
+    dynamics = {
+        "model": "constant_velocity",
+        "accel_density": config.accel_density,
+        "angular_accel_density": config.angular_accel_density,
+        "min_points": config.min_points,
+    }
+    default = BackendConfig()
+    return backend.model_copy(
+        update={
+            "dynamics": backend.dynamics.model_copy(update=dynamics),
+            "calibration": default.calibration,
+            "initialization": default.initialization,
+        }
+    )

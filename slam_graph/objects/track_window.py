@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The features of the last frames, static or not, and how well they fit given poses."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import BackendConfig, RigProjection
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.objects.ego_motion import pose_arrays
+from slam_graph.sensors import FeatureFrame, Rig
+
+
+class TrackWindow:
+    """Features of the last frames.
+
+    Args:
+        rig: the cameras.
+        backend: thresholds of triangulation.
+    """
+
+    def __init__(self, rig: Rig, backend: BackendConfig) -> None:
+        self.rig = rig
+        self.projection = RigProjection(rig)
+        self.frames: deque[FeatureFrame] = deque()
+        self._backend = backend
+        self._tracks = FeatureTracks()
+        self._numbers: deque[int] = deque()  # of the frames in the tracks
+        self._count = 0
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Stamps of the frames, ascending."""
+        return [frame.stamp_ns for frame in self.frames]
+
+    @property
+    def seen(self) -> IntArray:
+        """Ids (N,) of all features that the last frame saw, ascending."""
+        return self._tracks.seen
+
+    def add(self, frame: FeatureFrame, since_ns: int) -> None:
+        """Add a frame, and forget those before a time."""
+        self._tracks.add(self._count, frame)
+        self.frames.append(frame)
+        self._numbers.append(self._count)
+        self._count += 1
+        while self.frames[0].stamp_ns < since_ns:
+            self.frames.popleft()
+            self._numbers.popleft()
+        self._tracks.keep_frames(list(self._numbers))
+
+    def observations(self, ids: IntArray, least: int, stamps_ns: list[int]) -> Observations:
+        """Observations in some frames of the features (ascending ids) that enough of them saw.
+
+        Args:
+            ids: of the features.
+            least: how many frames must have seen a feature.
+            stamps_ns: of the frames; `frame` and `frames` of the result are numbers among them.
+        """
+        here = dict(zip(self.stamps_ns, self._numbers, strict=True))
+        chosen = [here[stamp] for stamp in stamps_ns if stamp in here]
+        obs = self._tracks.observations(ids, chosen)
+        frames = np.zeros((len(ids), len(obs.frames)), np.bool_)
+        frames[obs.feature, obs.frame] = True
+        enough = (frames.sum(axis=1) >= least) & (obs.counts >= 2)
+        obs = obs.subset(enough)
+        order = {here[stamp]: row for row, stamp in enumerate(stamps_ns) if stamp in here}
+        numbers = tuple(order[number] for number in obs.frames)
+        return Observations(
+            obs.ids, numbers, obs.feature, obs.frame, obs.camera, obs.pixels, obs.normalized
+        )
+
+    def misfit(
+        self, ids: IntArray, poses: dict[int, gtsam.Pose3], sigma_px: float, least: int = 3
+    ) -> tuple[IntArray, FloatArray, IntArray]:
+        """How well features fit as static points of a world in which the platform moved so.
+
+        Args:
+            ids: of the features, ascending.
+            poses: world_T_body by the stamps of frames.
+            sigma_px: standard deviation of the observations.
+            least: how many of these frames must have seen a feature.
+
+        Returns:
+            Ids (J,) of those that were seen often enough, their squared errors (J,) over σ², and
+            degrees of freedom (J,).
+        """
+        stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
+        obs = self.observations(ids, least, stamps)
+        if len(obs) == 0:
+            return obs.ids, np.zeros(0), np.zeros(0, np.int64)
+        rotations, positions = pose_arrays(tuple(poses[stamps[row]] for row in obs.frames))
+        found = triangulate(obs, self.projection, rotations, positions, self._backend.triangulation)
+        squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
+        squares = np.where(np.isfinite(squares), squares, np.inf)
+        return obs.ids, squares, 2 * obs.counts - 3

@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""One object from when it is found to when it is lost."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+import gtsam
+import numpy as np
+from scipy.special import chdtri
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import AlgorithmConfig, BackendConfig
+from slam_graph.objects.ego_motion import EgoMotion
+from slam_graph.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.objects.relative_motion import RelativeMotion
+from slam_graph.objects.track_window import TrackWindow
+
+_MAX_REJECTIONS = 3
+"""A track that the gate rejects in so many frames in a row is not of the object."""
+_CONFIRMED = 3
+"""An object is reported when it has so many frames."""
+_MOTION_S = 0.3
+"""Time over which it is judged whether an object moves."""
+
+
+class TrackedObject:
+    """Tracks of one object, and the estimator of its motion.
+
+    Args:
+        number: of the object.
+        label: of its mask; 0 without one.
+        members: (N,) ids of its tracks, ascending.
+        window: the last frames, from which it begins.
+        ego: the motion of the platform over them.
+        policies: algorithm and settings of the estimator.
+        config: of objects.
+
+    Attributes:
+        members: as above, now.
+        frames: number of frames with a state.
+        seen_ns: time of the last frame with a state.
+        moving: whether it is known to move.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        label: int,
+        members: IntArray,
+        window: TrackWindow,
+        ego: EgoMotion,
+        policies: tuple[AlgorithmConfig, BackendConfig],
+        config: ObjectsConfig,
+    ) -> None:
+        self.number, self.label, self.members = number, label, members
+        self.frames, self.moving = 0, False
+        self.seen_ns = ego.stamps_ns[-1]
+        self._config = config
+        self._motion = RelativeMotion(window.rig, *policies, config, config.window_s)
+        self._object_T_start = gtsam.Pose3()
+        self._strikes: Counter[int] = Counter()
+        self.state: ObjectState | None = None
+        for frame in window.frames:
+            self._motion.add(frame.only(members))
+        self._place(ego)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether it has been seen often enough to be reported."""
+        return self.frames >= _CONFIRMED
+
+    @property
+    def begun(self) -> bool:
+        """Whether its estimator has a state."""
+        return bool(self._motion.poses)
+
+    @property
+    def poses(self) -> dict[int, gtsam.Pose3]:
+        """Poses of the platform relative to the object, by the stamps of frames."""
+        return self._motion.poses
+
+    def points(self) -> FloatArray:
+        """(N, 3) its points, in its own frame, m."""
+        _, points = self._motion.points()
+        return np.asarray(self._object_T_start.transformFrom(points.T)).T.reshape(-1, 3)
+
+    def _place(self, ego: EgoMotion) -> None:
+        """Choose the frame of the object: axes of the world, origin in the middle of its points."""
+        now = ego.stamps_ns[-1]
+        if now not in self._motion.poses:
+            return
+        world_T_start = ego.poses[-1].compose(self._motion.poses[now].inverse())
+        _, points = self._motion.points()
+        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        origin = gtsam.Pose3(gtsam.Rot3(), world_T_start.transformFrom(middle))
+        self._object_T_start = origin.inverse().compose(world_T_start)
+
+    def continue_from(self, pose: gtsam.Pose3, ego: EgoMotion) -> None:
+        """Take a pose of the object now, with its axes: it was seen before.
+
+        Args:
+            pose: world_T_object, as predicted.
+            ego: the motion of the platform.
+        """
+        now = ego.stamps_ns[-1]
+        world_T_start = ego.poses[-1].compose(self._motion.poses[now].inverse())
+        self._object_T_start = pose.inverse().compose(world_T_start)
+
+    def add(self, window: TrackWindow, ego: EgoMotion) -> ObjectState | None:
+        """Take the last frame of the window.
+
+        Returns:
+            The state then; None if too few of its tracks are seen.
+        """
+        frame = window.frames[-1]
+        self.members = self.members[np.isin(self.members, window.seen)]
+        if len(self.members) < 4:
+            return None
+        if frame.stamp_ns not in self._motion.poses and not self._motion.add(
+            frame.only(self.members)
+        ):
+            return None
+        self._drop_rejected()
+        self.frames += 1
+        self.seen_ns = frame.stamp_ns
+        self.state = self._state(ego)
+        return self.state
+
+    def _drop_rejected(self) -> None:
+        rejected = self._motion.rejected
+        for i in list(self._strikes):
+            if i not in rejected:
+                del self._strikes[i]
+        self._strikes.update(rejected.tolist())
+        bad = [i for i, count in self._strikes.items() if count >= _MAX_REJECTIONS]
+        if bad:
+            self.members = np.setdiff1d(self.members, bad)
+
+    def _state(self, ego: EgoMotion) -> ObjectState | None:
+        now = ego.stamps_ns[-1]
+        pose = self._object_T_start.compose(self._motion.poses[now])
+        world_T_object = ego.poses[-1].compose(pose.inverse())
+        step = self._motion_since(1, ego)
+        mean = self._motion_since(self._frames_back(ego), ego) or step
+        velocity, velocity_covariance = np.zeros(3), np.full((3, 3), np.nan)
+        if mean is not None:
+            R = world_T_object.rotation().matrix()
+            velocity = R @ mean.motion.rotation().unrotate(mean.motion.translation()) / mean.seconds
+            velocity_covariance = R @ mean.covariance[3:, 3:] @ R.T / mean.seconds**2
+            self._judge(mean, velocity, velocity_covariance)
+        return ObjectState(
+            now,
+            self.number,
+            self.label,
+            world_T_object,
+            self._pose_covariance(ego, pose),
+            step,
+            velocity,
+            velocity_covariance,
+            self.moving,
+            len(self.members),
+        )
+
+    def _judge(self, mean: ObjectMotion, velocity: FloatArray, covariance: FloatArray) -> None:
+        """Whether it moves, by its motion over the last frames; as before where that cannot tell."""
+        if mean.statistic > chdtri(6, self._config.false_alarm):
+            self.moving = True
+        elif self.moving:
+            sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+            self.moving = float(np.linalg.norm(velocity)) + sigma > self._config.min_speed
+
+    def _frames_back(self, ego: EgoMotion) -> int:
+        """How many frames back the motion is taken from, to judge it."""
+        back = int(np.count_nonzero(ego.seconds >= -_MOTION_S)) - 1
+        known = sum(stamp in self._motion.poses for stamp in ego.stamps_ns[-1 - back :]) - 1
+        return max(min(back, known), 1)
+
+    def _motion_since(self, frames: int, ego: EgoMotion) -> ObjectMotion | None:
+        """The motion over the last frames; None where it is not known."""
+        if len(ego.stamps_ns) <= frames:
+            return None
+        before, now = ego.stamps_ns[-1 - frames], ego.stamps_ns[-1]
+        step = self._motion.step(now, before)
+        if step is None:
+            return None
+        between = ego.poses[-1 - frames].between(ego.poses[-1])
+        covariance = ego.step_covariance if frames == 1 else ego.covariance_over(-1 - frames)
+        return ObjectMotion.of(step, self._object_T_start, between, covariance)
+
+    def _pose_covariance(self, ego: EgoMotion, object_T_body: gtsam.Pose3) -> FloatArray:
+        """(6, 6) of the pose, by those of the platform in the world and in the object's frame."""
+        now = ego.stamps_ns[-1]
+        inner = self._motion.covariance(now)
+        if ego.state.covariance is not None:
+            inner = inner + ego.state.covariance[:6, :6]
+        adjoint = object_T_body.AdjointMap()
+        covariance: FloatArray = adjoint @ inner @ adjoint.T
+        return covariance
+
+    def middle(self, ego: EgoMotion) -> FloatArray:
+        """(3,) middle of its points now, in the world."""
+        pose = self._object_T_start.compose(self._motion.poses[ego.stamps_ns[-1]])
+        world_T_object = ego.poses[-1].compose(pose.inverse())
+        return np.asarray(world_T_object.transformFrom(self.shape_middle()))
+
+    def shape_middle(self) -> FloatArray:
+        """(3,) middle of its points, in its own frame."""
+        points = self.points()
+        return np.median(points, axis=0) if len(points) else np.zeros(3)
+
+    def size(self) -> float:
+        """Largest distance of a point from the middle, m."""
+        points = self.points()
+        if len(points) == 0:
+            return 0.0
+        return float(np.quantile(np.linalg.norm(points - self.shape_middle(), axis=1), 0.9))
+
+    def predicted(self, stamp_ns: int) -> gtsam.Pose3 | None:
+        """World_T_object at a later time, if its motion goes on as it was; None if it is unknown."""
+        state = self.state
+        if state is None:
+            return None
+        seconds = (stamp_ns - state.stamp_ns) * 1e-9
+        here = state.world_T_object
+        return gtsam.Pose3(here.rotation(), here.translation() + state.velocity * seconds)
+
+    def hull(self, window: TrackWindow) -> FloatArray:
+        """(N, 2) convex hull of its tracks in the first camera, in pixels."""
+        seen = window.frames[-1].cameras[0]
+        pixels = seen.pixels[np.isin(seen.ids, self.members)]
+        if len(pixels) < 3:
+            return pixels
+        return cv2.convexHull(pixels.astype(np.float32))[:, 0].astype(np.float64)
