@@ -19,6 +19,7 @@ from slam_graph.errors import ConfigError, closest
 from slam_graph.frontend import FrontendConfig
 from slam_graph.loop_closure import LoopClosureConfig
 from slam_graph.maps import LocalizationConfig, MapConfig
+from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.settings import ConfigTree, Settings, expert
 
 __all__ = [
@@ -136,6 +137,8 @@ class RunConfig(Settings):
     """Whether the map is saved at the end."""
     localization: LocalizationConfig = LocalizationConfig()
     """How the run is located in a map that was saved before."""
+    objects: ObjectsConfig = ObjectsConfig()
+    """Moving objects: whether and how they are estimated."""
     limits: LimitsConfig = LimitsConfig()
     """When an estimate is lost, and whether the run then starts again."""
 

@@ -16,7 +16,7 @@ from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.dataset_registry import DATASETS, open_dataset
 from slam_graph.pipeline.run_recording import run
-from slam_graph.results.run_result import Status
+from slam_graph.results.run_input import Status
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])

@@ -18,7 +18,7 @@ LAYERS = (
     {"sensors"},
     {"datasets", "frontend"},
     {"backend"},
-    {"pose_graph", "bundle_adjustment", "simulation", "diagnosis"},
+    {"pose_graph", "bundle_adjustment", "simulation", "diagnosis", "objects"},
     {"loop_closure"},
     {"maps", "evaluation"},
     {"visualization", "config"},

@@ -20,6 +20,7 @@ from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
+from slam_graph.backend.cost.feature_tracks import Outcome
 from slam_graph.backend.cost.imu_factor import Propagation
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
@@ -167,6 +168,10 @@ class Estimator(EstimatorKnowledge):
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
             self.diagnostics.warn("imu_rejected", message)
+
+    def add_motion(self, known: ImuData) -> None:
+        """Add what is known of the motion without an IMU: an ideal one's samples, no gravity."""
+        self._context.imu.add(known)
 
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
         """Take the features of one time and estimate the state then.
@@ -325,6 +330,12 @@ class Estimator(EstimatorKnowledge):
         self.aiding.restart()
         self.replayed = self.states = [self.window.current(self.window.prior)]
         return self.replayed[0]
+
+    def exclude(self, ids: IntArray) -> None:
+        """Do not use features (N,) any more: they move. What is in the prior of them stays."""
+        self._standstill.add_dynamic(ids)
+        if self.window is not None and len(ids):
+            self.window.tracks.remove(Outcome.DYNAMIC, ids)
 
     # --- output ----------------------------------------------------------------------------------
 

@@ -113,6 +113,14 @@ Inject = Annotated[
         rich_help_panel=_RECORDING,
     ),
 ]
+Objects = Annotated[
+    bool | None,
+    typer.Option(
+        "--objects/--no-objects",
+        help="Estimate moving objects, too (off by default).",
+        show_default=False,
+    ),
+]
 Start = Annotated[
     float | None,
     typer.Option(

@@ -34,6 +34,7 @@ from slam_graph.cli.options import (
     Inject,
     Json,
     NoImu,
+    Objects,
     Output,
     Overrides,
     Progress,
@@ -244,6 +245,7 @@ def run(
     sources: Sources = None,
     no_imu: NoImu = False,
     inject: Inject = None,
+    objects: Objects = None,
     as_json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording and write the results.
@@ -253,7 +255,7 @@ def run(
     settings = run_settings(
         config,
         set_,
-        {"final_ba": final_ba, "loop_closure": loop_closure, "map": save_map},
+        {"final_ba": final_ba, "loop_closure": loop_closure, "map": save_map, "objects": objects},
         algorithm=algorithm,
         cameras=cameras,
         start_s=start,

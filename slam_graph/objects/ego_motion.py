@@ -9,11 +9,16 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import Estimator
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
+from slam_graph.sensors import ImuData
+
+_SAMPLES = 17
+"""Samples of the motion between two frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +28,7 @@ class EgoMotion:
     Attributes:
         stamps_ns: (F,) of the frames, on the clock of the cameras, ascending.
         poses: world_T_body of each.
+        velocities: (F, 3) of the body in the world, m/s.
         state: of the last one.
         velocity_covariance: (3, 3) of the mean velocity over the frames, m²/s², world axes.
         rate_covariance: (3, 3) of the mean angular rate over them, rad²/s², world axes.
@@ -32,6 +38,7 @@ class EgoMotion:
 
     stamps_ns: tuple[int, ...]
     poses: tuple[gtsam.Pose3, ...]
+    velocities: FloatArray
     state: NavState
     velocity_covariance: FloatArray
     rate_covariance: FloatArray
@@ -50,6 +57,27 @@ class EgoMotion:
         covariance[:3, :3] = R.T @ self.rate_covariance @ R * seconds**2
         covariance[3:, 3:] = R.T @ self.velocity_covariance @ R * seconds**2
         return covariance
+
+    def samples(self, now_ns: int, offset_ns: int) -> ImuData:
+        """What an ideal IMU without gravity would have measured from the frame before to one.
+
+        Args:
+            now_ns: stamp of the frame.
+            offset_ns: from stamps of frames to the clock of the samples.
+        """
+        row = self.stamps_ns.index(now_ns)
+        if row == 0:
+            return ImuData.empty()
+        before_ns, seconds = self.stamps_ns[row - 1], self.seconds[row] - self.seconds[row - 1]
+        turn = self.poses[row - 1].rotation().between(self.poses[row].rotation())
+        rate = gtsam.Rot3.Logmap(turn) / seconds
+        acceleration = (self.velocities[row] - self.velocities[row - 1]) / seconds
+        parts = np.linspace(0.0, 1.0, _SAMPLES)
+        stamps = before_ns + offset_ns + (parts * (now_ns - before_ns)).astype(np.int64)
+        stamps[0] += 1  # the last one of the motion before stays
+        turned = Rotation.from_rotvec(parts[:, None] * rate * seconds)
+        start = self.poses[row - 1].rotation().unrotate(acceleration)
+        return ImuData(stamps, np.tile(rate, (_SAMPLES, 1)), turned.inv().apply(start))
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body."""
@@ -72,12 +100,14 @@ class EgoWindow:
     def __init__(self, length_s: float) -> None:
         self._length_ns = round(length_s * 1e9)
         self._poses: dict[int, gtsam.Pose3] = {}
+        self._velocities: dict[int, FloatArray] = {}
         self._frames: dict[int, int] = {}  # stamp of the frame with an index in the estimator
         self._started = False
 
     def forget(self) -> None:
         """Forget all frames: the world is another one from now on."""
         self._poses.clear()
+        self._velocities.clear()
         self._frames.clear()
         self._started = False
 
@@ -96,8 +126,10 @@ class EgoWindow:
             return None
         self._frames[window.frame] = stamp_ns
         self._poses[stamp_ns] = state.world_T_body
+        self._velocities[stamp_ns] = state.velocity
         for stamp in [s for s in self._poses if s < stamp_ns - self._length_ns]:
             del self._poses[stamp]
+            del self._velocities[stamp]
         self._frames = {i: s for i, s in self._frames.items() if s in self._poses}
         past = [i for i in window.past if i in self._frames and i != window.frame]
         for i in past:
@@ -106,7 +138,9 @@ class EgoWindow:
         stamps = tuple(self._poses)
         known = _known(estimator, window.frame, past, self._frames)
         velocity, rate, step = known or _by_state(state, stamps)
-        return EgoMotion(stamps, tuple(self._poses.values()), state, velocity, rate, step)
+        velocities = np.array([self._velocities[stamp] for stamp in stamps])
+        poses = tuple(self._poses.values())
+        return EgoMotion(stamps, poses, velocities, state, velocity, rate, step)
 
 
 def _known(

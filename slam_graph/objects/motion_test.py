@@ -30,11 +30,22 @@ from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.objects.ego_motion import EgoMotion
 from slam_graph.objects.objects_config import ObjectsConfig
 
-_STEPS = 3
+_STEPS = 4
 """Gauss-Newton steps for position and velocity."""
+_MAX_STEP = 0.5
+"""A step moves a point by no more than this part of its depth: it stays before the cameras."""
 _MAX_SPEED = 20.0
 """Standard deviation of the velocity before any observation, m/s: it keeps the equations regular
 where a camera sees nothing of it."""
+_MAX_SHIFT = 100.0
+"""The same for the position, m."""
+_OFFSET_PX, _DRIFT_PX_S = 0.5, 1.0
+"""Standard deviations of errors that last: of a match in another camera, pixels, and of the rate at
+which a patch slides off its point, pixels/s. Without them such tracks seem to move slowly."""
+_CREEP = 0.05
+"""Standard deviation, m/s, of the speed with which a static track may seem to move beside that."""
+_NUISANCES = 6
+_PRIOR_SIGMAS = np.repeat([_MAX_SHIFT, _MAX_SPEED, _OFFSET_PX, _DRIFT_PX_S], [3, 3, 2, 4])
 _OBJECT_SPEED = 1.0
 """Standard deviation of each component of the velocity of what moves, m/s, for its probability."""
 _PRIOR_ODDS = 0.05
@@ -102,13 +113,13 @@ def test_motion(
     rotations, positions = (a[frames] for a in ego.arrays())
     seconds = ego.seconds[frames]
     count = len(obs.ids)
-    points = triangulate(obs, rig, rotations, positions, backend.triangulation).points
-    points = np.where(np.isfinite(points), points, 0.0)
-    fit = _fit(obs, rig, rotations, positions, seconds, points, sigma_px)
-    points, velocities, Sigma, squares = fit
+    points = _first_points(obs, rig, rotations, positions, backend)
+    points, velocities, Sigma, squares = _fit(
+        obs, rig, rotations, positions, seconds, points, sigma_px
+    )
     offset = points - ego.state.world_T_body.translation()
     arm = _cross_matrices(offset)
-    Sigma = Sigma + ego.velocity_covariance + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
+    Sigma = Sigma + _CREEP**2 * np.eye(3) + ego.velocity_covariance + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
     statistics = np.einsum(
         "ji,ji->j", velocities, np.linalg.solve(Sigma, velocities[:, :, None])[:, :, 0]
     )
@@ -125,6 +136,36 @@ def test_motion(
     )
 
 
+def _first_points(
+    obs: Observations,
+    rig: RigProjection,
+    rotations: FloatArray,
+    positions: FloatArray,
+    backend: BackendConfig,
+) -> FloatArray:
+    """Positions (J, 3) from which the fit begins: those in the last frame, if two cameras saw it.
+
+    What moves is not where its rays of different times meet. Far points are put at the largest
+    depth that counts, where no motion is seen of them.
+    """
+    config = backend.triangulation
+    points = np.empty((len(obs.ids), 3))
+    last = obs.rows(obs.frame == len(obs.frames) - 1)
+    paired = last.counts >= 2
+    for rows, part in ((~paired, obs.subset(~paired)), (paired, last.subset(paired))):
+        if len(part):
+            points[rows] = triangulate(part, rig, rotations, positions, config).points
+    now = obs.starts[1:] - 1
+    camera_p = positions[obs.frame[now]]
+    rays = np.column_stack([obs.normalized[now], np.ones(len(now))])
+    world_R = rotations[obs.frame[now]] @ rig.body_R_camera[obs.camera[now]]
+    ahead = np.einsum("nij,nj->ni", world_R, rays)
+    depth = np.einsum("ni,ni->n", points - camera_p, world_R[:, :, 2])
+    bad = ~np.isfinite(depth) | (depth < config.min_depth_m) | (depth > config.max_depth_m)
+    points[bad] = (camera_p + config.max_depth_m * ahead)[bad]
+    return points
+
+
 def _fit(
     obs: Observations,
     rig: RigProjection,
@@ -139,24 +180,38 @@ def _fit(
     alone = replace(obs, feature=np.arange(N))  # every observation has a point of its own
     since = seconds[obs.frame]
     starts = obs.starts[:-1]
-    x = np.hstack([points, np.zeros((J, 3))])
-    prior = np.diag(np.repeat([1e-6, _MAX_SPEED**-2], 3))
+    x = np.hstack([points, np.zeros((J, 3 + _NUISANCES))])
+    before, prior = x.copy(), np.diag(_PRIOR_SIGMAS**-2.0)
+    slides = _slides(obs, since) / sigma_px
     squares = np.zeros(J)
     for step in range(_STEPS + 1):
-        seen = x[obs.feature, :3] + since[:, None] * x[obs.feature, 3:]
+        own = x[obs.feature]
+        seen = own[:, :3] + since[:, None] * own[:, 3:6]
         at = Geometry(rotations, positions, seen)
         views = rig.views(alone, at)
         residuals = (obs.pixels - views.pixels) / sigma_px
+        residuals -= np.einsum("nij,nj->ni", slides, own[:, 6:])
         squares = np.add.reduceat(np.sum(residuals**2, axis=1), starts)
         by_point = rig.derivatives(alone, at, views)[1] / sigma_px
-        A = np.concatenate([by_point, by_point * since[:, None, None]], axis=2)
+        A = np.concatenate([by_point, by_point * since[:, None, None], slides], axis=2)
         lhs = np.add.reduceat(A.transpose(0, 2, 1) @ A, starts) + prior
         rhs = np.add.reduceat(np.einsum("nij,ni->nj", A, residuals), starts)
-        rhs[:, 3:] -= prior[3:, 3:].diagonal() * x[:, 3:]
+        rhs -= prior.diagonal() * (x - before)
         if step < _STEPS:
-            x = x + np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
-    covariance = np.linalg.inv(lhs)[:, 3:, 3:]
-    return x[:, :3], x[:, 3:], covariance, squares
+            shift = np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
+            depth = np.minimum.reduceat(np.abs(views.in_camera[:, 2]), starts)
+            moved = np.linalg.norm(shift[:, :3], axis=1)
+            moved += np.linalg.norm(shift[:, 3:6], axis=1) * float(-seconds.min())
+            x = x + shift * np.minimum(1.0, _MAX_STEP * depth / np.maximum(moved, 1e-9))[:, None]
+    covariance = np.linalg.inv(lhs)[:, 3:6, 3:6]
+    return x[:, :3], x[:, 3:6], covariance, squares
+
+
+def _slides(obs: Observations, since: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, 6) of pixels by offset and drift of a patch; see `_OFFSET_PX`."""
+    second = (obs.camera > 0).astype(np.float64)
+    both = np.stack([second, (1.0 - second) * since, second * since], axis=1)
+    return np.einsum("nk,ij->nikj", both, np.eye(2)).reshape(len(obs), 2, 6)
 
 
 def _probabilities(velocities: FloatArray, Sigma: FloatArray) -> FloatArray:

@@ -107,7 +107,7 @@ class ObjectTracker:
         test = self._tested(others, ego, sigma_px)
         self._join(test, ego, sigma_px)
         self._leave(ego, sigma_px)
-        self._begin(test, ego)
+        self._begin(test, ego, sigma_px)
         self._merge(sigma_px)
         return self._described(states, test)
 
@@ -145,7 +145,9 @@ class ObjectTracker:
                 fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
             )
             alone = _for(fit, same, alone)
-            joins = fit[(squares < chdtri(dof, _FITS)) & (alone - squares > _MARGIN)]
+            scale = self._scale(item, sigma_px)
+            fits = squares < scale * chdtri(dof, _FITS)
+            joins = fit[fits & (alone - squares > scale * _MARGIN)]
             item.members = np.union1d(item.members, joins)
             candidates = np.setdiff1d(candidates, joins)
 
@@ -163,6 +165,14 @@ class ObjectTracker:
             leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(dof, _FITS))]
             item.members = np.setdiff1d(item.members, leaves)
 
+    def _scale(self, item: TrackedObject, sigma_px: float) -> float:
+        """Squared errors of the tracks of an object over what is expected, by its poses as known.
+
+        At first the poses are known badly, and no track fits them as well as it will.
+        """
+        _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
+        return max(1.0, float(np.median(squares / dof))) if len(dof) else 1.0
+
     def _merge(self, sigma_px: float) -> None:
         """Objects that move as one become one: the older stays (BIC; Schwarz 1978)."""
         for younger in list(self.objects)[::-1]:
@@ -175,6 +185,7 @@ class ObjectTracker:
                     continue
                 frames = len(older.poses.keys() & younger.poses.keys())
                 saved = 6 * max(frames - 1, 1) * np.log(max(int(np.sum(dof)), 2))
+                saved *= self._scale(older, sigma_px)
                 if frames >= _LEAST_FRAMES and float(np.sum(theirs) - np.sum(own)) < saved:
                     older.members = np.union1d(older.members, younger.members)
                     self.objects.remove(younger)
@@ -189,12 +200,12 @@ class ObjectTracker:
             obs, self._window.projection, ego, sigma_px, self._policies[1], self._config
         )
 
-    def _begin(self, test: MotionTest, ego: EgoMotion) -> None:
+    def _begin(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that move together begin an object."""
         own = _members(self.objects)
         free = np.setdiff1d(test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))], own)
         config = self._config
-        groups = [(0, group) for group in self._groups(free)]
+        groups = [(0, group) for group in self._groups(free, sigma_px)]
         for label, group in groups:
             item = TrackedObject(
                 self._next, label, group, self._window, ego, self._policies, config
@@ -206,12 +217,12 @@ class ObjectTracker:
                 self._next += 1
             self.objects.append(item)
 
-    def _groups(self, ids: IntArray) -> list[IntArray]:
+    def _groups(self, ids: IntArray, sigma_px: float) -> list[IntArray]:
         config = self._config
         if len(ids) < config.min_points or len(self._window.frames) < _LEAST_FRAMES:
             return []
         frames = list(self._window.frames)
-        return rigid_groups(ids, frames, self._rig, config.min_points, config.ransac_px)
+        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px)
 
     def _recognise(self, item: TrackedObject, ego: EgoMotion) -> None:
         """Give an object its old number if one that was hidden is expected there."""

@@ -22,8 +22,6 @@ class ObjectsConfig(Settings):
     Where a track is not known so well, the test says that it cannot tell."""
     min_points: int = expert(6, ge=4)
     """Fewest tracks that make an object."""
-    ransac_px: float = expert(2.0, gt=0)
-    """Largest error of a track that fits the motion of an object, in pixels."""
     accel_density: float = expert(1.0, gt=0)
     """White noise of the acceleration of an object, m/s²/√Hz. Raise it for objects that swerve."""
     angular_accel_density: float = expert(1.0, gt=0)

@@ -24,6 +24,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import AlgorithmConfig, BackendConfig, Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
+from slam_graph.objects.ego_motion import EgoMotion
 from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.sensors import FeatureFrame, Rig
 
@@ -69,6 +70,7 @@ class RelativeMotion:
             rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
         )
         self._length_ns = round(length_s * 1e9)
+        self._offset_ns = round(rig.pose_offset_s * 1e9)
         self._frames: dict[int, int] = {}  # index in the estimator of the frame with a stamp
         self.poses: dict[int, gtsam.Pose3] = {}  # object_T_body by stamp, as known now
 
@@ -77,8 +79,14 @@ class RelativeMotion:
         """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
         return self._estimator.rejected
 
-    def add(self, frame: FeatureFrame) -> bool:
+    def add(self, frame: FeatureFrame, ego: EgoMotion) -> bool:
         """Take the features of the object in the next frame.
+
+        Args:
+            frame: its features.
+            ego: the motion of the platform in the world. An object of constant velocity is an
+                inertial frame, in which the platform has the same acceleration and rate; those of
+                the object are the noise.
 
         Returns:
             Whether there is a pose for it.
@@ -86,6 +94,7 @@ class RelativeMotion:
         Raises:
             EstimationError: if the equations cannot be solved: the object is lost.
         """
+        self._estimator.add_motion(ego.samples(frame.stamp_ns, self._offset_ns))
         try:
             state = self._estimator.add_frame(frame)
         except (RuntimeError, np.linalg.LinAlgError) as error:

@@ -65,7 +65,7 @@ class TrackedObject:
         self._strikes: Counter[int] = Counter()
         self.state: ObjectState | None = None
         for frame in window.frames:
-            self._motion.add(frame.only(members))
+            self._motion.add(frame.only(members), ego)
         self._place(ego)
 
     @property
@@ -121,7 +121,7 @@ class TrackedObject:
         if len(self.members) < 4:
             return None
         if frame.stamp_ns not in self._motion.poses and not self._motion.add(
-            frame.only(self.members)
+            frame.only(self.members), ego
         ):
             return None
         self._drop_rejected()

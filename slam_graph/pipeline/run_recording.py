@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from slam_graph.backend import Estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import RecordedSequence, Sequence, open_dataset
 from slam_graph.errors import DataError
@@ -86,11 +87,13 @@ def run(
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
+    objects = _objects_stage(result, estimation.estimator)
     estimator, diagnostics = estimation.estimator, sequence.diagnostics
     progress = progress or NullProgress()
     smoothed = result.config.final_ba.enabled
     stages: list[Stage] = [  # in the order in which they finish
         Observers(progress, recorder or NullRecorder()),
+        objects,
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
         Verdict(result, diagnostics),
@@ -109,9 +112,9 @@ def run(
                 stage.begin(resources)
             for tracked in packets:
                 frame = estimation.estimate(tracked)
-                tracking.give_feedback(frame.feedback())
                 for stage in stages:
                     stage.frame(frame)
+                tracking.give_feedback(frame.feedback())
                 frame_done()
             estimation.finish()
         finish(stages, result)
@@ -140,6 +143,15 @@ def _place_stages(sequence: Sequence, result: RunResult, known_map: SlamMap | No
         of_places.LoopClosing(result, keyframes, diagnostics) if loops else off,
         of_places.MapBuilding(result, keyframes, diagnostics) if mapping else off,
     ]
+
+
+def _objects_stage(result: RunResult, estimator: Estimator) -> Stage:
+    """The estimation of moving objects, if it is wanted."""
+    if not result.config.objects.enabled:
+        return Stage()
+    from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
+
+    return Objects(result, estimator)
 
 
 def _settings(

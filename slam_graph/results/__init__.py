@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
     from slam_graph.results.result_files import ResultFolder
     from slam_graph.results.run_logs import RunLogs
-    from slam_graph.results.run_result import RunInput, RunResult
+    from slam_graph.results.run_input import RunInput
+    from slam_graph.results.run_result import RunResult
     from slam_graph.results.saved_run import SavedRun, load_result
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -45,10 +46,8 @@ else:
             ),
             "result_files": ("ResultFolder",),
             "run_logs": ("RunLogs",),
-            "run_result": (
-                "RunInput",
-                "RunResult",
-            ),
+            "run_input": ("RunInput",),
+            "run_result": ("RunResult",),
             "saved_run": (
                 "SavedRun",
                 "load_result",

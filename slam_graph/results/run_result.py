@@ -8,21 +8,23 @@ from collections import Counter
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam_graph import evaluation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
-from slam_graph.datasets import SequenceInfo, kalibr_text
+from slam_graph.datasets import kalibr_text
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap, save_map, write_ply
+from slam_graph.results.object_files import objects_table, save_objects
 from slam_graph.results.result_files import MAP_NAME, ResultFolder
+from slam_graph.results.run_input import Ending, RunInput, Status
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.results.run_picture import (
     CAUSAL,
@@ -40,58 +42,10 @@ if TYPE_CHECKING:
     from slam_graph.backend import FinalBa, WindowGraph
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
-
-_Ended = Literal[
-    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
-]
-Status = Literal[_Ended, "suspect", "unfinished"]
+    from slam_graph.objects.object_history import ObjectHistory
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class RunInput:
-    """What was run: a part of a recording, under which settings.
-
-    Attributes:
-        info: the recording.
-        config: all settings.
-        rig: the sensors that were used.
-        start_ns, end_ns: times of the first and the last frame that were asked for.
-        truth: ground truth of the whole recording, or None.
-        datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
-    """
-
-    info: SequenceInfo
-    config: RunConfig
-    rig: Rig
-    start_ns: int
-    end_ns: int
-    truth: Trajectory | None = None
-    datum: tuple[float, float, float] | None = None
-
-    @property
-    def recorded_s(self) -> float:
-        """Length of the part that was asked for, s."""
-        return (self.end_ns - self.start_ns) * 1e-9
-
-
-@dataclass(eq=False)
-class Ending:
-    """How a run ended.
-
-    Attributes:
-        status: in one word.
-        message: why it did not end well; empty if it did.
-        error: what ended the run, if something was raised.
-        wall_s: time that the run took, without smoothing, loop closure and map, s.
-    """
-
-    status: Status = "ok"
-    message: str = ""
-    error: BaseException | None = None
-    wall_s: float = 0.0
 
 
 @dataclass(eq=False, repr=False)
@@ -115,6 +69,7 @@ class RunResult(RunSummary):
         loops: loop closures, if loops were to be closed.
         slam_map: the map, if one was to be built.
         localization: poses in a known map, if there was one.
+        objects: moving objects, if they were to be estimated.
         graphs: factor graphs of the back end by the stamps (ns) of their frames, if asked for.
         warnings: counted faults and rejections.
     """
@@ -132,6 +87,7 @@ class RunResult(RunSummary):
     loops: LoopClosures | None = None
     slam_map: SlamMap | None = None
     localization: LocalizationLog | None = None
+    objects: ObjectHistory | None = None
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
@@ -298,6 +254,7 @@ class RunResult(RunSummary):
                     if located is None
                     else located.table(asked.start_ns, logs.frames, asked.truth)
                 ),
+                "moving_objects": objects_table(self.objects),
                 "nees": tables.consistency_table(
                     truth, self.history, self.start_was_given, self.final_ba
                 ),
@@ -356,6 +313,8 @@ class RunResult(RunSummary):
         if self.localization is not None:
             files.text(names.IN_MAP, self.localization.trajectory().tum_lines())
             files.text("localization.csv", self.localization.csv_lines())
+        if self.objects is not None:
+            save_objects(files, self.objects)
         if self.groundtruth is not None:
             files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)

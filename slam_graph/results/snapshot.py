@@ -11,7 +11,8 @@ from slam_graph.datasets import kalibr_text
 from slam_graph.results import result_files as names
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.result_files import ResultFolder
-from slam_graph.results.run_result import Ending, RunResult
+from slam_graph.results.run_input import Ending
+from slam_graph.results.run_result import RunResult
 
 _MESSAGE = "the run goes on, or was ended before its files were complete"
 

@@ -174,11 +174,14 @@ class FeatureFrame:
             camera has no image.
         outliers: for those who watch, where each camera saw the features that the front end has
             just rejected; empty where it does not say. They are no observations.
+        moving: the observations of each camera of features that move by themselves; empty where
+            these are not followed. They are not among those of `cameras`.
     """
 
     stamp_ns: int
     cameras: tuple[FeatureObservations, ...]
     outliers: tuple[FeatureObservations, ...] = ()
+    moving: tuple[FeatureObservations, ...] = ()
 
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""

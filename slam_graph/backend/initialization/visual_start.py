@@ -55,15 +55,18 @@ class VisualStart:
         if isinstance(motion, Refusal):
             self._refusal = motion
             return None
-        state = self._state(stamp_ns, motion, (stamp_ns - before[0]) * 1e-9)
+        state = self._state(stamp_ns, motion, before[0])
         return start_from(state, self._context.config, self._context.calibration)
 
     def waiting_for(self) -> str:
         """What a start still needs."""
         return self._refusal.needs
 
-    def _state(self, stamp_ns: int, motion: gtsam.Pose3, seconds: float) -> NavState:
-        """The state after a motion start_T_end of the body."""
+    def _state(self, stamp_ns: int, motion: gtsam.Pose3, before_ns: int) -> NavState:
+        """The state after a motion start_T_end of the body since a time."""
+        seconds = (stamp_ns - before_ns) * 1e-9
+        known = self._context.imu.between(before_ns, stamp_ns).rotation(np.zeros(3))
+        unknown = known.between(motion.rotation())
         prior = self._context.config.initialization.prior
         world_T_body = self._context.rig.cameras[0].body_T_camera.inverse()
         velocity = motion.rotation().unrotate(motion.translation()) / seconds
@@ -76,7 +79,7 @@ class VisualStart:
             world_T_body,
             np.asarray(world_T_body.rotation().rotate(velocity)),
             accel_bias=np.zeros(3),
-            gyro_bias=-gtsam.Rot3.Logmap(motion.rotation()) / seconds,
+            gyro_bias=-gtsam.Rot3.Logmap(unknown) / seconds,
             covariance=covariance,
         )
 

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""All that a run found out about moving objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.geometry import Trajectory
+from slam_graph.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.objects.tracked_object import TrackedObject
+
+
+@dataclass(eq=False)
+class ObjectHistory:
+    """States of the objects of a run, as they were estimated frame by frame.
+
+    Attributes:
+        points: (N, 3) by the number of an object: its points, in its own frame, m.
+        classes: name of the class by label, where the masks have one.
+        milliseconds: time that the objects took, of all frames with a state.
+        frames: number of these frames.
+    """
+
+    points: dict[int, FloatArray] = field(default_factory=dict)
+    classes: dict[int, str] = field(default_factory=dict)
+    milliseconds: float = 0.0
+    frames: int = 0
+    _states: dict[int, list[ObjectState]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def __repr__(self) -> str:
+        states = sum(map(len, self._states.values()))
+        return f"ObjectHistory({len(self)} objects, {states} states)"
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the objects, ascending."""
+        return sorted(self._states)
+
+    def note(self, states: Iterable[ObjectState], objects: Iterable[TrackedObject]) -> None:
+        """Add the states of the next frame, and the points of the objects that are seen."""
+        for state in states:
+            self._states.setdefault(state.number, []).append(state)
+        for item in objects:
+            if item.number in self._states:
+                self.points[item.number] = item.points()
+
+    def states(self, number: int) -> list[ObjectState]:
+        """States of an object, in the order of time."""
+        return list(self._states[number])
+
+    def all_states(self) -> list[ObjectState]:
+        """States of all objects, by time and number."""
+        states = (state for states in self._states.values() for state in states)
+        return sorted(states, key=lambda state: (state.stamp_ns, state.number))
+
+    def motions(self, number: int) -> list[ObjectMotion]:
+        """Motions of an object from frame to frame."""
+        return [state.step for state in self._states[number] if state.step is not None]
+
+    def trajectory(self, number: int) -> Trajectory:
+        """Poses `world_T_object` of an object, with velocities."""
+        states = self._states[number]
+        return poses_over_time(
+            np.array([state.stamp_ns for state in states], np.int64),
+            [state.world_T_object for state in states],
+            np.array([state.velocity for state in states]),
+        )
+
+    def label(self, number: int) -> int:
+        """Label of the mask of an object; 0 without one."""
+        return self._states[number][-1].label
+
+
+def poses_over_time(
+    stamps_ns: IntArray, poses: list[gtsam.Pose3], velocities: FloatArray | None = None
+) -> Trajectory:
+    """Poses as a trajectory."""
+    matrices = np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4)
+    quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+    return Trajectory(stamps_ns, matrices[:, :3, 3], quaternions, velocities)

@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What was run, under which settings, and how it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from slam_graph.config import RunConfig
+from slam_graph.datasets import SequenceInfo
+from slam_graph.geometry import Trajectory
+from slam_graph.sensors import Rig
+
+_Ended = Literal[
+    "ok", "interrupted", "not_initialized", "diverged", "low_coverage", "no_map", "failed"
+]
+Status = Literal[_Ended, "suspect", "unfinished"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RunInput:
+    """What was run: a part of a recording, under which settings.
+
+    Attributes:
+        info: the recording.
+        config: all settings.
+        rig: the sensors that were used.
+        start_ns, end_ns: times of the first and the last frame that were asked for.
+        truth: ground truth of the whole recording, or None.
+        datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
+    """
+
+    info: SequenceInfo
+    config: RunConfig
+    rig: Rig
+    start_ns: int
+    end_ns: int
+    truth: Trajectory | None = None
+    datum: tuple[float, float, float] | None = None
+
+    @property
+    def recorded_s(self) -> float:
+        """Length of the part that was asked for, s."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(eq=False)
+class Ending:
+    """How a run ended.
+
+    Attributes:
+        status: in one word.
+        message: why it did not end well; empty if it did.
+        error: what ended the run, if something was raised.
+        wall_s: time that the run took, without smoothing, loop closure and map, s.
+    """
+
+    status: Status = "ok"
+    message: str = ""
+    error: BaseException | None = None
+    wall_s: float = 0.0
