@@ -119,7 +119,12 @@ def test_motion(
     )
     offset = points - ego.state.world_T_body.translation()
     arm = _cross_matrices(offset)
-    Sigma = Sigma + _CREEP**2 * np.eye(3) + ego.velocity_covariance + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
+    Sigma = (
+        Sigma
+        + _CREEP**2 * np.eye(3)
+        + ego.velocity_covariance
+        + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
+    )
     statistics = np.einsum(
         "ji,ji->j", velocities, np.linalg.solve(Sigma, velocities[:, :, None])[:, :, 0]
     )

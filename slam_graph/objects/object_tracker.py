@@ -35,6 +35,10 @@ _MARGIN = 12.0
 another: 1 in 400."""
 _FITS = 1e-4
 """Probability of the errors of a track that fits."""
+_CLEARLY = 2.0
+"""Factor on that limit for tracks that are of an object already."""
+_BEST = 0.3
+"""Share of the tracks of an object that is of it beyond doubt."""
 _SAME_PLACE_M = 0.5
 """An object that appears again is no farther than this from where it is expected, or its own
 size."""
@@ -108,7 +112,7 @@ class ObjectTracker:
         self._join(test, ego, sigma_px)
         self._leave(ego, sigma_px)
         self._begin(test, ego, sigma_px)
-        self._merge(sigma_px)
+        self._merge(ego)
         return self._described(states, test)
 
     # --- objects that are known ------------------------------------------------------------------
@@ -152,12 +156,15 @@ class ObjectTracker:
             candidates = np.setdiff1d(candidates, joins)
 
     def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks of an object that are static leave it, if the object moves."""
+        """Tracks that do not fit an object leave it, and static ones if the object moves."""
         static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
         for item in self.objects:
+            fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
+            unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
+            item.members = np.setdiff1d(item.members, fit[unfit])
             if not item.moving:
                 continue
-            fit, squares, _ = self._window.misfit(item.members, item.poses, sigma_px)
+            fit, squares = fit[~unfit], squares[~unfit]
             same, alone, dof = self._window.misfit(
                 fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
             )
@@ -171,22 +178,13 @@ class ObjectTracker:
         At first the poses are known badly, and no track fits them as well as it will.
         """
         _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-        return max(1.0, float(np.median(squares / dof))) if len(dof) else 1.0
+        return _scale(squares, dof)
 
-    def _merge(self, sigma_px: float) -> None:
-        """Objects that move as one become one: the older stays (BIC; Schwarz 1978)."""
+    def _merge(self, ego: EgoMotion) -> None:
+        """Objects that move as one rigid body become one: the older stays."""
         for younger in list(self.objects)[::-1]:
             for older in self.objects:
-                if older.number >= younger.number or not older.confirmed:
-                    continue
-                ids, theirs, _ = self._window.misfit(younger.members, older.poses, sigma_px)
-                again, own, dof = self._window.misfit(ids, younger.poses, sigma_px)
-                if len(again) < self._config.min_points or len(again) < len(ids):
-                    continue
-                frames = len(older.poses.keys() & younger.poses.keys())
-                saved = 6 * max(frames - 1, 1) * np.log(max(int(np.sum(dof)), 2))
-                saved *= self._scale(older, sigma_px)
-                if frames >= _LEAST_FRAMES and float(np.sum(theirs) - np.sum(own)) < saved:
+                if older.number < younger.number and older.moves_with(younger, ego):
                     older.members = np.union1d(older.members, younger.members)
                     self.objects.remove(younger)
                     break
@@ -260,6 +258,13 @@ class ObjectTracker:
             members,
             [(item.number, item.hull(self._window)) for item in self.objects if item.confirmed],
         )
+
+
+def _scale(squares: FloatArray, dof: IntArray) -> float:
+    """Squared errors of the tracks that fit best, over what is expected; at least 1."""
+    if len(dof) == 0:
+        return 1.0
+    return max(1.0, float(np.quantile(squares / dof, _BEST)))
 
 
 def _members(objects: Sequence[TrackedObject]) -> IntArray:

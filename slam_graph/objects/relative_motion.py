@@ -46,6 +46,12 @@ class RelativeStep:
     now: gtsam.Pose3
     covariance: FloatArray
 
+    def body_motion(self) -> tuple[gtsam.Pose3, FloatArray]:
+        """Motion before_T_now of the platform relative to the object, and its covariance (6, 6)."""
+        motion = self.before.between(self.now)
+        J = np.hstack([-motion.inverse().AdjointMap(), np.eye(6)])
+        return motion, J @ self.covariance @ J.T
+
 
 class RelativeMotion:
     """Estimates the motion of the platform in the frame of one object.

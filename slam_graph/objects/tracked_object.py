@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import deque
 
 import cv2
 import gtsam
@@ -19,10 +19,14 @@ from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.objects.relative_motion import RelativeMotion
 from slam_graph.objects.track_window import TrackWindow
 
-_MAX_REJECTIONS = 3
-"""A track that the gate rejects in so many frames in a row is not of the object."""
+_MAX_REJECTIONS = 2
+"""A track that the gate rejects so often within the frames of the window is not of the object."""
 _CONFIRMED = 3
 """An object is reported when it has so many frames."""
+_SAME_MOTION = 0.01
+"""Probability with which two parts of one object are taken for two in a frame."""
+_NEAR = 1.5
+"""Parts of one object are no farther apart than the sum of their sizes times this."""
 _MOTION_S = 0.3
 """Time over which it is judged whether an object moves."""
 
@@ -62,7 +66,7 @@ class TrackedObject:
         self._config = config
         self._motion = RelativeMotion(window.rig, *policies, config, config.window_s)
         self._object_T_start = gtsam.Pose3()
-        self._strikes: Counter[int] = Counter()
+        self._rejections: deque[IntArray] = deque()
         self.state: ObjectState | None = None
         for frame in window.frames:
             self._motion.add(frame.only(members), ego)
@@ -131,14 +135,11 @@ class TrackedObject:
         return self.state
 
     def _drop_rejected(self) -> None:
-        rejected = self._motion.rejected
-        for i in list(self._strikes):
-            if i not in rejected:
-                del self._strikes[i]
-        self._strikes.update(rejected.tolist())
-        bad = [i for i, count in self._strikes.items() if count >= _MAX_REJECTIONS]
-        if bad:
-            self.members = np.setdiff1d(self.members, bad)
+        self._rejections.append(self._motion.rejected)
+        while len(self._rejections) > max(len(self._motion.poses), 1):
+            self._rejections.popleft()
+        ids, counts = np.unique(np.concatenate(self._rejections), return_counts=True)
+        self.members = np.setdiff1d(self.members, ids[counts >= _MAX_REJECTIONS])
 
     def _state(self, ego: EgoMotion) -> ObjectState | None:
         now = ego.stamps_ns[-1]
@@ -200,6 +201,27 @@ class TrackedObject:
         adjoint = object_T_body.AdjointMap()
         covariance: FloatArray = adjoint @ inner @ adjoint.T
         return covariance
+
+    def moves_with(self, other: TrackedObject, ego: EgoMotion) -> bool:
+        """Whether another object is near and cannot be told from a part of this one.
+
+        The platform has the same motion relative to all parts of a rigid body.
+        """
+        if min(self.frames, other.frames) < _CONFIRMED:
+            return False
+        apart = float(np.linalg.norm(self.middle(ego) - other.middle(ego)))
+        if apart > _NEAR * (self.size() + other.size()):
+            return False
+        back = self._frames_back(ego)
+        steps = [
+            item._motion.step(ego.stamps_ns[-1], ego.stamps_ns[-1 - back]) for item in (self, other)
+        ]
+        if steps[0] is None or steps[1] is None:
+            return False
+        (mine, P), (theirs, Q) = (step.body_motion() for step in steps if step is not None)
+        difference = gtsam.Pose3.Logmap(mine.between(theirs))
+        distance = float(difference @ np.linalg.solve(P + Q, difference))
+        return distance < chdtri(6, _SAME_MOTION)
 
     def middle(self, ego: EgoMotion) -> FloatArray:
         """(3,) middle of its points now, in the world."""
