@@ -103,7 +103,7 @@ class EngineContext:
             frame: its features.
             known: gives ids (N,) and world positions (N, 3) of the features that are known.
         """
-        if self.rig.has_imu:
+        if self.rig.has_imu or not self.config.dynamics.start_at_images:
             return None
         return lambda before, predicted: self._motion.corrected(before, predicted, frame, known())
 

@@ -37,6 +37,8 @@ _FITS = 1e-4
 """Probability of the errors of a track that fits."""
 _CLEARLY = 2.0
 """Factor on that limit for tracks that are of an object already."""
+_TWO_MOTIONS = 3.0
+"""Squared errors, over what is expected, above which the tracks have no motion in common."""
 _BEST = 0.3
 """Share of the tracks of an object that is of it beyond doubt."""
 _SAME_PLACE_M = 0.5
@@ -158,8 +160,11 @@ class ObjectTracker:
     def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that do not fit an object leave it, and static ones if the object moves."""
         static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
-        for item in self.objects:
+        for item in list(self.objects):
             fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
+            if item.confirmed and _scale(squares, dof) > _TWO_MOTIONS:
+                self._separate(item, ego, sigma_px)
+                continue
             unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
             item.members = np.setdiff1d(item.members, fit[unfit])
             if not item.moving:
@@ -171,6 +176,14 @@ class ObjectTracker:
             alone, dof = _for(fit, same, alone), _for(fit, same, dof)
             leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(dof, _FITS))]
             item.members = np.setdiff1d(item.members, leaves)
+
+    def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
+        """Leave an object the largest part of its tracks that moves as one; none fits it."""
+        groups = self._groups(item.members, sigma_px)
+        if groups:
+            item.begin_again(groups[0], self._window, ego)
+        if not groups or not item.begun:
+            self.objects.remove(item)
 
     def _scale(self, item: TrackedObject, sigma_px: float) -> float:
         """Squared errors of the tracks of an object over what is expected, by its poses as known.

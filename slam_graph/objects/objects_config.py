@@ -22,10 +22,11 @@ class ObjectsConfig(Settings):
     Where a track is not known so well, the test says that it cannot tell."""
     min_points: int = expert(6, ge=4)
     """Fewest tracks that make an object."""
-    accel_density: float = expert(1.0, gt=0)
+    accel_density: float = expert(1.5, gt=0)
     """White noise of the acceleration of an object, m/s²/√Hz. Raise it for objects that swerve."""
-    angular_accel_density: float = expert(1.0, gt=0)
-    """White noise of the angular acceleration of an object, rad/s²/√Hz."""
+    angular_accel_density: float = expert(0.3, gt=0)
+    """White noise of the angular acceleration of an object, rad/s²/√Hz. It decides which way an
+    object turns whose points are nearly on a plane that faces the cameras."""
     max_occlusion_s: float = expert(2.0, gt=0)
     """How long an object that is not seen is kept; if it appears again within this time it has the
     same number."""

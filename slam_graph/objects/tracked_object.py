@@ -64,13 +64,32 @@ class TrackedObject:
         self.frames, self.moving = 0, False
         self.seen_ns = ego.stamps_ns[-1]
         self._config = config
-        self._motion = RelativeMotion(window.rig, *policies, config, config.window_s)
+        self._policies = policies
         self._object_T_start = gtsam.Pose3()
-        self._rejections: deque[IntArray] = deque()
         self.state: ObjectState | None = None
-        for frame in window.frames:
-            self._motion.add(frame.only(members), ego)
+        self._motion = self._begun(window, ego)
         self._place(ego)
+
+    def _begun(self, window: TrackWindow, ego: EgoMotion) -> RelativeMotion:
+        """A new estimator, which has taken the frames of the window."""
+        self._rejections: deque[IntArray] = deque()
+        config = self._config
+        motion = RelativeMotion(window.rig, *self._policies, config, config.window_s)
+        for frame in window.frames:
+            motion.add(frame.only(self.members), ego)
+        return motion
+
+    def begin_again(self, members: IntArray, window: TrackWindow, ego: EgoMotion) -> None:
+        """Estimate the motion anew, with some of the tracks only: the others moved otherwise."""
+        before = self.state
+        self.members = members
+        self._motion = self._begun(window, ego)
+        if not self.begun:
+            return
+        if before is not None and before.stamp_ns == ego.stamps_ns[-1]:
+            self.continue_from(before.world_T_object, ego)
+        else:
+            self._place(ego)
 
     @property
     def confirmed(self) -> bool:

@@ -135,6 +135,7 @@ class FeatureObservations:
             None where the camera has no depth.
         depth_sigma_m: (N,) their standard deviations in m, NaN where `depth_m` is; None together
             with it.
+        labels: (N,) label of the mask that each is in, 0 outside of all; None without masks.
     """
 
     ids: IntArray
@@ -143,6 +144,7 @@ class FeatureObservations:
     descriptors: NDArray[np.uint8] | None = None
     depth_m: FloatArray | None = None
     depth_sigma_m: FloatArray | None = None
+    labels: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -161,6 +163,7 @@ class FeatureObservations:
             None if self.descriptors is None else self.descriptors[rows],
             None if self.depth_m is None else self.depth_m[rows],
             None if self.depth_sigma_m is None else self.depth_sigma_m[rows],
+            None if self.labels is None else self.labels[rows],
         )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,28 @@ class _MovingBox:
         return self.points + self.middle + offset
 
 
+class BodyLandmarks(Protocol):
+    """Landmarks on moving objects.
+
+    Attributes:
+        number: (N,) of the object that each is on.
+    """
+
+    number: IntArray
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Their positions and normals (N, 3) at a time."""
+        ...
+
+    def panels(self, stamp_ns: int) -> tuple[Panel, ...]:
+        """The sides of all objects at a time."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Landmarks:
     """All landmarks of a world.
@@ -61,14 +84,21 @@ class Landmarks:
         normals: (P, 3) of the walls that they are on, zero where there is none.
         box: dynamic landmarks, numbered from P on; or None.
         reach_m: how far from a place static landmarks are looked for; None for everywhere.
+        bodies: landmarks on moving objects, numbered after those; see `moving_bodies.py`.
     """
 
     points: FloatArray
     normals: FloatArray
     box: _MovingBox | None = None
     reach_m: float | None = None
+    bodies: BodyLandmarks | None = None
 
     def __len__(self) -> int:
+        return self.static + (0 if self.bodies is None else len(self.bodies))
+
+    @property
+    def static(self) -> int:
+        """Number of the landmarks that are not on objects."""
         return len(self.points) + (0 if self.box is None else len(self.box.points))
 
     @cached_property
@@ -76,14 +106,30 @@ class Landmarks:
         return KDTree(self.points[:, :2])
 
     def around(self, place: FloatArray) -> IntArray:
-        """Numbers (N,) of the landmarks within reach of a place (3,), in random order."""
+        """Numbers (N,) of the static landmarks within reach of a place (3,), in random order."""
         if self.reach_m is None:
-            return np.arange(len(self))
+            return np.arange(self.static)
         near = self._tree.query_ball_point(place[:2], self.reach_m, return_sorted=True)
         return np.array(near, np.int64)
 
+    def labels(self, index: IntArray) -> IntArray:
+        """Number (N,) of the object that landmarks are on; 0 for none."""
+        found = np.zeros(len(index), np.int64)
+        if self.bodies is not None:
+            rows = index >= self.static
+            found[rows] = self.bodies.number[index[rows] - self.static]
+        return found
+
+    def world_at(self, world: World, stamp_ns: int) -> World:
+        """The walls with the sides of the objects at a time."""
+        if self.bodies is None:
+            return world
+        return World((*world.panels, *self.bodies.panels(stamp_ns)))
+
     def at(self, index: IntArray, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Positions and normals (N, 3) of landmarks by their numbers (N,)."""
+        if self.bodies is not None and np.any(index >= self.static):
+            return self._with_bodies(self.bodies, index, stamp_ns)
         if self.box is None:
             return self.points[index], self.normals[index]
         count, moving = len(self.points), index >= len(self.points)
@@ -91,6 +137,16 @@ class Landmarks:
         points, normals = self.points[static], self.normals[static]
         points[moving] = self.box.at(stamp_ns)[index[moving] - count]
         normals[moving] = 0.0
+        return points, normals
+
+    def _with_bodies(
+        self, bodies: BodyLandmarks, index: IntArray, stamp_ns: int
+    ) -> tuple[FloatArray, FloatArray]:
+        on_body = index >= self.static
+        points, normals = self.at(np.where(on_body, 0, index), stamp_ns)
+        rows = index[on_body] - self.static
+        places, sides = bodies.at(stamp_ns)
+        points[on_body], normals[on_body] = places[rows], sides[rows]
         return points, normals
 
 
@@ -172,6 +228,32 @@ _SMOOTHING_SAMPLES = 21
 
 
 @dataclass(frozen=True, eq=False)
+class SmoothView:
+    """Where a camera is and looks, averaged over some time.
+
+    Attributes:
+        motion: of the platform.
+        body_R_camera: (3, 3) of the camera.
+        body_p_camera: (3,) of the same camera.
+    """
+
+    motion: Motion
+    body_R_camera: FloatArray
+    body_p_camera: FloatArray
+
+    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean position of the camera around a time, and its mean right and viewing directions."""
+        around = np.linspace(-_SMOOTHING_NS, _SMOOTHING_NS, _SMOOTHING_SAMPLES).astype(np.int64)
+        stamps = np.clip(stamp_ns + around, self.motion.start_ns, self.motion.end_ns)
+        world_R_body = self.motion.rotations(stamps).as_matrix()
+        eye = (self.motion.positions(stamps) + world_R_body @ self.body_p_camera).mean(axis=0)
+        axes = (world_R_body @ self.body_R_camera).mean(axis=0)
+        ahead = axes[:, 2] / np.linalg.norm(axes[:, 2])
+        right = axes[:, 0] - (axes[:, 0] @ ahead) * ahead
+        return eye, right / np.linalg.norm(right), ahead
+
+
+@dataclass(frozen=True, eq=False)
 class MovingBoard:
     """A rectangle that faces the cameras and moves in the world.
 
@@ -181,17 +263,13 @@ class MovingBoard:
 
     Attributes:
         config: size, distance and motion.
-        motion: of the platform.
-        body_R_camera: (3, 3) of the camera in whose view it stays.
-        body_p_camera: (3,) of the same camera.
+        view: of the camera in front of which it stays.
         began_ns: time of the first frame.
         phase_rad: of the sinusoid, at the first frame.
     """
 
     config: MovingObjectConfig
-    motion: Motion
-    body_R_camera: FloatArray
-    body_p_camera: FloatArray
+    view: SmoothView
     began_ns: int
     phase_rad: float
 
@@ -206,8 +284,8 @@ class MovingBoard:
         """A board in front of the camera mounted at `body_T_camera` (4, 4)."""
         rng = np.random.default_rng(random_stream(seed, "object"))
         phase_rad = float(rng.uniform(0.0, 2.0 * np.pi))
-        R, p = body_T_camera[:3, :3], body_T_camera[:3, 3]
-        return MovingBoard(config, motion, R, p, began_ns, phase_rad)
+        view = SmoothView(motion, body_T_camera[:3, :3], body_T_camera[:3, 3])
+        return MovingBoard(config, view, began_ns, phase_rad)
 
     @property
     def size(self) -> tuple[float, float]:
@@ -216,22 +294,11 @@ class MovingBoard:
 
     def at(self, stamp_ns: int) -> Panel:
         """The board at a time on the clock of the IMU."""
-        eye, right, ahead = self._smooth_view(stamp_ns)
+        eye, right, ahead = self.view.at(stamp_ns)
         up = np.cross(right, ahead)
         middle = eye + self.config.distance_m * ahead + self._sideways_m(stamp_ns) * right
         corner = middle - 0.5 * self.size[0] * right - 0.5 * self.size[1] * up
         return Panel(corner, right, up, self.size)
-
-    def _smooth_view(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean position of the camera around a time, and its mean right and viewing directions."""
-        around = np.linspace(-_SMOOTHING_NS, _SMOOTHING_NS, _SMOOTHING_SAMPLES).astype(np.int64)
-        stamps = np.clip(stamp_ns + around, self.motion.start_ns, self.motion.end_ns)
-        world_R_body = self.motion.rotations(stamps).as_matrix()
-        eye = (self.motion.positions(stamps) + world_R_body @ self.body_p_camera).mean(axis=0)
-        axes = (world_R_body @ self.body_R_camera).mean(axis=0)
-        ahead = axes[:, 2] / np.linalg.norm(axes[:, 2])
-        right = axes[:, 0] - (axes[:, 0] @ ahead) * ahead
-        return eye, right / np.linalg.norm(right), ahead
 
     def _sideways_m(self, stamp_ns: int) -> float:
         """Displacement to the right, m; until `since_s` it moves in from outside the view."""

@@ -21,6 +21,7 @@ from slam_graph.sensors import CameraFrame, Rig, RigCamera
 from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.landmarks import MovingBoard
 from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.moving_bodies import MovingBody
 from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.world import Panel, World
 
@@ -181,6 +182,7 @@ class Renderer:
         depth: DepthRendering | None = None,
     ) -> None:
         self._depth = depth
+        self.bodies: tuple[MovingBody, ...] = ()
         self._cameras = [_RayCamera(mounted) for mounted in rig.cameras]
         self._middle_s = rig.cameras[0].middle_s
         self._world = world
@@ -295,9 +297,12 @@ class Renderer:
 
     def _world_at(self, stamp_ns: int) -> World:
         """The walls, and the board at a time."""
-        if self._board is None:
+        if self._board is None and not self.bodies:
             return self._world
-        return World((*self._world.panels, self._board.at(stamp_ns)))
+        moving = [panel for body in self.bodies for panel in body.at(stamp_ns)]
+        if self._board is not None:
+            moving.append(self._board.at(stamp_ns))
+        return World((*self._world.panels, *moving))
 
     def _instants(self, motion: Motion, exposure_ns: int) -> NDArray[np.int64]:
         """Times of the sharp images whose mean is the blurred one."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -30,8 +30,9 @@ from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, R
 from slam_graph.simulation.aiding_simulation import simulated_aiding
 from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.imu_simulation import ImuSource
-from slam_graph.simulation.landmarks import Landmarks, MovingBoard
+from slam_graph.simulation.landmarks import Landmarks, MovingBoard, SmoothView
 from slam_graph.simulation.motion import Motion
+from slam_graph.simulation.moving_bodies import LandmarksOnBodies, MovingBody, moving_bodies
 from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.rendering import Renderer, paint
 from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
@@ -152,6 +153,21 @@ class SimulatedSequence(RecordedSequence):
             covariance=np.diag(standard_deviations**2),
         )
 
+    @cached_property
+    def bodies(self) -> tuple[MovingBody, ...]:
+        """The moving objects."""
+        flight, config = self.flight, self.config
+        mounting = flight.rig.cameras[0].body_T_camera.matrix()
+        view = SmoothView(flight.motion, mounting[:3, :3], mounting[:3, 3])
+        return moving_bodies(config.objects, view, int(flight.exposures_ns[0]), config.seed)
+
+    def object_truth(self) -> dict[int, Trajectory]:
+        """True poses of the objects by their numbers, at the stamps of the frames."""
+        stamps = self.flight.exposures_ns
+        truth = {body.number: body.trajectory(stamps) for body in self.bodies}
+        on_cameras = stamps - self._offset_ns
+        return {number: replace(path, stamps_ns=on_cameras) for number, path in truth.items()}
+
     def save(self, path: str | Path, progress: Progress | None = None) -> None:
         """Write the simulation to a new folder, completely or not at all, with its settings.
 
@@ -188,6 +204,9 @@ class SimulatedTracks(SimulatedSequence):
         diagnostics: Diagnostics | None = None,
     ) -> None:
         super().__init__(name, config, flight, diagnostics)
+        if config.objects.count:
+            on_bodies = LandmarksOnBodies(self.bodies, config.seed)
+            landmarks = replace(landmarks, bodies=on_bodies)
         self.landmarks = landmarks
 
     def frames(
@@ -203,6 +222,7 @@ class SimulatedTracks(SimulatedSequence):
             config.seed,
             config.place_seed,
             config.depth.noise_scale,
+            config.objects.masks,
         )
         stamps = flight.exposures_ns - self._offset_ns
         until = flight.exposures_ns[self.within(stamps, None, end_ns)]
@@ -228,9 +248,12 @@ class SimulatedImages(SimulatedSequence):
     def renderer(self) -> Renderer:
         """The renderer; textures are generated on first use."""
         flight, config = self.flight, self.config
-        board = self.board
+        board, bodies = self.board, self.bodies
         sizes = [panel.size for panel in flight.world.panels]
         texels_m = [config.images.texel_m] * len(sizes)
+        for body in bodies:
+            sizes += [panel.size for panel, _ in body.panels]
+            texels_m += [config.objects.texel_m] * len(body.panels)
         if board is not None:
             sizes.append(board.size)
             texels_m.append(board.config.texel_m)
@@ -238,7 +261,11 @@ class SimulatedImages(SimulatedSequence):
         depth = None
         if flight.rig.depth is not None:
             depth = DepthRendering(flight.rig.depth, config.depth.noise_scale, config.seed)
-        return Renderer(flight.rig, flight.world, atlas, config.images, config.seed, board, depth)
+        renderer = Renderer(
+            flight.rig, flight.world, atlas, config.images, config.seed, board, depth
+        )
+        renderer.bodies = bodies
+        return renderer
 
     @cached_property
     def board(self) -> MovingBoard | None:

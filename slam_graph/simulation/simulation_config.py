@@ -176,6 +176,34 @@ class SimulatedOdometryConfig(Settings):
     """Standard deviation of the rotation about each axis after one metre, rad/√m."""
 
 
+class SimulatedObjectsConfig(Settings):
+    """Rigid objects that move in front of the cameras, whose true poses come with the data."""
+
+    count: int = Field(0, ge=0, le=8)
+    """How many there are. Three or more pass in front of one another."""
+    motion: Literal["straight", "turning", "tumbling", "stop_and_go", "mixed"] = expert("turning")
+    """straight: it sways without turning; turning: about the vertical; tumbling: about any axis;
+    stop_and_go: it moves for 2 s and stands for 1.5 s; mixed: one of each."""
+    shape: Literal["box", "l_shape", "people"] = expert("box")
+    """people: three boxes that move a little against one another, which no rigid motion fits."""
+    size_m: float = expert(1.0, gt=0)
+    """Length of the longest side."""
+    distance_m: float = expert(3.5, gt=0)
+    """How far ahead of the first camera the first one is."""
+    speed: float = expert(0.6, gt=0)
+    """Largest speed of the sway, m/s; the motion of the cameras, which it follows, comes on top."""
+    sway_m: float = expert(0.5, gt=0)
+    """Amplitude of the sway."""
+    since_s: float = expert(0.0, ge=0)
+    """Time at which they have come into view from the side; 0: they are there at first."""
+    points: int = expert(100, ge=1)
+    """Landmarks on each of them, in track simulations; about a quarter of them is seen at a time."""
+    masks: bool = expert(default=False)
+    """Whether the data say which features, or pixels of the images, are on which object."""
+    texel_m: float = expert(0.003, gt=0)
+    """Size of a texel, in rendered images."""
+
+
 class StartConfig(Settings):
     """The start state that comes with the data, and its standard deviations."""
 
@@ -262,6 +290,8 @@ class SimulationConfig(Settings):
     """Position fixes."""
     odometry: SimulatedOdometryConfig = SimulatedOdometryConfig()
     """Odometry of wheels."""
+    objects: SimulatedObjectsConfig = SimulatedObjectsConfig()
+    """Rigid objects that move, and their true poses."""
     start: StartConfig | None = expert(None)
     """The start state that comes with the data; with a real IMU it is less certain by default."""
 

@@ -91,6 +91,7 @@ class TrackSimulator:
         seed: of the simulation.
         place_seed: of what landmarks look like; the same as `seed` if None.
         depth_noise: factor on the noise of the rig's depth sensor.
+        masks: whether features know which object they are on.
     """
 
     def __init__(
@@ -102,9 +103,11 @@ class TrackSimulator:
         seed: int,
         place_seed: int | None = None,
         depth_noise: float = 1.0,
+        masks: bool = False,
     ) -> None:
         reach_m = landmarks.reach_m or MAX_DEPTH_M
         self.views = [View.of(mounted, reach_m) for mounted in rig.cameras]
+        self._masks = masks
         self.groups = camera_groups(rig, self.views)
         self._middle_s = rig.cameras[0].middle_s
         self._world = world
@@ -158,7 +161,8 @@ class TrackSimulator:
     def _see(self, view: View, pose: _Pose, landmarks: IntArray) -> tuple[IntArray, FloatArray]:
         """Which of some landmarks a camera sees (indices), and their pixels."""
         points, normals = self._landmarks.at(landmarks, pose.stamp_ns)
-        index, pixels = view.see(pose.rotation, pose.position, points, normals, self._world)
+        world = self._landmarks.world_at(self._world, pose.stamp_ns)
+        index, pixels = view.see(pose.rotation, pose.position, points, normals, world)
         if view.mounted.readout_s == 0.0 or len(index) == 0:
             return index, pixels
         return self._see_rolling(view, pose, index, points, pixels)
@@ -195,15 +199,29 @@ class TrackSimulator:
         near = self._landmarks.around(pose.position)
         total, searched = len(near), 0
         taken = [t.landmarks for t in self._tracks]
-        while searched < total and len(tracks.ids) < self._config.features:
+        self._begin_on_objects(tracks, leader, pose)
+        while searched < total and self._static(tracks) < self._config.features:
             count = min(_LANDMARKS_AT_ONCE, total - searched)
             block = near[(self._next_landmark + np.arange(count)) % total]
             self._next_landmark, searched = (self._next_landmark + count) % total, searched + count
             block = block[~np.isin(block, np.concatenate(taken))]
             index, pixels = self._see(leader, pose, block)
-            chosen = self._select(leader.camera, tracks.pixels, pixels)
+            static = tracks.pixels[tracks.landmarks < self._landmarks.static]
+            chosen = self._select(leader.camera, static, pixels)
             landmarks = block[index[chosen]]
             tracks.add(landmarks, self._new_ids(landmarks), pixels[chosen])
+
+    def _static(self, tracks: _Tracks) -> int:
+        """Number of tracks that are not on objects."""
+        return int(np.count_nonzero(tracks.landmarks < self._landmarks.static))
+
+    def _begin_on_objects(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
+        """Start tracks of all landmarks on moving objects that are seen."""
+        block = np.arange(self._landmarks.static, len(self._landmarks))
+        block = block[~np.isin(block, np.concatenate([t.landmarks for t in self._tracks]))]
+        if len(block):
+            index, pixels = self._see(leader, pose, block)
+            tracks.add(block[index], self._new_ids(block[index]), pixels)
 
     def _new_ids(self, landmarks: IntArray) -> IntArray:
         if self._config.keep_ids:
@@ -215,7 +233,7 @@ class TrackSimulator:
         self, camera: Camera, present: FloatArray, candidates: FloatArray
     ) -> NDArray[np.intp]:
         """Candidates to take (indices): those in the cells with the fewest features first."""
-        wanted = self._config.features - len(present)
+        wanted = max(self._config.features - len(present), 0)
         if len(candidates) == 0:
             return np.zeros(0, np.intp)
         order = self._rng.permutation(len(candidates))
@@ -242,6 +260,8 @@ class TrackSimulator:
         if config.pixel_sigma > 0:
             pixels = pixels + self._rng.normal(0.0, config.pixel_sigma, pixels.shape)
         seen = FeatureObservations(ids.copy(), pixels.copy(), camera.undistort(pixels))
+        if self._masks:
+            seen = replace(seen, labels=self._landmarks.labels(landmarks))
         if self._depth is None or self._depth.sensor.camera != number:
             return seen
         exact_m = self._depths_m(number, pose, landmarks, exact)

@@ -95,6 +95,14 @@ def box(low: FloatArray, high: FloatArray) -> tuple[Panel, ...]:
     return tuple(panels)
 
 
+def outer_box(low: FloatArray, high: FloatArray) -> tuple[Panel, ...]:
+    """The six outer sides of a box from `low` (3,) to `high` (3,), which hide what is behind."""
+    return tuple(
+        Panel(panel.corner, panel.along, panel.across, panel.size[::-1], inner=True)
+        for panel in box(low, high)
+    )
+
+
 def room_around(positions: FloatArray, margin_m: float) -> World:
     """An empty room around a trajectory (N, 3)."""
     margin = np.array([margin_m, margin_m, _HEADROOM_M])
