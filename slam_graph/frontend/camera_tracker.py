@@ -14,6 +14,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
+from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
 from slam_graph.kernels.spacing import apart
@@ -35,6 +36,7 @@ class CameraTracker:
         stats: receives counts and times.
         rng: draws the samples of RANSAC.
         rotation: takes the place of a gyroscope.
+        moving: which features move by themselves; without it such are rejected.
 
     Attributes:
         outliers: the features that RANSAC, or the map of the back end, rejected in the last image.
@@ -50,7 +52,9 @@ class CameraTracker:
         stats: FrameStats,
         rng: np.random.Generator,
         rotation: ImageRotation | None = None,
+        moving: MovingTracks | None = None,
     ) -> None:
+        self._moving = moving or MovingTracks(wanted=False)
         self._camera = mounted.camera
         self._body_T_camera = mounted.body_T_camera
         self._extractor = extractor
@@ -84,10 +88,17 @@ class CameraTracker:
         with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(found.points[keep].astype(np.float64))
             after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
-            motions = self._rigid_motions(self._unrolled(before)[keep], self._unrolled(after))
+            moves = np.isin(after.ids, self._moving.ids)
+            tested = np.flatnonzero(~moves)
+            places = self._unrolled(before)[keep][tested], self._unrolled(after)[tested]
+            motions = [tested[rows] for rows in self._rigid_motions(*places)]
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = np.zeros(len(after), np.bool_)
             inlier[np.concatenate(motions)] = True
+            if self._moving.wanted:
+                self._stats.count(moving=moves)
+                self._moving.add(after.ids[~inlier])
+                inlier[:] = True
             in_map = np.ones(len(after), np.bool_)
             in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
             self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
@@ -126,11 +137,27 @@ class CameraTracker:
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
                 flow = self._predictor.residual_flow(origins, ends, seconds)
             self._stats.count(rejected_new=~good, new=good)
+            fits = good.copy()
+            if self._moving.wanted:
+                good[:] = True
             ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
+            self._moving.add(ids[~fits[good]])
             self._associator.accept(ids, good)
         new = Tracks.of(after.image, after.stamp_ns, ids, points[good], normalized[good])
         new.residual_flow[:] = flow[good]
-        return after.joined(new)
+        return self._with_corners_of_objects(after.joined(new), next_id + len(ids))
+
+    def _with_corners_of_objects(self, tracks: Tracks, next_id: int) -> Tracks:
+        """The features, and new ones on objects that have too few."""
+        if not self._moving.hulls or tracks.image is None:
+            return tracks
+        distance_px = 0.5 * self._config.min_distance_px
+        points = self._moving.corners(tracks.image, tracks.pixels, distance_px)
+        points = points[self._extractor.allows(points)]
+        ids = np.arange(next_id, next_id + len(points), dtype=np.int64)
+        self._moving.add(ids)
+        normalized = self._camera.undistort(points.astype(np.float64))
+        return tracks.joined(Tracks.of(tracks.image, tracks.stamp_ns, ids, points, normalized))
 
     def mount(self, mounted: RigCamera) -> None:
         """Take the place and the clock of the camera as they are calibrated now."""

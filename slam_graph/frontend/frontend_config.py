@@ -151,6 +151,10 @@ class FrontendConfig(Settings):
     map_check_px: PositivePixels | None = expert(None)
     """Largest reprojection error against the back end's map (PnP with RANSAC); null: no check."""
 
+    keep_moving: bool = expert(default=False)
+    """Whether features of the first camera that move by themselves are tracked on, apart from the
+    others. With `objects.enabled` it is so anyway."""
+
     drop_rejected: bool = expert(False)
     """Whether to stop tracking features that the χ² gate of the back end rejects."""
 

@@ -60,6 +60,11 @@ class Feedback:
         ids: (M,) ids of features whose position is estimated, ascending.
         points: (M, 3) these positions in the world frame, in metres.
         rig: the calibration, where the back end has corrected it; None otherwise.
+        moving: (K,) ids of features that move by themselves.
+        static: (K,) ids of features that do not, although the front end may have thought so.
+        wrong: (K,) ids of features that are neither: wrong matches.
+        hulls: polygons (N, 2) around moving objects, in pixels of the first camera, and how many
+            features are wanted in each.
     """
 
     state: NavState | None = None
@@ -67,6 +72,10 @@ class Feedback:
     ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     rig: Rig | None = None
+    moving: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    static: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    wrong: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    hulls: tuple[tuple[FloatArray, int], ...] = ()
 
     @staticmethod
     def of(

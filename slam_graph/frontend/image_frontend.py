@@ -20,6 +20,7 @@ from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
+from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.prediction import ImuMotion, PointPredictor
 from slam_graph.frontend.stereo import StereoMatcher, reference_cameras
 from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, ImuData, Rig
@@ -88,6 +89,7 @@ class ImageFrontend:
         masks = _masks(rig, config)
         rng = np.random.default_rng(seed)
         lucas_kanade = LucasKanade(config, images=2 * len(rig.cameras))
+        self._moving = MovingTracks(config.keep_moving)
         self._trackers: list[CameraTracker] = []
         self._matchers: dict[int, StereoMatcher] = {}
         for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
@@ -121,6 +123,7 @@ class ImageFrontend:
                     self._stats,
                     rng,
                     rotation,
+                    self._moving if i == 0 else None,
                 )
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
@@ -168,7 +171,18 @@ class ImageFrontend:
                 found[camera] = self._depth.measure(found[camera], frame, self._stats)
         self.frame_stats = dict(self._stats)
         outliers = tuple(tracker.outliers.observations() for tracker in self._trackers)
-        return FeatureFrame(frame.stamp_ns, tuple(found), outliers)
+        return FeatureFrame(frame.stamp_ns, *self._apart(found, outliers))
+
+    def _apart(
+        self, found: list[FeatureObservations], outliers: tuple[FeatureObservations, ...]
+    ) -> tuple[tuple[FeatureObservations, ...], ...]:
+        """Static features, outliers, and features that move, of each camera."""
+        static, moving = self._moving.apart(found)
+        if self._moving.wanted:
+            late = self._moving.surplus(self._tracks[0].ids)
+            if len(late):
+                self.drop(late)
+        return static, outliers, moving
 
     def drop(self, ids: IntArray) -> None:
         """Forget features in all cameras, e.g. those that the back end rejected."""
@@ -183,6 +197,11 @@ class ImageFrontend:
         if feedback.rig is not None:
             for tracker, mounted in zip(self._trackers, feedback.rig.cameras, strict=True):
                 tracker.mount(mounted)
+        self._moving.add(feedback.moving)
+        self._moving.remove(feedback.static)
+        self._moving.hulls = list(feedback.hulls) if self._moving.wanted else []
+        if len(feedback.wrong):
+            self.drop(feedback.wrong)
         if self._config.drop_rejected and len(feedback.rejected):
             followed = np.unique(np.concatenate([tracks.ids for tracks in self._tracks]))
             self._gated += int(np.count_nonzero(np.isin(followed, feedback.rejected)))

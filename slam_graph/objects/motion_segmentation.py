@@ -87,7 +87,7 @@ class _Tracks:
             start[0],
             start[1],
         )
-        return rotation, translation
+        return np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
 
 
 def rigid_groups(

@@ -88,7 +88,7 @@ class MotionTest:
 
     def of(self, verdict: Verdict) -> IntArray:
         """Ids (N,) of the tracks with a verdict, ascending."""
-        return self.ids[self.verdicts == verdict]
+        return np.asarray(self.ids[self.verdicts == verdict])
 
 
 def test_motion(
@@ -208,7 +208,7 @@ def _fit(
             moved = np.linalg.norm(shift[:, :3], axis=1)
             moved += np.linalg.norm(shift[:, 3:6], axis=1) * float(-seconds.min())
             x = x + shift * np.minimum(1.0, _MAX_STEP * depth / np.maximum(moved, 1e-9))[:, None]
-    covariance = np.linalg.inv(lhs)[:, 3:6, 3:6]
+    covariance: FloatArray = np.asarray(np.linalg.inv(lhs)[:, 3:6, 3:6], np.float64)
     return x[:, :3], x[:, 3:6], covariance, squares
 
 
@@ -216,7 +216,8 @@ def _slides(obs: Observations, since: FloatArray) -> FloatArray:
     """Derivatives (N, 2, 6) of pixels by offset and drift of a patch; see `_OFFSET_PX`."""
     second = (obs.camera > 0).astype(np.float64)
     both = np.stack([second, (1.0 - second) * since, second * since], axis=1)
-    return np.einsum("nk,ij->nikj", both, np.eye(2)).reshape(len(obs), 2, 6)
+    slides: FloatArray = np.einsum("nk,ij->nikj", both, np.eye(2)).reshape(len(obs), 2, 6)
+    return slides
 
 
 def _probabilities(velocities: FloatArray, Sigma: FloatArray) -> FloatArray:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 from scipy.special import chdtri
 
@@ -58,6 +57,7 @@ class ObjectFrame:
         states: of the objects that are seen.
         moving: ids (N,) of the features that must not count as static, ascending.
         static: ids (N,) of the features that are known to be static, ascending.
+        wrong: ids (N,) of features that are neither.
         probabilities: ids (J,) and the probability (J,) that each moves by itself.
         members: number of the object by feature.
         hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
@@ -67,6 +67,7 @@ class ObjectFrame:
     states: list[ObjectState] = field(default_factory=list)
     moving: IntArray = field(default_factory=_no_ids)
     static: IntArray = field(default_factory=_no_ids)
+    wrong: IntArray = field(default_factory=_no_ids)
     probabilities: tuple[IntArray, FloatArray] = field(
         default_factory=lambda: (_no_ids(), np.zeros(0))
     )
@@ -173,8 +174,8 @@ class ObjectTracker:
             same, alone, dof = self._window.misfit(
                 fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
             )
-            alone, dof = _for(fit, same, alone), _for(fit, same, dof)
-            leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(dof, _FITS))]
+            alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
+            leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(freedom, _FITS))]
             item.members = np.setdiff1d(item.members, leaves)
 
     def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
@@ -266,7 +267,8 @@ class ObjectTracker:
         return ObjectFrame(
             states,
             np.union1d(own, by_itself),
-            test.of(Verdict.STATIC),
+            np.setdiff1d(test.of(Verdict.STATIC), own),
+            np.setdiff1d(test.of(Verdict.WRONG), own),
             (ids[order], known[order]),
             members,
             [(item.number, item.hull(self._window)) for item in self.objects if item.confirmed],

@@ -186,7 +186,7 @@ class TrackedObject:
         )
 
     def _judge(self, mean: ObjectMotion, velocity: FloatArray, covariance: FloatArray) -> None:
-        """Whether it moves, by its motion over the last frames; as before where that cannot tell."""
+        """Whether it moves, by its motion over the last frames; as before if that cannot tell."""
         if mean.statistic > chdtri(6, self._config.false_alarm):
             self.moving = True
         elif self.moving:
@@ -240,7 +240,7 @@ class TrackedObject:
         (mine, P), (theirs, Q) = (step.body_motion() for step in steps if step is not None)
         difference = gtsam.Pose3.Logmap(mine.between(theirs))
         distance = float(difference @ np.linalg.solve(P + Q, difference))
-        return distance < chdtri(6, _SAME_MOTION)
+        return bool(distance < chdtri(6, _SAME_MOTION))
 
     def middle(self, ego: EgoMotion) -> FloatArray:
         """(3,) middle of its points now, in the world."""
@@ -261,7 +261,7 @@ class TrackedObject:
         return float(np.quantile(np.linalg.norm(points - self.shape_middle(), axis=1), 0.9))
 
     def predicted(self, stamp_ns: int) -> gtsam.Pose3 | None:
-        """World_T_object at a later time, if its motion goes on as it was; None if it is unknown."""
+        """world_T_object at a later time, if its motion goes on; None if it is not known."""
         state = self.state
         if state is None:
             return None

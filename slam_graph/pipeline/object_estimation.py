@@ -5,18 +5,19 @@
 from __future__ import annotations
 
 import time
-
-import numpy as np
+from dataclasses import replace
 
 from slam_graph.backend import Estimator
+from slam_graph.config import load_config
+from slam_graph.frontend import Feedback
 from slam_graph.objects.ego_motion import EgoWindow
 from slam_graph.objects.object_history import ObjectHistory
 from slam_graph.objects.object_tracker import ObjectFrame, ObjectTracker, merged_frame
-from slam_graph.pipeline.stage import EstimatedFrame, Stage
+from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
 from slam_graph.results import RunResult
 
 
-class Objects(Stage):
+class Objects(NoObjects):
     """Estimates the moving objects, and tells estimator and front end what moves.
 
     Args:
@@ -38,7 +39,19 @@ class Objects(Stage):
 
     def _new_tracker(self, result: RunResult) -> ObjectTracker:
         config = result.config
-        return ObjectTracker(result.causal_rig, config.algorithm, config.backend, config.objects)
+        policies = load_config(config.objects.algorithm).algorithm
+        return ObjectTracker(result.causal_rig, policies, config.backend, config.objects)
+
+    def feedback(self, feedback: Feedback) -> Feedback:
+        """What the front end is told, with what moves and where objects want more features."""
+        found, wanted = self.found, self._config.objects.features
+        return replace(
+            feedback,
+            moving=found.moving,
+            static=found.static,
+            wrong=found.wrong,
+            hulls=tuple((hull, wanted) for _, hull in found.hulls if len(hull) > 2),
+        )
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Estimate the objects in a frame."""

@@ -31,7 +31,7 @@ from slam_graph.pipeline.observers import (
     Viewing,
 )
 from slam_graph.pipeline.smoothing import Smoothing
-from slam_graph.pipeline.stage import Stage
+from slam_graph.pipeline.stage import NoObjects, Stage
 from slam_graph.pipeline.supervision import finish, outcome
 from slam_graph.pipeline.tracking import Tracking, packets_of
 from slam_graph.pipeline.verdict import Verdict
@@ -114,7 +114,7 @@ def run(
                 frame = estimation.estimate(tracked)
                 for stage in stages:
                     stage.frame(frame)
-                tracking.give_feedback(frame.feedback())
+                tracking.give_feedback(objects.feedback(frame.feedback()))
                 frame_done()
             estimation.finish()
         finish(stages, result)
@@ -145,10 +145,10 @@ def _place_stages(sequence: Sequence, result: RunResult, known_map: SlamMap | No
     ]
 
 
-def _objects_stage(result: RunResult, estimator: Estimator) -> Stage:
+def _objects_stage(result: RunResult, estimator: Estimator) -> NoObjects:
     """The estimation of moving objects, if it is wanted."""
     if not result.config.objects.enabled:
-        return Stage()
+        return NoObjects()
     from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
 
     return Objects(result, estimator)
@@ -198,9 +198,10 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:
     """Front end and reader of the recording."""
     config = asked.config
+    moving = config.frontend.keep_moving or config.objects.enabled
     frontend = build_frontend(
         asked.rig,
-        config.frontend,
+        config.frontend.model_copy(update={"keep_moving": moving}),
         config.seed,
         sequence.diagnostics,
         asked.info.content,

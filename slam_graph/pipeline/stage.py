@@ -104,6 +104,14 @@ class Stage:
         """Called once, when the last frame is done, however the run ended."""
 
 
+class NoObjects(Stage):
+    """Moving objects are not estimated."""
+
+    def feedback(self, feedback: Feedback) -> Feedback:
+        """What the front end is told, with what is known of moving objects."""
+        return feedback
+
+
 @contextmanager
 def warn_on_failure(diagnostics: Diagnostics, kind: str, consequence: str) -> Iterator[None]:
     """Turn a failure of the block into a counted warning: the causal result is not lost by it.

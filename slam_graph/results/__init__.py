@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from slam_graph.results.map_output import export_map, load_map, save_map
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
     from slam_graph.results.result_files import ResultFolder
-    from slam_graph.results.run_logs import RunLogs
     from slam_graph.results.run_input import RunInput
+    from slam_graph.results.run_logs import RunLogs
     from slam_graph.results.run_result import RunResult
     from slam_graph.results.saved_run import SavedRun, load_result
 else:

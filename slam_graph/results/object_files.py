@@ -58,9 +58,9 @@ def csv_lines(objects: ObjectHistory) -> Iterator[str]:
 
 def _numbers(state: ObjectState) -> Iterator[float]:
     pose = state.world_T_object
-    x, y, z, w = pose.rotation().toQuaternion().coeffs()
+    quaternion: Any = pose.rotation().toQuaternion()  # a type that the stubs do not know
     yield from pose.translation()
-    yield from (x, y, z, w)
+    yield from quaternion.coeffs()
     yield from state.velocity
     yield from _sigmas(state.covariance)
     yield from _sigmas(state.velocity_covariance)

@@ -137,7 +137,7 @@ def moving_bodies(
     bodies = []
     for number in range(1, config.count + 1):
         rng = np.random.default_rng(random_stream(seed, "bodies", number))
-        kind = config.motion
+        kind: str = config.motion
         if kind == "mixed":
             kind = _KINDS[(number - 1) % len(_KINDS)]
         axis = np.array([0.0, 0.0, 1.0])

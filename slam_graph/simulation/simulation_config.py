@@ -197,7 +197,7 @@ class SimulatedObjectsConfig(Settings):
     since_s: float = expert(0.0, ge=0)
     """Time at which they have come into view from the side; 0: they are there at first."""
     points: int = expert(100, ge=1)
-    """Landmarks on each of them, in track simulations; about a quarter of them is seen at a time."""
+    """Landmarks on each of them, in track simulations; of which a quarter is seen at a time."""
     masks: bool = expert(default=False)
     """Whether the data say which features, or pixels of the images, are on which object."""
     texel_m: float = expert(0.003, gt=0)

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features that move by themselves: tracked like the others, and reported apart from them.
+
+A track that RANSAC rejects between two images is a wrong match, or it moves. If moving objects are
+estimated it is kept: forward and backward Lucas-Kanade and the stereo test go on to find wrong
+matches, and the back end says in the end which of the tracks move, and which do not.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.frontend.keypoints import Image, Pixels
+from slam_graph.sensors import FeatureObservations
+
+MOST = 150
+"""Moving features that are tracked; of more the youngest are left out."""
+_CORNER_QUALITY = 0.02
+"""Smallest corner in the hull of an object, relative to the best one there."""
+
+
+class MovingTracks:
+    """Which of the features move.
+
+    Args:
+        wanted: whether they are kept at all.
+
+    Attributes:
+        ids: (N,) of them, ascending.
+        hulls: (K, 2) polygons around objects in the first camera, pixels, and how many features are
+            wanted in each.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self.wanted = wanted
+        self.ids: IntArray = np.zeros(0, np.int64)
+        self.hulls: list[tuple[FloatArray, int]] = []
+
+    def __contains__(self, feature: int) -> bool:
+        return bool(np.isin(feature, self.ids))
+
+    def add(self, ids: IntArray) -> None:
+        """Features that moved between two images, or that the back end found to move."""
+        if self.wanted and len(ids):
+            self.ids = np.union1d(self.ids, ids)
+
+    def remove(self, ids: IntArray) -> None:
+        """Features that are static after all."""
+        if len(ids):
+            self.ids = np.setdiff1d(self.ids, ids)
+
+    def surplus(self, alive: IntArray) -> IntArray:
+        """Forget features that are not tracked any more; ids (N,) of those that are too many."""
+        self.ids = self.ids[np.isin(self.ids, alive)]
+        self.ids, late = self.ids[:MOST], self.ids[MOST:]
+        return late
+
+    def apart(
+        self, found: list[FeatureObservations]
+    ) -> tuple[tuple[FeatureObservations, ...], tuple[FeatureObservations, ...]]:
+        """The observations of each camera of features that are static, and of those that move."""
+        if not self.wanted:
+            return tuple(found), ()
+        moving = [np.isin(seen.ids, self.ids) for seen in found]
+        static = tuple(seen.select(~rows) for seen, rows in zip(found, moving, strict=True))
+        return static, tuple(seen.select(rows) for seen, rows in zip(found, moving, strict=True))
+
+    def corners(self, image: Image, taken: Pixels, distance_px: float) -> Pixels:
+        """New corners (N, 2) in the hulls, which are wanted there beside those that are taken.
+
+        Args:
+            image: of the first camera.
+            taken: (M, 2) pixels of the features that are tracked.
+            distance_px: smallest distance between features.
+        """
+        found = [np.zeros((0, 2), np.float32)]
+        for hull, wanted in self.hulls:
+            polygon = np.round(hull).astype(np.int32).reshape(-1, 1, 2)
+            inside = [
+                cv2.pointPolygonTest(polygon, p, measureDist=False) >= 0 for p in taken.tolist()
+            ]
+            missing = wanted - sum(inside)
+            if missing <= 0:
+                continue
+            mask = np.zeros(image.shape, np.uint8)
+            cv2.fillPoly(mask, [polygon], 255)
+            for x, y in taken.tolist():
+                cv2.circle(mask, (round(x), round(y)), round(distance_px), 0, -1)
+            corners = cv2.goodFeaturesToTrack(
+                image, missing, _CORNER_QUALITY, distance_px, mask=mask
+            )
+            if corners is not None:
+                found.append(np.asarray(corners, np.float32).reshape(-1, 2))
+        return np.concatenate(found)
