@@ -19,7 +19,7 @@ from slam_graph.errors import ConfigError, closest
 from slam_graph.frontend import FrontendConfig
 from slam_graph.loop_closure import LoopClosureConfig
 from slam_graph.maps import LocalizationConfig, MapConfig
-from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.objects import ObjectsConfig
 from slam_graph.settings import ConfigTree, Settings, expert
 
 __all__ = [

@@ -14,11 +14,14 @@ __all__ = [
     "BackendConfig",
     "Estimator",
     "FeaturePolicy",
+    "FeatureTracks",
     "FinalBa",
     "FinalBaConfig",
     "FrameLog",
     "GainRatioDamping",
+    "Geometry",
     "Innovations",
+    "Observations",
     "PoseSelection",
     "RigProjection",
     "RobustLoss",
@@ -26,14 +29,16 @@ __all__ = [
     "WindowGraph",
     "adjust_worlds",
     "levenberg_marquardt",
+    "triangulate",
     "triangulate_frames",
     "visual_rotation",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.backend.backend_config import BackendConfig
+    from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
     from slam_graph.backend.cost.gating import Innovations
-    from slam_graph.backend.cost.reprojection import RigProjection
+    from slam_graph.backend.cost.reprojection import Geometry, RigProjection
     from slam_graph.backend.cost.robust_loss import RobustLoss
     from slam_graph.backend.cost.selection_policies import (
         FEATURE_POLICIES,
@@ -41,7 +46,7 @@ if TYPE_CHECKING:
         FeaturePolicy,
         PoseSelection,
     )
-    from slam_graph.backend.cost.triangulation import triangulate_frames
+    from slam_graph.backend.cost.triangulation import triangulate, triangulate_frames
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.policies import AlgorithmConfig
@@ -60,8 +65,9 @@ else:
         __name__,
         {
             "backend_config": ("BackendConfig",),
+            "cost.feature_tracks": ("FeatureTracks", "Observations"),
             "cost.gating": ("Innovations",),
-            "cost.reprojection": ("RigProjection",),
+            "cost.reprojection": ("Geometry", "RigProjection"),
             "cost.robust_loss": ("RobustLoss",),
             "cost.selection_policies": (
                 "FEATURE_POLICIES",
@@ -69,7 +75,7 @@ else:
                 "FeaturePolicy",
                 "PoseSelection",
             ),
-            "cost.triangulation": ("triangulate_frames",),
+            "cost.triangulation": ("triangulate", "triangulate_frames"),
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),
             "policies": ("AlgorithmConfig",),

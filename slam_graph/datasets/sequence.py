@@ -25,6 +25,7 @@ from slam_graph.datasets.groundtruth import (
 )
 from slam_graph.datasets.packets import packetize, packetize_alone
 from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
+from slam_graph.datasets.streams.object_truth import OBJECT_TRUTH, read_object_truth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory
@@ -188,6 +189,18 @@ class RecordedSequence(Displayed, ABC):
         if isinstance(source, Path):
             self.groundtruth_path = resolve_groundtruth(source)
             check_groundtruth(self.groundtruth_path)
+
+    def object_truth(self) -> dict[int, Trajectory]:
+        """True poses of moving objects by their numbers, at the stamps of frames; none if unknown.
+
+        Raises:
+            DataError: if `objects_truth.csv` cannot be read.
+        """
+        path = getattr(self, "path", None)
+        for folder in () if path is None else (path, path.parent):
+            if (folder / OBJECT_TRUTH).is_file():
+                return read_object_truth(folder / OBJECT_TRUTH)
+        return {}
 
     def __repr__(self) -> str:
         info = self.info()

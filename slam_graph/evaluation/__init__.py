@@ -8,12 +8,14 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "ErrorSeries",
+    "ObjectStep",
     "accuracy_report",
     "ape",
     "consistency_report",
     "innovation_report",
     "mean_bounds",
     "nees_of_run",
+    "object_errors",
     "rpe",
     "synchronize",
 ]
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
         innovation_report,
         nees_of_run,
     )
+    from slam_graph.evaluation.object_motion import ObjectStep, object_errors
     from slam_graph.evaluation.relative_pose_error import rpe
     from slam_graph.evaluation.truth_pairing import synchronize
 else:
@@ -44,6 +47,7 @@ else:
                 "innovation_report",
                 "nees_of_run",
             ),
+            "object_motion": ("ObjectStep", "object_errors"),
             "relative_pose_error": ("rpe",),
             "truth_pairing": ("synchronize",),
         },

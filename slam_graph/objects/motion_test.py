@@ -23,10 +23,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import BackendConfig, RigProjection
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import Geometry
-from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection, triangulate
 from slam_graph.objects.ego_motion import EgoMotion
 from slam_graph.objects.objects_config import ObjectsConfig
 

@@ -77,6 +77,7 @@ class ObjectState:
         world_T_object: its pose. The frame of an object has the axes of the world and its origin in
             the middle of the points where the object was found first.
         covariance: (6, 6) of the tangent of the pose.
+        world_T_body: the platform then.
         step: motion since the frame before; None where it is not known.
         velocity: (3,) of its origin, mean over the last frames, m/s, in the world.
         velocity_covariance: (3, 3).
@@ -89,6 +90,7 @@ class ObjectState:
     label: int
     world_T_object: gtsam.Pose3
     covariance: FloatArray
+    world_T_body: gtsam.Pose3
     step: ObjectMotion | None
     velocity: FloatArray
     velocity_covariance: FloatArray

@@ -152,7 +152,7 @@ def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
         "accel_density": config.accel_density,
         "angular_accel_density": config.angular_accel_density,
         "min_points": config.min_points,
-        "start_at_images": False,  # few points on a plane have two poses, and the prediction is good
+        "start_at_images": False,  # few points on a plane have two poses; prediction is good
     }
     default = BackendConfig()
     return backend.model_copy(

@@ -178,6 +178,7 @@ class TrackedObject:
             self.label,
             world_T_object,
             self._pose_covariance(ego, pose),
+            ego.poses[-1],
             step,
             velocity,
             velocity_covariance,

@@ -10,9 +10,13 @@ from dataclasses import replace
 from slam_graph.backend import Estimator
 from slam_graph.config import load_config
 from slam_graph.frontend import Feedback
-from slam_graph.objects.ego_motion import EgoWindow
-from slam_graph.objects.object_history import ObjectHistory
-from slam_graph.objects.object_tracker import ObjectFrame, ObjectTracker, merged_frame
+from slam_graph.objects import (
+    EgoWindow,
+    ObjectFrame,
+    ObjectHistory,
+    ObjectTracker,
+    merged_frame,
+)
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
 from slam_graph.results import RunResult
 

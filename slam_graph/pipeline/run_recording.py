@@ -191,8 +191,12 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     rig = replace(rig, has_imu=config.backend.dynamics.uses_imu(recorded))
     if not rig.has_imu:  # gravity is not known
         config = config.with_overrides(["loop_closure.degrees_of_freedom=6"])
-    datum = sequence.aiding.datum if isinstance(sequence, RecordedSequence) else None
-    return RunInput(info, config, rig, start_ns, end_ns, sequence.groundtruth(), datum)
+    datum, objects = None, {}
+    if isinstance(sequence, RecordedSequence):
+        datum = sequence.aiding.datum
+        objects = sequence.object_truth() if config.objects.enabled else {}
+    truth = sequence.groundtruth()
+    return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects)
 
 
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:

@@ -5,19 +5,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 
+from slam_graph import evaluation
 from slam_graph.arrays import FloatArray
 from slam_graph.files import Files
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.result_files import ResultFolder
+from slam_graph.results.run_input import RunInput
 
 if TYPE_CHECKING:
-    from slam_graph.objects.object_history import ObjectHistory
-    from slam_graph.objects.object_state import ObjectState
+    from slam_graph.objects import ObjectHistory, ObjectState
 
 OBJECTS = "objects.csv"
 
@@ -73,16 +75,43 @@ def _numbers(state: ObjectState) -> Iterator[float]:
     yield from _sigmas(state.step.covariance)
 
 
+def _accuracy(objects: ObjectHistory, asked: RunInput) -> dict[str, float | int] | None:
+    """Errors of motions and poses; None without true poses."""
+    if asked.truth is None or not asked.object_truth:
+        return None
+    offset_ns = round(asked.rig.pose_offset_s * 1e9)
+    true_body = replace(asked.truth, stamps_ns=asked.truth.stamps_ns - offset_ns)
+    steps = [
+        evaluation.ObjectStep(
+            state.stamp_ns,
+            state.step.before_ns,
+            state.number,
+            state.world_T_object,
+            state.step.motion,
+            state.step.covariance,
+            state.world_T_body,
+        )
+        for state in objects.all_states()
+        if state.step is not None
+    ]
+    return evaluation.object_errors(steps, asked.object_truth, true_body).table()
+
+
 def _sigmas(covariance: FloatArray) -> FloatArray:
     """Standard deviations (n,) of a covariance (n, n)."""
     return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
-def objects_table(objects: ObjectHistory | None) -> dict[str, Any] | None:
-    """What `metrics.json` says of the objects; None if none were looked for."""
+def objects_table(objects: ObjectHistory | None, asked: RunInput) -> dict[str, Any] | None:
+    """What `metrics.json` says of the objects; None if none were looked for.
+
+    Args:
+        objects: as they were estimated.
+        asked: the true poses, if they are known.
+    """
     if objects is None:
         return None
-    table = {}
+    table: dict[str, Any] = {}
     for number in objects.numbers:
         states = objects.states(number)
         speeds = [float(np.linalg.norm(state.velocity)) for state in states if state.moving]
@@ -98,5 +127,6 @@ def objects_table(objects: ObjectHistory | None) -> dict[str, Any] | None:
         }
     return {
         "objects": table,
+        "accuracy": _accuracy(objects, asked),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from slam_graph.config import RunConfig
@@ -28,6 +29,7 @@ class RunInput:
         rig: the sensors that were used.
         start_ns, end_ns: times of the first and the last frame that were asked for.
         truth: ground truth of the whole recording, or None.
+        object_truth: true poses of moving objects by their numbers.
         datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
     """
 
@@ -38,6 +40,7 @@ class RunInput:
     end_ns: int
     truth: Trajectory | None = None
     datum: tuple[float, float, float] | None = None
+    object_truth: Mapping[int, Trajectory] = field(default_factory=dict)
 
     @property
     def recorded_s(self) -> float:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from slam_graph.backend import FinalBa, WindowGraph
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
-    from slam_graph.objects.object_history import ObjectHistory
+    from slam_graph.objects import ObjectHistory
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
@@ -254,7 +254,7 @@ class RunResult(RunSummary):
                     if located is None
                     else located.table(asked.start_ns, logs.frames, asked.truth)
                 ),
-                "moving_objects": objects_table(self.objects),
+                "moving_objects": objects_table(self.objects, asked),
                 "nees": tables.consistency_table(
                     truth, self.history, self.start_was_given, self.final_ba
                 ),

@@ -23,6 +23,7 @@ from slam_graph.datasets import (
     RecordedSequence,
     SequenceInfo,
     TrackRecorder,
+    object_truth_file,
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
@@ -183,6 +184,7 @@ class SimulatedSequence(RecordedSequence):
         notes = {_SETTINGS_FILE: yaml.safe_dump(settings, sort_keys=False)}
         if self.flight.report is not None:
             notes[_PATH_FILE] = json.dumps(self.flight.report.as_dict(), indent=2) + "\n"
+        notes |= object_truth_file(self.object_truth())
         self._write(Path(path), notes, progress if progress is not None else _ignore)
 
     @abstractmethod

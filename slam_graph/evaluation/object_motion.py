@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the estimated motions and poses of objects against their true ones.
+
+The frame of an estimated object is not that of the true one, so motions are compared in the world:
+with L the true pose of the object before a step and H = L_now L_before⁻¹ its motion in the world,
+the error is E = (L⁻¹ H L)⁻¹ (L⁻¹ Ĥ L) (VDO-SLAM: Zhang et al. 2020; DynoSAM: Morris et al. 2025).
+The worlds of estimate and truth are put together at every frame by the two poses of the platform,
+so that its own drift does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.geometry import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectStep:
+    """An object as it was estimated at one frame.
+
+    Attributes:
+        stamp_ns, before_ns: times of this frame and of the one before.
+        number: of the object.
+        world_T_object: its pose.
+        motion: before_T_now of its own frame.
+        covariance: (6, 6) of the tangent of the motion.
+        world_T_body: the platform then.
+    """
+
+    stamp_ns: int
+    before_ns: int
+    number: int
+    world_T_object: gtsam.Pose3
+    motion: gtsam.Pose3
+    covariance: FloatArray
+    world_T_body: gtsam.Pose3
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectErrors:
+    """Errors of the steps that belong to a true object, N of them.
+
+    Attributes:
+        truth: (N,) number of the true object.
+        tangents: (N, 6) of the motion errors: rotation (rad) and translation (m), object axes.
+        nees: (N,) squared errors by their covariances, over 6: one where these are right.
+        poses: (N, 2) rotation (rad) and translation (m) of the pose errors, once the constant
+            difference of the two frames is taken from where each estimate began.
+        switches: number of times that a true object went on under another number.
+    """
+
+    truth: FloatArray
+    tangents: FloatArray
+    nees: FloatArray
+    poses: FloatArray
+    switches: int
+
+    def table(self) -> dict[str, float | int]:
+        """Root mean squares: motion and pose errors, NEES and identity switches."""
+        rotation, translation = (
+            np.linalg.norm(self.tangents[:, :3], axis=1),
+            np.linalg.norm(self.tangents[:, 3:], axis=1),
+        )
+        return {
+            "steps": len(self.tangents),
+            "motion_rotation_deg": _rms(np.degrees(rotation)),
+            "motion_translation_m": _rms(translation),
+            "median_motion_rotation_deg": _middle(np.degrees(rotation)),
+            "median_motion_translation_m": _middle(translation),
+            "pose_rotation_deg": _rms(np.degrees(self.poses[:, 0])),
+            "pose_translation_m": _rms(self.poses[:, 1]),
+            "nees": float(np.mean(self.nees)) if len(self.nees) else np.nan,
+            "identity_switches": self.switches,
+        }
+
+
+def motion_error(before: gtsam.Pose3, now: gtsam.Pose3, world_motion: gtsam.Pose3) -> gtsam.Pose3:
+    """The error of an estimated motion in the world, in the frame of the true object.
+
+    Args:
+        before: true world_T_object before the step.
+        now: the same after it.
+        world_motion: estimated L_now L_before⁻¹ of any frame that is fixed to the object.
+    """
+    true = before.between(now)
+    return true.between(before.inverse().compose(world_motion).compose(before))
+
+
+def object_errors(
+    steps: Sequence[ObjectStep],
+    truth: Mapping[int, Trajectory],
+    true_body: Trajectory,
+    max_distance_m: float = 2.0,
+) -> ObjectErrors:
+    """Errors of all steps whose object is near a true one.
+
+    Args:
+        steps: of all objects, in the order of time.
+        truth: poses of the true objects by their numbers, at the stamps of the frames.
+        true_body: true poses of the platform.
+        max_distance_m: farthest middle of a true object.
+    """
+    rows: list[tuple[int, ObjectStep, FloatArray, float]] = []
+    poses: list[tuple[float, float]] = []
+    offsets: dict[tuple[int, int], gtsam.Pose3] = {}
+    for step in steps:
+        aligned = true_body.at(step.stamp_ns).compose(step.world_T_body.inverse())
+        here = aligned.compose(step.world_T_object)
+        nearest = _nearest(here.translation(), step, truth)
+        if nearest is None or nearest[1] > max_distance_m:
+            continue
+        number = nearest[0]
+        before, now = (truth[number].at(stamp) for stamp in (step.before_ns, step.stamp_ns))
+        was = here.compose(step.motion.inverse())
+        tangent = gtsam.Pose3.Logmap(motion_error(before, now, here.compose(was.inverse())))
+        adjoint = before.inverse().compose(was).AdjointMap()
+        covariance = adjoint @ step.covariance @ adjoint.T
+        rows.append((number, step, tangent, tangent @ np.linalg.solve(covariance, tangent) / 6))
+        offset = offsets.setdefault((step.number, number), here.between(now))
+        error = now.between(here.compose(offset))
+        turn = float(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))
+        poses.append((turn, float(np.linalg.norm(error.translation()))))
+    return ObjectErrors(
+        np.array([number for number, _, _, _ in rows], np.float64),
+        np.array([tangent for _, _, tangent, _ in rows]).reshape(-1, 6),
+        np.array([nees for _, _, _, nees in rows]),
+        np.array(poses).reshape(-1, 2),
+        _switches([(number, step.number) for number, step, _, _ in rows]),
+    )
+
+
+def _nearest(
+    middle: FloatArray, step: ObjectStep, truth: Mapping[int, Trajectory]
+) -> tuple[int, float] | None:
+    """Number of the nearest true object that is known at both times, and how far it is, m."""
+    known = [
+        (float(np.linalg.norm(path.at(step.stamp_ns).translation() - middle)), number)
+        for number, path in truth.items()
+        if path.stamps_ns[0] <= step.before_ns and step.stamp_ns <= path.stamps_ns[-1]
+    ]
+    return (min(known)[1], min(known)[0]) if known else None
+
+
+def _switches(pairs: Sequence[tuple[int, int]]) -> int:
+    """How often a true object is next seen under another number than its own so far.
+
+    Args:
+        pairs: numbers of the true and of the estimated object, in the order of time.
+    """
+    last: dict[int, int] = {}
+    switches = 0
+    for true, estimated in pairs:
+        switches += last.get(true, estimated) != estimated
+        last[true] = estimated
+    return switches
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """How well moving features are told from static ones.
+
+    Attributes:
+        precision: share of those called moving that move.
+        recall: share of those that move that are called so.
+        false_positives, true_positives: (K,) the curve (ROC), from no to all features.
+        area: under the curve; one half is chance.
+    """
+
+    precision: float
+    recall: float
+    false_positives: FloatArray
+    true_positives: FloatArray
+    area: float
+
+
+def detection(probabilities: FloatArray, moving: BoolArray, limit: float = 0.5) -> Detection:
+    """Compare probabilities (N,) that features move with the truth (N,).
+
+    Args:
+        probabilities: of moving.
+        moving: whether they do.
+        limit: probability from which a feature is called moving.
+    """
+    called = probabilities >= limit
+    hits = int(np.count_nonzero(called & moving))
+    count = max(int(np.count_nonzero(moving)), 1), max(int(np.count_nonzero(~moving)), 1)
+    order = np.argsort(-probabilities, kind="stable")
+    true = np.concatenate([[0.0], np.cumsum(moving[order]) / count[0]])
+    false = np.concatenate([[0.0], np.cumsum(~moving[order]) / count[1]])
+    return Detection(
+        hits / max(int(np.count_nonzero(called)), 1),
+        hits / count[0],
+        false,
+        true,
+        float(np.trapezoid(true, false)),
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def _middle(values: FloatArray) -> float:
+    return float(np.median(values)) if len(values) else np.nan
