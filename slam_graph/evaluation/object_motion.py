@@ -122,7 +122,8 @@ def object_errors(
         tangent = gtsam.Pose3.Logmap(motion_error(before, now, here.compose(was.inverse())))
         adjoint = before.inverse().compose(was).AdjointMap()
         covariance = adjoint @ step.covariance @ adjoint.T
-        rows.append((number, step, tangent, tangent @ np.linalg.solve(covariance, tangent) / 6))
+        nees = float(tangent @ np.linalg.solve(covariance, tangent)) / 6.0
+        rows.append((number, step, tangent, nees))
         offset = offsets.setdefault((step.number, number), here.between(now))
         error = now.between(here.compose(offset))
         turn = float(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))

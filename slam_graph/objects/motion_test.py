@@ -88,7 +88,7 @@ class MotionTest:
         return np.asarray(self.ids[self.verdicts == verdict])
 
 
-def test_motion(
+def judge_tracks(
     obs: Observations,
     rig: RigProjection,
     ego: EgoMotion,

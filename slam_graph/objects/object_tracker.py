@@ -20,7 +20,7 @@ from slam_graph.backend import AlgorithmConfig, BackendConfig
 from slam_graph.errors import EstimationError
 from slam_graph.objects.ego_motion import EgoMotion
 from slam_graph.objects.motion_segmentation import rigid_groups
-from slam_graph.objects.motion_test import MotionTest, Verdict, test_motion
+from slam_graph.objects.motion_test import MotionTest, Verdict, judge_tracks
 from slam_graph.objects.object_state import ObjectState
 from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.objects.track_window import TrackWindow
@@ -208,7 +208,7 @@ class ObjectTracker:
     def _tested(self, ids: IntArray, ego: EgoMotion, sigma_px: float) -> MotionTest:
         stamps = list(ego.stamps_ns)
         obs = self._window.observations(ids, _LEAST_FRAMES, stamps)
-        return test_motion(
+        return judge_tracks(
             obs, self._window.projection, ego, sigma_px, self._policies[1], self._config
         )
 
