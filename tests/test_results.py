@@ -21,8 +21,8 @@ from slam_graph.pipeline.tracking import Stopwatch
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, finite
 from slam_graph.results.result_files import ResultFolder
-from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_input import RunInput
+from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import load_result
 from slam_graph.sensors.rig import Rig

@@ -73,6 +73,7 @@ class MotionTest:
         statistics: (J,) uᵀ Σ⁻¹ u.
         probabilities: (J,) that it moves.
         verdicts: (J,) each a `Verdict`.
+        misfits: (J,) squared errors under a constant velocity, over what is expected.
     """
 
     ids: IntArray
@@ -82,6 +83,7 @@ class MotionTest:
     statistics: FloatArray
     probabilities: FloatArray
     verdicts: IntArray
+    misfits: FloatArray
 
     def of(self, verdict: Verdict) -> IntArray:
         """Ids (N,) of the tracks with a verdict, ascending."""
@@ -134,7 +136,14 @@ def judge_tracks(
     verdicts[moving] = Verdict.MOVING
     verdicts[squares > chdtri(dof, _MISFIT)] = Verdict.WRONG
     return MotionTest(
-        obs.ids, points, velocities, Sigma, statistics, _probabilities(velocities, Sigma), verdicts
+        obs.ids,
+        points,
+        velocities,
+        Sigma,
+        statistics,
+        _probabilities(velocities, Sigma),
+        verdicts,
+        squares / dof,
     )
 
 

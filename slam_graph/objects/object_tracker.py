@@ -36,8 +36,10 @@ _FITS = 1e-4
 """Probability of the errors of a track that fits."""
 _CLEARLY = 2.0
 """Factor on that limit for tracks that are of an object already."""
-_TWO_MOTIONS = 3.0
-"""Squared errors, over what is expected, above which the tracks have no motion in common."""
+_ENOUGH, _NEWS, _LEAST_NOISE = 20, 0.1, 0.3
+"""Tracks that tell the noise, weight of one frame of them, and its least ratio to the setting."""
+_TWO_MOTIONS = 0.25
+"""Share of the tracks of an object that move in its frame, from which it is two objects."""
 _BEST = 0.3
 """Share of the tracks of an object that is of it beyond doubt."""
 _SAME_PLACE_M = 0.5
@@ -96,6 +98,7 @@ class ObjectTracker:
         self._window = TrackWindow(rig, backend)
         self._rig = rig
         self._next = 1
+        self._noise = 1.0
         self.objects: list[TrackedObject] = []
         self._hidden: list[TrackedObject] = []
 
@@ -112,6 +115,7 @@ class ObjectTracker:
         own = _members(self.objects)
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
         test = self._tested(others, ego, sigma_px)
+        sigma_px *= self._noise_of(test)
         self._join(test, ego, sigma_px)
         self._leave(ego, sigma_px)
         self._begin(test, ego, sigma_px)
@@ -163,11 +167,12 @@ class ObjectTracker:
         static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
         for item in list(self.objects):
             fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-            if item.confirmed and _scale(squares, dof) > _TWO_MOTIONS:
+            unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
+            apart = self._moving_within(item, ego, sigma_px)
+            if item.confirmed and len(apart) > _TWO_MOTIONS * len(item.members):
                 self._separate(item, ego, sigma_px)
                 continue
-            unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
-            item.members = np.setdiff1d(item.members, fit[unfit])
+            item.members = np.setdiff1d(item.members, np.union1d(fit[unfit], apart))
             if not item.moving:
                 continue
             fit, squares = fit[~unfit], squares[~unfit]
@@ -177,6 +182,19 @@ class ObjectTracker:
             alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
             leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(freedom, _FITS))]
             item.members = np.setdiff1d(item.members, leaves)
+
+    def _moving_within(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> IntArray:
+        """Ids (N,) of the tracks of an object that move in its frame: an object is a world."""
+        world = item.as_ego_motion(ego)
+        if world is None:
+            return _no_ids()
+        stamps = list(world.stamps_ns)
+        obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
+        if len(obs) == 0:
+            return _no_ids()
+        rig, backend = self._window.projection, self._policies[1]
+        test = judge_tracks(obs, rig, world, sigma_px, backend, self._config)
+        return test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
 
     def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
         """Leave an object the largest part of its tracks that moves as one; none fits it."""
@@ -202,6 +220,14 @@ class ObjectTracker:
                     older.members = np.union1d(older.members, younger.members)
                     self.objects.remove(younger)
                     break
+
+    def _noise_of(self, test: MotionTest) -> float:
+        """Noise of the tracks that do not move, over what is assumed; at most 1."""
+        steady = test.misfits[np.isin(test.verdicts, (Verdict.STATIC, Verdict.UNKNOWN))]
+        if len(steady) >= _ENOUGH:
+            ratio = float(np.clip(np.median(steady), _LEAST_NOISE**2, 1.0))
+            self._noise += _NEWS * (float(np.sqrt(ratio)) - self._noise)
+        return self._noise
 
     # --- new objects -----------------------------------------------------------------------------
 

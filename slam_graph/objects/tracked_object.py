@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import cv2
 import gtsam
@@ -221,6 +222,26 @@ class TrackedObject:
         adjoint = object_T_body.AdjointMap()
         covariance: FloatArray = adjoint @ inner @ adjoint.T
         return covariance
+
+    def as_ego_motion(self, ego: EgoMotion) -> EgoMotion | None:
+        """The motion of the platform in the frame of the object; None if it is not known yet."""
+        stamps = [stamp for stamp in ego.stamps_ns if stamp in self._motion.poses]
+        if len(stamps) < 3:
+            return None
+        step = self._motion.step(stamps[-1], stamps[0])
+        if step is None:
+            return None
+        R, P = step.now.rotation().matrix(), step.body_motion()[1]
+        seconds = (stamps[-1] - stamps[0]) * 1e-9
+        return EgoMotion(
+            tuple(stamps),
+            tuple(self._motion.poses[stamp] for stamp in stamps),
+            np.zeros((len(stamps), 3)),
+            replace(ego.state, world_T_body=step.now),
+            R @ P[3:, 3:] @ R.T / seconds**2,
+            R @ P[:3, :3] @ R.T / seconds**2,
+            P,
+        )
 
     def moves_with(self, other: TrackedObject, ego: EgoMotion) -> bool:
         """Whether another object is near and cannot be told from a part of this one.
