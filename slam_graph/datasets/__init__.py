@@ -13,6 +13,7 @@ __all__ = [
     "DATASETS",
     "EurocWriter",
     "Format",
+    "MaskFolder",
     "ReaderOptions",
     "RecordedSequence",
     "Rows",
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence, Sequence, SequenceInfo
     from slam_graph.datasets.streams.csv_rows import Rows
+    from slam_graph.datasets.streams.mask_images import MaskFolder
     from slam_graph.datasets.streams.object_truth import object_truth_file
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -57,6 +59,7 @@ else:
             "memory_sequence": ("dataset_from_arrays",),
             "sequence": ("ReaderOptions", "RecordedSequence", "Sequence", "SequenceInfo"),
             "streams.csv_rows": ("Rows",),
+            "streams.mask_images": ("MaskFolder",),
             "streams.object_truth": ("object_truth_file",),
         },
     )

@@ -25,6 +25,7 @@ from slam_graph.datasets.formats.video import VideoSequence, is_video
 from slam_graph.datasets.rosbag.bag import is_bag
 from slam_graph.datasets.rosbag.ros_sequence import RosBagSequence
 from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence
+from slam_graph.datasets.streams.mask_images import MASKS
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.plugins import Registry
@@ -49,7 +50,7 @@ class Format:
     fallback: bool = False
 
 
-_AIDING = ("gnss", "odometry")
+_AIDING = ("gnss", "odometry", MASKS)
 """Sensors that any recording may have, or a file beside it."""
 
 
@@ -126,7 +127,7 @@ def open_dataset(
         diagnostics: where faults are counted.
         sources: where each sensor is, in formats that leave it open: topics of a ROS bag or files
             beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``; in every format
-            the files or topics of ``gnss`` and ``odometry``.
+            the files or topics of ``gnss`` and ``odometry``, and the folder of ``masks``.
         faults: to put into it on purpose, such as ``imu_missing:at_s=6,duration_s=1``.
         imu: False to read it as if it had no IMU.
 

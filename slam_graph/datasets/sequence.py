@@ -25,6 +25,7 @@ from slam_graph.datasets.groundtruth import (
 )
 from slam_graph.datasets.packets import packetize, packetize_alone
 from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
+from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder
 from slam_graph.datasets.streams.object_truth import OBJECT_TRUTH, read_object_truth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
@@ -201,6 +202,20 @@ class RecordedSequence(Displayed, ABC):
             if (folder / OBJECT_TRUTH).is_file():
                 return read_object_truth(folder / OBJECT_TRUTH)
         return {}
+
+    def masks(self) -> MaskFolder | None:
+        """Masks of objects: those that were named, or the folder `masks` beside the recording.
+
+        Raises:
+            DataError: if they cannot be read.
+        """
+        if MASKS in self.named_aiding:
+            return MaskFolder(Path(self.named_aiding[MASKS]))
+        path = getattr(self, "path", None)
+        for folder in () if path is None else (path, path.parent):
+            if (folder / MASKS).is_dir():
+                return MaskFolder(folder / MASKS)
+        return None
 
     def __repr__(self) -> str:
         info = self.info()

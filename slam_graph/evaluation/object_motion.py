@@ -99,24 +99,26 @@ def object_errors(
     true_body: Trajectory,
     max_distance_m: float = 2.0,
 ) -> ObjectErrors:
-    """Errors of all steps whose object is near a true one.
+    """Errors of all steps whose object belongs to a true one.
 
     Args:
         steps: of all objects, in the order of time.
         truth: poses of the true objects by their numbers, at the stamps of the frames.
         true_body: true poses of the platform.
-        max_distance_m: farthest middle of a true object.
+        max_distance_m: farthest middle of the true object that an estimated one belongs to.
     """
     rows: list[tuple[int, ObjectStep, FloatArray, float]] = []
     poses: list[tuple[float, float]] = []
     offsets: dict[tuple[int, int], gtsam.Pose3] = {}
-    for step in steps:
-        aligned = true_body.at(step.stamp_ns).compose(step.world_T_body.inverse())
-        here = aligned.compose(step.world_T_object)
-        nearest = _nearest(here.translation(), step, truth)
-        if nearest is None or nearest[1] > max_distance_m:
+    placed = [
+        (step, true_body.at(step.stamp_ns).compose(step.world_T_body.inverse())) for step in steps
+    ]
+    belongs = _matched(placed, truth, max_distance_m)
+    for step, aligned in placed:
+        number = belongs.get(step.number)
+        if number is None or not _known(truth[number], step):
             continue
-        number = nearest[0]
+        here = aligned.compose(step.world_T_object)
         before, now = (truth[number].at(stamp) for stamp in (step.before_ns, step.stamp_ns))
         was = here.compose(step.motion.inverse())
         tangent = gtsam.Pose3.Logmap(motion_error(before, now, here.compose(was.inverse())))
@@ -137,16 +139,30 @@ def object_errors(
     )
 
 
-def _nearest(
-    middle: FloatArray, step: ObjectStep, truth: Mapping[int, Trajectory]
-) -> tuple[int, float] | None:
-    """Number of the nearest true object that is known at both times, and how far it is, m."""
-    known = [
-        (float(np.linalg.norm(path.at(step.stamp_ns).translation() - middle)), number)
-        for number, path in truth.items()
-        if path.stamps_ns[0] <= step.before_ns and step.stamp_ns <= path.stamps_ns[-1]
-    ]
-    return (min(known)[1], min(known)[0]) if known else None
+def _matched(
+    placed: Sequence[tuple[ObjectStep, gtsam.Pose3]],
+    truth: Mapping[int, Trajectory],
+    max_distance_m: float,
+) -> dict[int, int]:
+    """The true object of each estimated one: the one that is nearest over all of its steps."""
+    distances: dict[int, dict[int, list[float]]] = {}
+    for step, aligned in placed:
+        middle = aligned.compose(step.world_T_object).translation()
+        for number, path in truth.items():
+            if _known(path, step):
+                away = float(np.linalg.norm(path.at(step.stamp_ns).translation() - middle))
+                distances.setdefault(step.number, {}).setdefault(number, []).append(away)
+    found = {}
+    for estimated, others in distances.items():
+        mean, number = min((float(np.mean(away)), number) for number, away in others.items())
+        if mean <= max_distance_m:
+            found[estimated] = number
+    return found
+
+
+def _known(path: Trajectory, step: ObjectStep) -> bool:
+    """Whether a true object is known at both times of a step."""
+    return bool(path.stamps_ns[0] <= step.before_ns and step.stamp_ns <= path.stamps_ns[-1])
 
 
 def _switches(pairs: Sequence[tuple[int, int]]) -> int:

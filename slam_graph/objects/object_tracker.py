@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 from scipy.special import chdtri
 
@@ -23,6 +24,7 @@ from slam_graph.objects.motion_segmentation import rigid_groups
 from slam_graph.objects.motion_test import MotionTest, Verdict, judge_tracks
 from slam_graph.objects.object_state import ObjectState
 from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.objects.track_labels import TrackLabels
 from slam_graph.objects.track_window import TrackWindow
 from slam_graph.objects.tracked_object import TrackedObject
 from slam_graph.sensors import FeatureFrame, FeatureObservations, Rig
@@ -38,6 +40,8 @@ _CLEARLY = 2.0
 """Factor on that limit for tracks that are of an object already."""
 _ENOUGH, _NEWS, _LEAST_NOISE = 20, 0.1, 0.3
 """Tracks that tell the noise, weight of one frame of them, and its least ratio to the setting."""
+_MOVING_SHARE = 0.3
+"""Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
 _BEST = 0.3
@@ -111,6 +115,7 @@ class ObjectTracker:
             sigma_px: standard deviation of the observations.
         """
         self._window.add(frame, ego.stamps_ns[0])
+        self._labels = TrackLabels(frame)
         states = self._follow(ego)
         own = _members(self.objects)
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
@@ -151,16 +156,18 @@ class ObjectTracker:
         static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
         candidates = test.ids[test.verdicts != Verdict.STATIC]
         for item in self.objects:
-            fit, squares, dof = self._window.misfit(candidates, item.poses, sigma_px)
+            allowed = self._labels.allowed(candidates, item.label)
+            fit, squares, dof = self._window.misfit(allowed, item.poses, sigma_px)
             same, alone, _ = self._window.misfit(
                 fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
             )
             alone = _for(fit, same, alone)
             scale = self._scale(item, sigma_px)
-            fits = squares < scale * chdtri(dof, _FITS)
-            joins = fit[fits & (alone - squares > scale * _MARGIN)]
-            item.members = np.union1d(item.members, joins)
-            candidates = np.setdiff1d(candidates, joins)
+            joins = squares < scale * chdtri(dof, _FITS)
+            if not self._labels.given:  # masks tell what is of the object, and not static
+                joins &= alone - squares > scale * _MARGIN
+            item.members = np.union1d(item.members, fit[joins])
+            candidates = np.setdiff1d(candidates, fit[joins])
 
     def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that do not fit an object leave it, and static ones if the object moves."""
@@ -169,6 +176,9 @@ class ObjectTracker:
             fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
             unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
             apart = self._moving_within(item, ego, sigma_px)
+            item.members = np.setdiff1d(
+                item.members, self._labels.contradicted(item.members, item.label)
+            )
             if item.confirmed and len(apart) > _TWO_MOTIONS * len(item.members):
                 self._separate(item, ego, sigma_px)
                 continue
@@ -216,7 +226,9 @@ class ObjectTracker:
         """Objects that move as one rigid body become one: the older stays."""
         for younger in list(self.objects)[::-1]:
             for older in self.objects:
-                if older.number < younger.number and older.moves_with(younger, ego):
+                if older.label != younger.label or older.number >= younger.number:
+                    continue
+                if older.moves_with(younger, ego):
                     older.members = np.union1d(older.members, younger.members)
                     self.objects.remove(younger)
                     break
@@ -240,11 +252,8 @@ class ObjectTracker:
 
     def _begin(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that move together begin an object."""
-        own = _members(self.objects)
-        free = np.setdiff1d(test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))], own)
         config = self._config
-        groups = [(0, group) for group in self._groups(free, sigma_px)]
-        for label, group in groups:
+        for label, group in self._new_groups(test, sigma_px):
             item = TrackedObject(
                 self._next, label, group, self._window, ego, self._policies, config
             )
@@ -254,6 +263,21 @@ class ObjectTracker:
             if item.number == self._next:
                 self._next += 1
             self.objects.append(item)
+
+    def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
+        """Labels and tracks of what begins to move; without masks labels are 0."""
+        free = ~np.isin(test.ids, _members(self.objects))
+        moves = free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))
+        if not self._labels.given:
+            return [(0, group) for group in self._groups(test.ids[moves], sigma_px)]
+        taken = {item.label for item in self.objects}
+        groups: list[tuple[int, IntArray]] = []
+        for label in self._labels.present(test.ids[moves]):
+            inside = free & (self._labels.of(test.ids) == label)
+            if label in taken or np.mean(moves[inside]) < _MOVING_SHARE:
+                continue
+            groups += [(label, group) for group in self._groups(test.ids[inside], sigma_px)[:1]]
+        return groups
 
     def _groups(self, ids: IntArray, sigma_px: float) -> list[IntArray]:
         config = self._config
@@ -269,8 +293,11 @@ class ObjectTracker:
             expected = hidden.predicted(now)
             if expected is None or hidden.label != item.label:
                 continue
-            far = np.linalg.norm(item.middle(ego) - expected.transformFrom(hidden.shape_middle()))
-            if far < max(_SAME_PLACE_M, hidden.size()):
+            shift = item.middle(ego) - expected.transformFrom(hidden.shape_middle())
+            if item.label > 0:  # the mask says that it is the same
+                expected = gtsam.Pose3(expected.rotation(), expected.translation() + shift)
+                shift = np.zeros(3)
+            if np.linalg.norm(shift) < max(_SAME_PLACE_M, hidden.size()):
                 item.number, item.moving = hidden.number, hidden.moving
                 item.continue_from(expected, ego)
                 self._hidden.remove(hidden)
@@ -333,4 +360,7 @@ def _joined(a: FeatureObservations, b: FeatureObservations) -> FeatureObservatio
         np.concatenate([a.ids, b.ids]),
         np.concatenate([a.pixels, b.pixels]),
         np.concatenate([a.normalized, b.normalized]),
+        labels=None
+        if a.labels is None or b.labels is None
+        else np.concatenate([a.labels, b.labels]),
     )

@@ -7,8 +7,11 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+import numpy as np
+
 from slam_graph.backend import Estimator
 from slam_graph.config import load_config
+from slam_graph.datasets import MaskFolder
 from slam_graph.frontend import Feedback
 from slam_graph.objects import (
     EgoWindow,
@@ -19,6 +22,7 @@ from slam_graph.objects import (
 )
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
 from slam_graph.results import RunResult
+from slam_graph.sensors import FeatureFrame
 
 
 class Objects(NoObjects):
@@ -27,14 +31,20 @@ class Objects(NoObjects):
     Args:
         result: of the run; it is given the objects.
         estimator: of the platform.
+        masks: of objects in the images of the first camera; None without.
 
     Attributes:
         found: what became of the tracks of the last frame.
     """
 
-    def __init__(self, result: RunResult, estimator: Estimator) -> None:
+    def __init__(
+        self, result: RunResult, estimator: Estimator, masks: MaskFolder | None = None
+    ) -> None:
+        super().__init__()
+        self._masks = masks
         self._estimator = estimator
-        self._history = result.objects = ObjectHistory()
+        classes = {} if masks is None else masks.classes
+        self._history = result.objects = ObjectHistory(classes=dict(classes))
         self._config = result.config
         self._window = EgoWindow(result.config.objects.window_s)
         self._tracker = self._new_tracker(result)
@@ -71,8 +81,20 @@ class Objects(NoObjects):
         if ego is None:
             return
         sigma_px = self._config.backend.noise.pixel_sigma
-        self.found = self._tracker.add(merged_frame(features, features.moving), ego, sigma_px)
+        merged = self._labelled(merged_frame(features, features.moving))
+        self.found = self._tracker.add(merged, ego, sigma_px)
         self._estimator.exclude(self.found.moving)
+        self.moved = np.union1d(self.moved, self.found.moving)
         self._history.note(self.found.states, self._tracker.objects)
         self._history.milliseconds += 1e3 * (time.perf_counter() - begin)
         self._history.frames += 1
+
+    def _labelled(self, frame: FeatureFrame) -> FeatureFrame:
+        """The frame with the labels of the masks in which the first camera sees its features."""
+        if self._masks is None:
+            return frame
+        seen, camera = frame.cameras[0], self._result.rig.cameras[0].camera
+        labels = self._masks.labels(frame.stamp_ns, seen.pixels, (camera.width, camera.height))
+        if labels is None:
+            return frame
+        return replace(frame, cameras=(replace(seen, labels=labels), *frame.cameras[1:]))

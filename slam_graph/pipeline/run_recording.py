@@ -87,7 +87,7 @@ def run(
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
-    objects = _objects_stage(result, estimation.estimator)
+    objects = _objects_stage(sequence, result, estimation.estimator)
     estimator, diagnostics = estimation.estimator, sequence.diagnostics
     progress = progress or NullProgress()
     smoothed = result.config.final_ba.enabled
@@ -96,7 +96,7 @@ def run(
         objects,
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
-        Verdict(result, diagnostics),
+        Verdict(result, diagnostics, objects),
         GraphKeeping(result, estimator, graph_times, diagnostics),
         *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),
@@ -145,13 +145,14 @@ def _place_stages(sequence: Sequence, result: RunResult, known_map: SlamMap | No
     ]
 
 
-def _objects_stage(result: RunResult, estimator: Estimator) -> NoObjects:
+def _objects_stage(sequence: Sequence, result: RunResult, estimator: Estimator) -> NoObjects:
     """The estimation of moving objects, if it is wanted."""
     if not result.config.objects.enabled:
         return NoObjects()
     from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
 
-    return Objects(result, estimator)
+    masks = sequence.masks() if isinstance(sequence, RecordedSequence) else None
+    return Objects(result, estimator, masks)
 
 
 def _settings(

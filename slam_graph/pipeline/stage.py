@@ -105,7 +105,14 @@ class Stage:
 
 
 class NoObjects(Stage):
-    """Moving objects are not estimated."""
+    """Moving objects are not estimated.
+
+    Attributes:
+        moved: ids (N,) of all features that were found to move so far, ascending.
+    """
+
+    def __init__(self) -> None:
+        self.moved: IntArray = np.zeros(0, np.int64)
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what is known of moving objects."""

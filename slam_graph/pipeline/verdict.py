@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
+from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
@@ -48,8 +48,9 @@ logger = logging.getLogger(__name__)
 class _Memory:
     """What is kept of a recording: features, IMU samples and a few pairs of images."""
 
-    def __init__(self, pairs: bool) -> None:
+    def __init__(self, pairs: bool, objects: NoObjects) -> None:
         """Begin with nothing; `pairs` says whether images of two cameras are of use."""
+        self._objects = objects
         self._frames: deque[tuple[FeatureFrame, ImuData]] = deque()
         self._since: list[ImuData] = []
         self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
@@ -59,8 +60,8 @@ class _Memory:
 
     @property
     def frames(self) -> list[FeatureFrame]:
-        """Features of the frames that are kept."""
-        return [features for features, _ in self._frames]
+        """Features of the frames that are kept, without those that move by themselves."""
+        return [features.without(self._objects.moved) for features, _ in self._frames]
 
     @property
     def imu(self) -> ImuData:
@@ -105,11 +106,14 @@ class Verdict(Stage):
     Args:
         result: of the run; its status and message say the verdict.
         diagnostics: of the run; it counts what goes wrong here, too.
+        objects: knows what moves.
     """
 
-    def __init__(self, result: RunResult, diagnostics: Diagnostics) -> None:
+    def __init__(
+        self, result: RunResult, diagnostics: Diagnostics, objects: NoObjects | None = None
+    ) -> None:
         self._result, self._diagnostics = result, diagnostics
-        self._kept = _Memory(len(result.input.rig.cameras) > 1)
+        self._kept = _Memory(len(result.input.rig.cameras) > 1, objects or NoObjects())
         self._started_ns: int | None = None
         self._first_ns: int | None = None
         config = result.config
