@@ -5,6 +5,7 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -12,8 +13,13 @@ import pytest
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import BackendConfig, Estimator, RigProjection
 from slam_graph.config import load_config
-from slam_graph.datasets import object_truth_file, open_dataset
-from slam_graph.datasets.streams.object_truth import OBJECT_TRUTH, read_object_truth
+from slam_graph.datasets import RecordedSequence, open_dataset
+from slam_graph.datasets.streams.mask_images import MaskFolder
+from slam_graph.datasets.streams.object_truth import (
+    OBJECT_TRUTH,
+    object_truth_file,
+    read_object_truth,
+)
 from slam_graph.errors import DataError
 from slam_graph.evaluation.object_motion import (
     ObjectStep,
@@ -359,7 +365,8 @@ def test_a_saved_recording_has_the_true_poses(tmp_path: Path) -> None:
     sequence = simulate(duration_s=1.0, rate_hz=5.0, objects={"count": 2})
     sequence.save(tmp_path / "flight")
     read = open_dataset(tmp_path / "flight")
-    truth = read.object_truth()  # type: ignore[attr-defined]
+    assert isinstance(read, RecordedSequence)
+    truth = read.object_truth()
     assert truth.keys() == {1, 2}
     np.testing.assert_allclose(truth[1].positions, sequence.object_truth()[1].positions, atol=1e-7)
 
@@ -384,3 +391,82 @@ def test_the_window_of_the_platform_forgets_the_first_pose() -> None:
     assert last is not None
     assert len(last.stamps_ns) == 6, "half a second at 10 Hz"
     assert np.all(np.linalg.eigvalsh(last.velocity_covariance) > 0)
+
+
+# --- masks ---------------------------------------------------------------------------------------
+
+
+def masked(folder: Path) -> MaskFolder:
+    labels = np.zeros((40, 60), np.uint16)
+    labels[10:30, 20:40] = 7
+    folder.mkdir()
+    cv2.imwrite(str(folder / "100.png"), labels)
+    (folder / "boxes.csv").write_text("#stamp,label,l,t,r,b\n200,3,20,10,39,29\n")
+    (folder / "classes.csv").write_text("7,car\n")
+    return MaskFolder(folder)
+
+
+def test_masks_are_read_as_images_and_as_boxes(tmp_path: Path) -> None:
+    masks = masked(tmp_path / "masks")
+    pixels = np.array([[30.0, 20.0], [5.0, 5.0], [20.0, 20.0], [39.6, 20.0]])
+    found = [masks.labels(stamp, pixels, (60, 40)) for stamp in (100, 200)]
+    assert [labels.tolist() for labels in found if labels is not None] == [
+        [7, 0, 0, 0],
+        [3, 0, 0, 0],
+    ], "at a border a feature may be on either side"
+    assert masks.labels(300, pixels, (60, 40)) is None
+    assert masks.classes == {7: "car"}
+
+
+def test_what_is_wrong_with_masks_is_said(tmp_path: Path) -> None:
+    masks = masked(tmp_path / "masks")
+    with pytest.raises(DataError, match=r"100\.png: a label image has one channel.*30 x 40"):
+        masks.image(100, (30, 40))
+    with pytest.raises(DataError, match="no such folder of masks"):
+        MaskFolder(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="holds neither"):
+        MaskFolder(tmp_path / "empty")
+    (tmp_path / "masks" / "classes.csv").write_text("car,7\n")
+    with pytest.raises(DataError, match=r"classes\.csv:1: expected a label"):
+        MaskFolder(tmp_path / "masks")
+
+
+def test_masks_keep_three_objects_apart() -> None:
+    result = estimated(flight(count=3, motion="mixed", masks=True))
+    found = result.metrics["moving_objects"]
+    assert found["accuracy"]["identity_switches"] == 0
+    assert found["accuracy"]["median_motion_translation_m"] < 0.012
+    assert {row["label"] for row in found["objects"].values()} == {1, 2, 3}
+    assert len(found["objects"]) == 3
+
+
+def test_rendered_objects_come_with_masks_and_true_poses(tmp_path: Path) -> None:
+    objects = {"count": 1, "masks": True}
+    sequence = simulate(kind="images", duration_s=0.5, rate_hz=4.0, objects=objects)
+    sequence.save(tmp_path / "flight")
+    read = open_dataset(tmp_path / "flight")
+    assert isinstance(read, RecordedSequence)
+    masks, truth = read.masks(), read.object_truth()[1]
+    assert masks is not None
+    camera = sequence.rig.cameras[0]
+    size = camera.camera.width, camera.camera.height
+    for stamp_ns, middle in zip(truth.stamps_ns.tolist(), truth.positions, strict=True):
+        image = masks.image(stamp_ns, size)
+        assert image is not None
+        assert set(np.unique(image)) == {0, 1}
+        body = sequence.groundtruth().at(stamp_ns)
+        local = body.compose(camera.body_T_camera).transformTo(middle)
+        u, v = camera.camera.distort(local[None, :2] / local[2])[0][0]
+        assert image[round(v), round(u)] == 1, "the middle of a box is behind its face"
+
+
+def test_images_of_a_rendered_object_show_its_motion() -> None:
+    sequence = simulate(
+        kind="images", duration_s=3.0, rate_hz=RATE_HZ, objects={"count": 1, "masks": True}
+    )
+    result = run(sequence, overrides={"objects.enabled": True, "final_ba.enabled": False})
+    found = result.metrics["moving_objects"]["accuracy"]
+    assert found["steps"] > 8
+    assert found["median_motion_rotation_deg"] < 1.5
+    assert found["median_motion_translation_m"] < 0.03

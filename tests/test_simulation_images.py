@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from slam_graph.sensors.measurements import CameraFrame
 from slam_graph.sensors.rig import Rig, RigCamera
-from slam_graph.simulation.rendering import Renderer, cast, paint
+from slam_graph.simulation.rendering import Renderer, cast
 from slam_graph.simulation.simulated_sequence import SimulatedImages
 from slam_graph.simulation.simulation_config import ImageConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
+from slam_graph.simulation.textures import paint
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ __all__ = [
     "DATASETS",
     "EurocWriter",
     "Format",
-    "MaskFolder",
+    "Masks",
     "ReaderOptions",
     "RecordedSequence",
     "Rows",
@@ -23,7 +23,6 @@ __all__ = [
     "check_sequence",
     "dataset_from_arrays",
     "kalibr_text",
-    "object_truth_file",
     "open_dataset",
     "read_groundtruth",
     "read_kalibr",
@@ -44,8 +43,7 @@ if TYPE_CHECKING:
     from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence, Sequence, SequenceInfo
     from slam_graph.datasets.streams.csv_rows import Rows
-    from slam_graph.datasets.streams.mask_images import MaskFolder
-    from slam_graph.datasets.streams.object_truth import object_truth_file
+    from slam_graph.datasets.streams.mask_images import Masks
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -59,7 +57,6 @@ else:
             "memory_sequence": ("dataset_from_arrays",),
             "sequence": ("ReaderOptions", "RecordedSequence", "Sequence", "SequenceInfo"),
             "streams.csv_rows": ("Rows",),
-            "streams.mask_images": ("MaskFolder",),
-            "streams.object_truth": ("object_truth_file",),
+            "streams.mask_images": ("Masks",),
         },
     )

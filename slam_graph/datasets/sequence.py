@@ -25,8 +25,12 @@ from slam_graph.datasets.groundtruth import (
 )
 from slam_graph.datasets.packets import packetize, packetize_alone
 from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
-from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder
-from slam_graph.datasets.streams.object_truth import OBJECT_TRUTH, read_object_truth
+from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, Masks
+from slam_graph.datasets.streams.object_truth import (
+    OBJECT_TRUTH,
+    object_truth_file,
+    read_object_truth,
+)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory
@@ -203,7 +207,11 @@ class RecordedSequence(Displayed, ABC):
                 return read_object_truth(folder / OBJECT_TRUTH)
         return {}
 
-    def masks(self) -> MaskFolder | None:
+    def object_truth_file(self) -> dict[str, str]:
+        """Name and text of a file with these poses; empty without any."""
+        return object_truth_file(self.object_truth())
+
+    def masks(self) -> Masks | None:
         """Masks of objects: those that were named, or the folder `masks` beside the recording.
 
         Raises:

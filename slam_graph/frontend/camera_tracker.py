@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import Associator
@@ -157,7 +158,14 @@ class CameraTracker:
         ids = np.arange(next_id, next_id + len(points), dtype=np.int64)
         self._moving.add(ids)
         normalized = self._camera.undistort(points.astype(np.float64))
-        return tracks.joined(Tracks.of(tracks.image, tracks.stamp_ns, ids, points, normalized))
+        new = Tracks.of(tracks.image, tracks.stamp_ns, ids, points, normalized)
+        old = tracks.select(
+            np.isin(tracks.ids, self._moving.ids) & np.isfinite(tracks.residual_flow[:, 0])
+        )
+        if len(old) and len(new):  # it moves as what is nearest on the object
+            nearest = np.argmin(cdist(new.pixels, old.pixels), axis=1)
+            new.residual_flow[:] = old.residual_flow[nearest]
+        return tracks.joined(new)
 
     def mount(self, mounted: RigCamera) -> None:
         """Take the place and the clock of the camera as they are calibrated now."""

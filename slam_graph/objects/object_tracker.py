@@ -22,6 +22,7 @@ from slam_graph.errors import EstimationError
 from slam_graph.objects.ego_motion import EgoMotion
 from slam_graph.objects.motion_segmentation import rigid_groups
 from slam_graph.objects.motion_test import MotionTest, Verdict, judge_tracks
+from slam_graph.objects.object_regions import region, regions_of_motion
 from slam_graph.objects.object_state import ObjectState
 from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.objects.track_labels import TrackLabels
@@ -67,7 +68,7 @@ class ObjectFrame:
         probabilities: ids (J,) and the probability (J,) that each moves by itself.
         members: number of the object by feature.
         hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
-            camera.
+            camera; with the number 0 around tracks that move and are of no object yet.
     """
 
     states: list[ObjectState] = field(default_factory=list)
@@ -303,6 +304,12 @@ class ObjectTracker:
                 self._hidden.remove(hidden)
                 return
 
+    def _hulls(self, by_itself: IntArray) -> list[tuple[int, FloatArray]]:
+        """Number and polygon of each object; of what moves and is none yet, 0."""
+        seen = self._window.frames[-1].cameras[0]
+        hulls = [(item.number, region(seen, item.members)) for item in self.objects]
+        return hulls + [(0, polygon) for polygon in regions_of_motion(seen, by_itself)]
+
     def _described(self, states: list[ObjectState], test: MotionTest) -> ObjectFrame:
         moving = [item for item in self.objects if item.moving or not item.confirmed]
         members = {int(i): item.number for item in self.objects for i in item.members}
@@ -324,7 +331,7 @@ class ObjectTracker:
             np.setdiff1d(test.of(Verdict.WRONG), own),
             (ids[order], known[order]),
             members,
-            [(item.number, item.hull(self._window)) for item in self.objects if item.confirmed],
+            self._hulls(by_itself),
         )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
-import cv2
 import gtsam
 import numpy as np
 from scipy.special import chdtri
@@ -290,11 +289,3 @@ class TrackedObject:
         seconds = (stamp_ns - state.stamp_ns) * 1e-9
         here = state.world_T_object
         return gtsam.Pose3(here.rotation(), here.translation() + state.velocity * seconds)
-
-    def hull(self, window: TrackWindow) -> FloatArray:
-        """(N, 2) convex hull of its tracks in the first camera, in pixels."""
-        seen = window.frames[-1].cameras[0]
-        pixels = seen.pixels[np.isin(seen.ids, self.members)]
-        if len(pixels) < 3:
-            return pixels
-        return cv2.convexHull(pixels.astype(np.float32))[:, 0].astype(np.float64)

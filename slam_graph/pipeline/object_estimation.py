@@ -11,7 +11,7 @@ import numpy as np
 
 from slam_graph.backend import Estimator
 from slam_graph.config import load_config
-from slam_graph.datasets import MaskFolder
+from slam_graph.datasets import Masks
 from slam_graph.frontend import Feedback
 from slam_graph.objects import (
     EgoWindow,
@@ -37,9 +37,7 @@ class Objects(NoObjects):
         found: what became of the tracks of the last frame.
     """
 
-    def __init__(
-        self, result: RunResult, estimator: Estimator, masks: MaskFolder | None = None
-    ) -> None:
+    def __init__(self, result: RunResult, estimator: Estimator, masks: Masks | None = None) -> None:
         super().__init__()
         self._masks = masks
         self._estimator = estimator

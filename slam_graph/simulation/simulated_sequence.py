@@ -15,15 +15,16 @@ from typing import ClassVar, Literal
 import gtsam
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.datasets import (
     EurocWriter,
+    Masks,
     ReaderOptions,
     RecordedSequence,
     SequenceInfo,
     TrackRecorder,
-    object_truth_file,
 )
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState, Trajectory
@@ -35,8 +36,9 @@ from slam_graph.simulation.landmarks import Landmarks, MovingBoard, SmoothView
 from slam_graph.simulation.motion import Motion
 from slam_graph.simulation.moving_bodies import LandmarksOnBodies, MovingBody, moving_bodies
 from slam_graph.simulation.path_report import PathReport
-from slam_graph.simulation.rendering import Renderer, paint
+from slam_graph.simulation.rendering import Renderer
 from slam_graph.simulation.simulation_config import SimulationConfig, random_stream
+from slam_graph.simulation.textures import paint
 from slam_graph.simulation.track_simulation import TrackSimulator
 from slam_graph.simulation.world import World
 
@@ -184,7 +186,7 @@ class SimulatedSequence(RecordedSequence):
         notes = {_SETTINGS_FILE: yaml.safe_dump(settings, sort_keys=False)}
         if self.flight.report is not None:
             notes[_PATH_FILE] = json.dumps(self.flight.report.as_dict(), indent=2) + "\n"
-        notes |= object_truth_file(self.object_truth())
+        notes |= self.object_truth_file()
         self._write(Path(path), notes, progress if progress is not None else _ignore)
 
     @abstractmethod
@@ -279,6 +281,14 @@ class SimulatedImages(SimulatedSequence):
         began_ns = int(flight.exposures_ns[0])
         return MovingBoard.ahead_of(config, flight.motion, mounting, began_ns, self.config.seed)
 
+    def masks(self) -> Masks | None:
+        """The rendered label images, if they are wanted."""
+        return RenderedMasks(self) if self.bodies and self.config.objects.masks else None
+
+    def label_image(self, stamp_ns: int) -> NDArray[np.uint16]:
+        """The label image (height, width) of the first camera in a frame."""
+        return self.renderer.labels(self.flight.motion, stamp_ns + self._offset_ns)
+
     def frames(
         self, start_ns: int | None = None, end_ns: int | None = None
     ) -> Generator[CameraFrame, None, None]:
@@ -298,7 +308,27 @@ class SimulatedImages(SimulatedSequence):
                 assert isinstance(packet.frame, CameraFrame)
                 writer.write_imu(packet.imu)
                 writer.write_frame(packet.frame)
+                if self.masks() is not None:
+                    writer.write_mask(
+                        packet.frame.stamp_ns, self.label_image(packet.frame.stamp_ns)
+                    )
                 progress(packet.frame.stamp_ns)
+
+
+class RenderedMasks(Masks):
+    """The masks of a simulation, rendered as they are asked for.
+
+    Args:
+        sequence: the simulation.
+    """
+
+    def __init__(self, sequence: SimulatedImages) -> None:
+        super().__init__()
+        self._sequence = sequence
+
+    def image(self, stamp_ns: int, size: tuple[int, int]) -> NDArray[np.uint16]:
+        """The label image (height, width) of a frame."""
+        return self._sequence.label_image(stamp_ns)
 
 
 def _ignore(stamp_ns: int) -> None:

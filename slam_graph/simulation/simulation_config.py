@@ -203,6 +203,13 @@ class SimulatedObjectsConfig(Settings):
     texel_m: float = expert(0.003, gt=0)
     """Size of a texel, in rendered images."""
 
+    @property
+    def reach_m(self) -> float:
+        """How far from the cameras an object may be; 0 without objects."""
+        if self.count == 0:
+            return 0.0
+        return self.distance_m + self.sway_m + 0.5 * (self.count + 2) * self.size_m
+
 
 class StartConfig(Settings):
     """The start state that comes with the data, and its standard deviations."""

@@ -155,7 +155,9 @@ def _flight(config: SimulationConfig, diagnostics: Diagnostics) -> Flight:
     if config.real_imu:
         motion = recorded = recording.motion(smooth)
         imu = RecordedImu(recording.samples(recorded), recorded)
-    world = room_around(recording.truth.positions, config.landmarks.margin_m)
+    world = room_around(
+        recording.truth.positions, config.landmarks.margin_m, config.objects.reach_m
+    )
     return Flight(rig, motion, imu, world, _exposures(motion, config), recording.report)
 
 
@@ -186,7 +188,7 @@ def _world(config: SimulationConfig, rig: Rig, motion: SplineMotion) -> World:
         return World(())
     if config.world_seed is not None:
         motion = _fly(config, rig, config.world_seed, _DEFAULT_DURATION_S)
-    return room_around(_positions(motion), config.landmarks.margin_m)
+    return room_around(_positions(motion), config.landmarks.margin_m, config.objects.reach_m)
 
 
 def _landmarks(config: SimulationConfig, flight: Flight) -> Landmarks:

@@ -103,9 +103,15 @@ def outer_box(low: FloatArray, high: FloatArray) -> tuple[Panel, ...]:
     )
 
 
-def room_around(positions: FloatArray, margin_m: float) -> World:
-    """An empty room around a trajectory (N, 3)."""
-    margin = np.array([margin_m, margin_m, _HEADROOM_M])
+def room_around(positions: FloatArray, margin_m: float, reach_m: float = 0.0) -> World:
+    """An empty room around a trajectory (N, 3).
+
+    Args:
+        positions: of the trajectory.
+        margin_m: distance of the walls from it.
+        reach_m: how far from it there is something, which walls, floor and ceiling leave room for.
+    """
+    margin = np.maximum([margin_m, margin_m, _HEADROOM_M], reach_m)
     return World(box(positions.min(axis=0) - margin, positions.max(axis=0) + margin))
 
 

@@ -28,6 +28,7 @@ from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.euroc import DEPTH_FOLDER
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.datasets.streams.aiding_files import aiding_texts
+from slam_graph.datasets.streams.mask_images import MASKS
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
@@ -184,6 +185,14 @@ class EurocWriter:
         self._depth_ns = stamp_ns
         folder = self._folder / "mav0" / DEPTH_FOLDER / "data"
         self._write_image(self._depths, folder, sensor.raw(frame.depth), stamp_ns)
+
+    def write_mask(self, stamp_ns: int, labels: NDArray[np.uint16]) -> None:
+        """The label image (height, width) of the first camera in a frame."""
+        Files.make_folder(self._folder / MASKS)
+        good, data = cv2.imencode(".png", labels)
+        assert good
+        with Files.writing(self._path):
+            (self._folder / MASKS / f"{stamp_ns}.png").write_bytes(data.tobytes())
 
     def _write_image(self, index: TextIO, folder: Path, image: NDArray[Any], stamp_ns: int) -> None:
         name = f"{stamp_ns}.png"

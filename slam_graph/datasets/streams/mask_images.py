@@ -32,31 +32,15 @@ _BORDER_PX = 2
 LabelImage = NDArray[np.uint16]
 
 
-class MaskFolder:
-    """Masks by the stamps of frames.
-
-    Args:
-        folder: of label images or boxes.
-
-    Raises:
-        DataError: if there is no such folder, or nothing of this in it, or a file is damaged.
+class Masks:
+    """Masks by the stamps of frames; this base class has none.
 
     Attributes:
         classes: name of the class by label.
     """
 
-    def __init__(self, folder: Path) -> None:
-        if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder of masks")
-        self._folder = folder
-        self._images = {int(p.stem): p for p in folder.glob("*.png") if p.stem.isdigit()}
-        self._boxes = _read_boxes(folder / BOXES) if (folder / BOXES).is_file() else None
-        self.classes = _read_classes(folder / CLASSES) if (folder / CLASSES).is_file() else {}
-        if not self._images and self._boxes is None:
-            raise DataError(
-                f"{folder}: holds neither {BOXES} nor label images named by stamps in ns "
-                "(1403636579763555584.png)"
-            )
+    def __init__(self) -> None:
+        self.classes: dict[int, str] = {}
 
     def labels(self, stamp_ns: int, pixels: FloatArray, size: tuple[int, int]) -> IntArray | None:
         """Labels (N,) of the masks at pixels (N, 2); None for a frame without a mask.
@@ -71,6 +55,36 @@ class MaskFolder:
         """
         image = self.image(stamp_ns, size)
         return None if image is None else sampled(image, pixels)
+
+    def image(self, stamp_ns: int, size: tuple[int, int]) -> LabelImage | None:
+        """The label image (height, width) of a frame; None without one."""
+        return None
+
+
+class MaskFolder(Masks):
+    """Masks in a folder; see the module.
+
+    Args:
+        folder: of label images or boxes.
+
+    Raises:
+        DataError: if there is no such folder, or nothing of this in it, or a file is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder of masks")
+        self._folder = folder
+        self._images = {int(p.stem): p for p in folder.glob("*.png") if p.stem.isdigit()}
+        self._boxes = _read_boxes(folder / BOXES) if (folder / BOXES).is_file() else None
+        if (folder / CLASSES).is_file():
+            self.classes = _read_classes(folder / CLASSES)
+        if not self._images and self._boxes is None:
+            raise DataError(
+                f"{folder}: holds neither {BOXES} nor label images named by stamps in ns "
+                "(1403636579763555584.png)"
+            )
 
     def image(self, stamp_ns: int, size: tuple[int, int]) -> LabelImage | None:
         """The label image (height, width) of a frame; None without one."""
