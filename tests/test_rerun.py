@@ -119,6 +119,23 @@ def test_a_run_has_everything_that_is_promised(watched: tuple[RunResult, Content
     assert found.timelines == TIMELINES
 
 
+def test_objects_have_points_a_trail_and_a_velocity(tmp_path: Path) -> None:
+    sequence = sg.simulate(
+        duration_s=3.0, rate_hz=10.0, tracks={"pixel_sigma": 0.5}, objects={"count": 1}
+    )
+    viewer = RerunRecording("save", "objects", tmp_path / "objects.rrd").viewer()
+    changes = {"objects.enabled": True, "backend.noise.pixel_sigma": 0.5}
+    result = sg.run(sequence, viewer=viewer, overrides={**changes, "final_ba.enabled": False})
+    assert not result.warnings["viewer_failed"]
+    assert result.objects is not None
+    found, number = content(tmp_path / "objects.rrd"), result.objects.numbers[0]
+    frames = len(result.objects.states(number))
+    for part in ("trail", "points", "velocity"):
+        assert found.rows[f"/world/objects/{number}/{part}"] >= frames > 5
+    assert found.rows["/world/body/cam0/objects/regions"] > frames
+    assert found.rows["/world/body/cam0/objects/tracks"] > frames
+
+
 def test_a_path_is_one_entity_with_a_piece_for_each_frame(
     watched: tuple[RunResult, Content],
 ) -> None:

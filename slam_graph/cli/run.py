@@ -133,8 +133,28 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
         yield "map", f"{table['keyframes']} keyframes, {table['features']} features"
     if metrics["localization"]:
         yield "located", _located(metrics["localization"])
+    if metrics["moving_objects"]:
+        yield from _objects(metrics["moving_objects"])
     if metrics["warnings"]:
         yield "warnings", ", ".join(f"{kind} {n}" for kind, n in metrics["warnings"].items())
+
+
+def _objects(table: _Table) -> Iterator[tuple[str, str]]:
+    """How many objects move, and how well that is known."""
+    each = [
+        f"{number} ({row['moving_frames']} of {row['frames']} frames, "
+        f"{row['mean_speed_m_s']:.2f} m/s)"
+        for number, row in table["objects"].items()
+    ]
+    yield "moving", f"{', '.join(each) or 'nothing'}; {table['ms_per_frame']:.1f} ms a frame"
+    errors = table["accuracy"]
+    if errors and errors["steps"]:
+        yield (
+            "their motion",
+            f"median error {errors['median_motion_rotation_deg']:.2f}°, "
+            f"{errors['median_motion_translation_m']:.4f} m a frame, NEES {errors['nees']:.2f} "
+            "where 1 is ideal",
+        )
 
 
 def _final_ba(table: _Table) -> str:

@@ -67,6 +67,7 @@ class ObjectFrame:
         wrong: ids (N,) of features that are neither.
         probabilities: ids (J,) and the probability (J,) that each moves by itself.
         members: number of the object by feature.
+        clouds: (K, 3) points of each object in the world, by its number.
         hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
             camera; with the number 0 around tracks that move and are of no object yet.
     """
@@ -79,6 +80,7 @@ class ObjectFrame:
         default_factory=lambda: (_no_ids(), np.zeros(0))
     )
     members: dict[int, int] = field(default_factory=dict)
+    clouds: dict[int, FloatArray] = field(default_factory=dict)
     hulls: list[tuple[int, FloatArray]] = field(default_factory=list)
 
 
@@ -331,6 +333,7 @@ class ObjectTracker:
             np.setdiff1d(test.of(Verdict.WRONG), own),
             (ids[order], known[order]),
             members,
+            {item.number: item.world_points() for item in self.objects if item.confirmed},
             self._hulls(by_itself),
         )
 

@@ -111,6 +111,13 @@ class TrackedObject:
         _, points = self._motion.points()
         return np.asarray(self._object_T_start.transformFrom(points.T)).T.reshape(-1, 3)
 
+    def world_points(self) -> FloatArray:
+        """(N, 3) its points in the world, where they were in its last frame, m."""
+        points = self.points()
+        if self.state is None or len(points) == 0:
+            return np.zeros((0, 3))
+        return np.asarray(self.state.world_T_object.transformFrom(points.T)).T
+
     def _place(self, ego: EgoMotion) -> None:
         """Choose the frame of the object: axes of the world, origin in the middle of its points."""
         now = ego.stamps_ns[-1]

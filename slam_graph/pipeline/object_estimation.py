@@ -65,7 +65,12 @@ class Objects(NoObjects):
             hulls=tuple((hull, wanted) for _, hull in found.hulls if len(hull) > 2),
         )
 
-    def frame(self, frame: EstimatedFrame) -> None:
+    def noted(self, frame: EstimatedFrame) -> EstimatedFrame:
+        """The frame with the objects in it."""
+        self._estimate(frame)
+        return replace(frame, objects=self.found)
+
+    def _estimate(self, frame: EstimatedFrame) -> None:
         """Estimate the objects in a frame."""
         self.found = ObjectFrame()
         if frame.restarted:

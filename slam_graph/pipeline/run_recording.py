@@ -93,7 +93,6 @@ def run(
     smoothed = result.config.final_ba.enabled
     stages: list[Stage] = [  # in the order in which they finish
         Observers(progress, recorder or NullRecorder()),
-        objects,
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
         Verdict(result, diagnostics, objects),
@@ -111,7 +110,7 @@ def run(
             for stage in stages:
                 stage.begin(resources)
             for tracked in packets:
-                frame = estimation.estimate(tracked)
+                frame = objects.noted(estimation.estimate(tracked))
                 for stage in stages:
                     stage.frame(frame)
                 tracking.give_feedback(objects.feedback(frame.feedback()))

@@ -13,6 +13,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -23,6 +24,9 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.frontend import Feedback
 from slam_graph.geometry import NavState
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
+
+if TYPE_CHECKING:
+    from slam_graph.objects import ObjectFrame
 
 COMPLETED = ("ok", "suspect", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
@@ -52,6 +56,7 @@ class EstimatedFrame:
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
         georeferenced: whether the world of the estimate is that of position fixes.
+        objects: what moves; None where moving objects are not estimated.
     """
 
     packet: Packet
@@ -68,6 +73,7 @@ class EstimatedFrame:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
     georeferenced: bool = False
+    objects: ObjectFrame | None = None
 
     @property
     def image(self) -> np.ndarray | None:
@@ -113,6 +119,10 @@ class NoObjects(Stage):
 
     def __init__(self) -> None:
         self.moved: IntArray = np.zeros(0, np.int64)
+
+    def noted(self, frame: EstimatedFrame) -> EstimatedFrame:
+        """The frame with what was found to move in it."""
+        return frame
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what is known of moving objects."""

@@ -102,6 +102,11 @@ class CameraViews:
             self._stream.log(entity, rr.AnnotationContext(names), static=True)
             self._style(entity)
 
+    @property
+    def first(self) -> tuple[str, int]:
+        """Entity of the first camera, and how many of its pixels are one on the screen."""
+        return self._entity(0), self._shrink[0]
+
     def _style(self, entity: str) -> None:
         """Send once how features look, so that a frame has their places only."""
         points, lines = self._stream.rr.Points2D, self._stream.rr.LineStrips2D

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from slam_graph.backend import Estimator
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
+
+if TYPE_CHECKING:
+    from slam_graph.objects import ObjectFrame
 
 
 class ShownFrame(Protocol):
@@ -57,6 +60,11 @@ class ShownFrame(Protocol):
     @property
     def restarted(self) -> bool:
         """Whether the estimator began anew."""
+        ...
+
+    @property
+    def objects(self) -> ObjectFrame | None:
+        """What moves."""
         ...
 
     @property

@@ -19,6 +19,7 @@ from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
 from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
+from slam_graph.visualization.rerun_objects import ObjectViews
 from slam_graph.visualization.rerun_outcome import (
     KEYFRAME_RADIUS,
     POINT_RADIUS,
@@ -99,6 +100,7 @@ class RerunViewer:
         brief = self._images == "none"
         self._cameras = CameraViews(self._stream, rig, f"{self._world}/body", brief)
         self._cameras.mount(rig)
+        self._objects = ObjectViews(self._stream, self._world, *self._cameras.first)
         self._outcome.style(f"{self._world}/path/causal", CAUSAL)
         for name, radius in {"features": -2.4, "map/points": POINT_RADIUS, "window": -3.0}.items():
             style = rr.Points3D.from_fields(radii=[radius])
@@ -147,6 +149,8 @@ class RerunViewer:
         if isinstance(images, CameraFrame) and self._wants_images(estimator, stamp_ns):
             self._cameras.show_images(images)
         self._cameras.show_tracks(features, frame.rejected, estimator.dynamic)
+        if frame.objects is not None:
+            self._objects.show(frame.objects, features)
         self._steps.add(number, stamp_ns, frame, estimator)
         if frame.state is None:
             return
