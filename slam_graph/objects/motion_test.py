@@ -85,6 +85,13 @@ class MotionTest:
     verdicts: IntArray
     misfits: FloatArray
 
+    @staticmethod
+    def empty() -> MotionTest:
+        """Of no tracks."""
+        none, vectors = np.zeros(0), np.zeros((0, 3))
+        ids = np.zeros(0, np.int64)
+        return MotionTest(ids, vectors, vectors, np.zeros((0, 3, 3)), none, none, ids, none)
+
     def of(self, verdict: Verdict) -> IntArray:
         """Ids (N,) of the tracks with a verdict, ascending."""
         return np.asarray(self.ids[self.verdicts == verdict])
@@ -108,6 +115,8 @@ def judge_tracks(
         backend: thresholds of triangulation.
         config: error rate and speed.
     """
+    if len(obs) == 0:
+        return MotionTest.empty()
     frames = np.array(obs.frames)
     rotations, positions = (a[frames] for a in ego.arrays())
     seconds = ego.seconds[frames]

@@ -203,8 +203,6 @@ class ObjectTracker:
             return _no_ids()
         stamps = list(world.stamps_ns)
         obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
-        if len(obs) == 0:
-            return _no_ids()
         rig, backend = self._window.projection, self._policies[1]
         test = judge_tracks(obs, rig, world, sigma_px, backend, self._config)
         return test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]

@@ -12,6 +12,7 @@ import numpy as np
 from slam_graph.backend import Estimator
 from slam_graph.config import load_config
 from slam_graph.datasets import Masks
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
 from slam_graph.objects import (
     EgoWindow,
@@ -20,7 +21,7 @@ from slam_graph.objects import (
     ObjectTracker,
     merged_frame,
 )
-from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
+from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame
 
@@ -31,13 +32,21 @@ class Objects(NoObjects):
     Args:
         result: of the run; it is given the objects.
         estimator: of the platform.
+        diagnostics: of the run; counts what goes wrong.
         masks: of objects in the images of the first camera; None without.
 
     Attributes:
         found: what became of the tracks of the last frame.
     """
 
-    def __init__(self, result: RunResult, estimator: Estimator, masks: Masks | None = None) -> None:
+    def __init__(
+        self,
+        result: RunResult,
+        estimator: Estimator,
+        diagnostics: Diagnostics,
+        masks: Masks | None = None,
+    ) -> None:
+        self._diagnostics = diagnostics
         super().__init__()
         self._masks = masks
         self._estimator = estimator
@@ -66,26 +75,30 @@ class Objects(NoObjects):
         )
 
     def noted(self, frame: EstimatedFrame) -> EstimatedFrame:
-        """The frame with the objects in it."""
-        self._estimate(frame)
+        """The frame with the objects in it; a failure costs no more than those.
+
+        Raises:
+            DataError: if a mask cannot be read.
+        """
+        self.found = ObjectFrame()
+        features = self._labelled(merged_frame(frame.features, frame.features.moving))
+        with warn_on_failure(self._diagnostics, "objects_failed", "a frame without moving objects"):
+            self._estimate(frame, features)
         return replace(frame, objects=self.found)
 
-    def _estimate(self, frame: EstimatedFrame) -> None:
-        """Estimate the objects in a frame."""
-        self.found = ObjectFrame()
+    def _estimate(self, frame: EstimatedFrame, features: FeatureFrame) -> None:
+        """Estimate the objects in a frame by all of its features."""
         if frame.restarted:
             self._window.forget()
             self._tracker = self._new_tracker(self._result)
         if frame.state is None or frame.waits:
             return
         begin = time.perf_counter()
-        features = frame.features
         ego = self._window.add(features.stamp_ns, frame.state, self._estimator)
         if ego is None:
             return
         sigma_px = self._config.backend.noise.pixel_sigma
-        merged = self._labelled(merged_frame(features, features.moving))
-        self.found = self._tracker.add(merged, ego, sigma_px)
+        self.found = self._tracker.add(features, ego, sigma_px)
         self._estimator.exclude(self.found.moving)
         self.moved = np.union1d(self.moved, self.found.moving)
         self._history.note(self.found.states, self._tracker.objects)

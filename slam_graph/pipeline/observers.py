@@ -151,7 +151,7 @@ class Recorder(Protocol):
         Args:
             imu: the samples since the frame before.
             frame: what the front end found.
-            aiding: position fixes and odometry since the frame before.
+            aiding: position fixes and odometry since the frame before; not given if there are none.
         """
         ...
 
@@ -201,7 +201,11 @@ class Observers(Stage):
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Record and report a frame."""
-        self._recorder.write(frame.packet.imu, frame.features, frame.packet.aiding)
+        packet = frame.packet
+        if packet.aiding is None:
+            self._recorder.write(packet.imu, frame.features)
+        else:
+            self._recorder.write(packet.imu, frame.features, packet.aiding)
         self._progress.advance(frame.features.stamp_ns, frame.initialized)
 
 

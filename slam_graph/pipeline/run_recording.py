@@ -151,7 +151,7 @@ def _objects_stage(sequence: Sequence, result: RunResult, estimator: Estimator) 
     from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
 
     masks = sequence.masks() if isinstance(sequence, RecordedSequence) else None
-    return Objects(result, estimator, masks)
+    return Objects(result, estimator, sequence.diagnostics, masks)
 
 
 def _settings(
