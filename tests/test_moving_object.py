@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam_graph.arrays import BoolArray
 from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.errors import ConfigError
+from slam_graph.frontend import Feedback, FrontendConfig, build_frontend
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
+from slam_graph.sensors import FeatureObservations
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.rendering import cast
@@ -119,6 +122,48 @@ def test_the_object_moves_as_it_is_told(calibration: Path) -> None:
 def test_tracks_have_no_moving_board() -> None:
     with pytest.raises(ConfigError, match="moving_points"):
         simulate(SimulationConfig.model_validate({"moving_object": {}}))
+
+
+def on_board(sequence: SimulatedImages, stamp_ns: int, seen: FeatureObservations) -> BoolArray:
+    """Which features (N,) of the first camera are truly on the board."""
+    flight, board, at = sequence.flight, sequence.board, np.array([stamp_ns])
+    assert board is not None
+    walls = flight.world.panels
+    camera = sequence.rig.cameras[0].body_T_camera.matrix()
+    R = flight.motion.rotations(at).as_matrix()[0]
+    eye = flight.motion.positions(at)[0] + R @ camera[:3, 3]
+    rays = np.column_stack([seen.normalized, np.ones(len(seen))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = (rays @ (R @ camera[:3, :3]).T).astype(np.float32)
+    hit: BoolArray = cast(World((*walls, board.at(stamp_ns))), eye, rays).panel == len(walls)
+    return hit
+
+
+def test_features_that_move_are_followed_apart_and_the_walls_are_not_among_them(
+    calibration: Path,
+) -> None:
+    """The front end is told once, after a second, which of its features are on the board."""
+    sequence = flight(calibration, {})
+    frontend = build_frontend(sequence.rig, FrontendConfig(keep_moving=True))
+    right, moving, walls, walls_moving = 0, 0, 0, 0
+    for k, packet in enumerate(sequence.packets()):
+        frame = frontend.track(packet.frame, packet.imu)
+        static, apart = frame.cameras[0], frame.moving[0]
+        assert not np.isin(apart.ids, static.ids).any()
+        is_static, is_apart = (on_board(sequence, frame.stamp_ns, f) for f in (static, apart))
+        if k == 20:
+            told = static.ids[is_static]
+            assert len(told) > 10
+            frontend.receive_feedback(Feedback(moving=told))
+        if k == 21:
+            assert not np.isin(told, static.ids).any()
+            assert np.isin(told, apart.ids).mean() > 0.8
+        if k > 20:
+            right, moving = right + np.count_nonzero(is_apart), moving + len(apart)
+            walls_moving += np.count_nonzero(~is_apart)
+            walls += np.count_nonzero(~is_static) + np.count_nonzero(~is_apart)
+    assert right > 0.9 * moving
+    assert walls_moving < 0.1 * walls
 
 
 def ate_m(result: RunResult) -> float:

@@ -130,7 +130,9 @@ class CameraTracker:
             good = np.ones(count, np.bool_)
             flow = np.full((count, 2), np.nan)
             if candidates.origins is not None:
-                motions = self._motions(before.select(there), after.select(here))
+                # what moves by itself would spoil the motion of the others
+                rest = ~np.isin(after.ids[here], self._moving.ids)
+                motions = self._motions(before.select(there[rest]), after.select(here[rest]))
                 unrolled = self._predictor.unrolled
                 origins = unrolled(candidates.origins, origins, before.stamp_ns)
                 ends = unrolled(points, normalized, after.stamp_ns)
