@@ -26,14 +26,18 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "stop_and_go": {"objects": {"count": 1, "motion": "stop_and_go"}},
     "three": {"objects": {"count": 3, "motion": "mixed"}},
     "rendered": {"objects": {"count": 1}, "kind": "images"},
+    "masks_three": {"objects": {"count": 3, "motion": "mixed", "masks": True}},
+    "masks_rendered": {"objects": {"count": 1, "masks": True}, "kind": "images"},
 }
 _BARS = {
     "turning": (0.75, 0.015),
     "stop_and_go": (0.75, 0.015),
     "three": (0.75, 0.015),
     "rendered": (0.75, 0.015),
+    "masks_three": (0.5, 0.010),
+    "masks_rendered": (0.5, 0.010),
 }
-"""Largest errors of the motion from frame to frame without masks: deg, m."""
+"""Largest errors of the motion from frame to frame: deg, m."""
 
 
 def measure(_: Path) -> Outcome:

@@ -14,16 +14,14 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from slam_graph.backend import AlgorithmConfig, BackendConfig, FinalBaConfig
+from slam_graph.backend import AlgorithmConfig, BackendConfig, FinalBaConfig, ObjectsConfig
 from slam_graph.errors import ConfigError, closest
 from slam_graph.frontend import FrontendConfig
 from slam_graph.loop_closure import LoopClosureConfig
 from slam_graph.maps import LocalizationConfig, MapConfig
-from slam_graph.objects import ObjectsConfig
 from slam_graph.settings import ConfigTree, Settings, expert
 
 __all__ = [
-    "LimitsConfig",
     "RunConfig",
     "load_config",
 ]

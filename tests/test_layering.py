@@ -18,7 +18,7 @@ LAYERS = (
     {"sensors"},
     {"datasets", "frontend"},
     {"backend"},
-    {"pose_graph", "bundle_adjustment", "simulation", "diagnosis", "objects"},
+    {"pose_graph", "bundle_adjustment", "simulation", "diagnosis"},
     {"loop_closure"},
     {"maps", "evaluation"},
     {"visualization", "config"},

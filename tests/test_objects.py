@@ -5,37 +5,31 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import gtsam
 import numpy as np
 import pytest
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import BackendConfig, Estimator, RigProjection
+from slam_graph.backend.objects.ego_motion import EgoMotion, EgoWindow
+from slam_graph.backend.objects.motion_segmentation import rigid_groups
+from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
+from slam_graph.backend.objects.object_errors import motion_error, object_errors
+from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import RelativeStep
+from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.config import load_config
 from slam_graph.datasets import RecordedSequence, open_dataset
-from slam_graph.datasets.streams.mask_images import MaskFolder
 from slam_graph.datasets.streams.object_truth import (
     OBJECT_TRUTH,
     object_truth_file,
     read_object_truth,
 )
 from slam_graph.errors import DataError
-from slam_graph.evaluation.object_motion import (
-    ObjectStep,
-    detection,
-    motion_error,
-    object_errors,
-)
+from slam_graph.evaluation.detection import detection
 from slam_graph.frontend.moving_tracks import MOST, MovingTracks
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.objects import EgoWindow, ObjectsConfig
-from slam_graph.objects.ego_motion import EgoMotion
-from slam_graph.objects.motion_segmentation import rigid_groups
-from slam_graph.objects.motion_test import MotionTest, Verdict, judge_tracks
-from slam_graph.objects.object_state import ObjectMotion
-from slam_graph.objects.relative_motion import RelativeStep
-from slam_graph.objects.track_window import TrackWindow
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations, Rig
@@ -220,22 +214,29 @@ def test_object_errors_count_switches_and_pose_drift() -> None:
     truth = {1: path_of(stamps, poses)}
     body = path_of(stamps, [gtsam.Pose3()] * 10)
     offset = drawn_pose(rng, 0.3)
-    steps = [
-        ObjectStep(
+    states = [
+        seen_at(
             int(stamps[k]),
-            int(stamps[k - 1]),
             4 if k < 6 else 5,
             poses[k].compose(offset),
-            poses[k - 1].compose(offset).between(poses[k].compose(offset)),
-            np.eye(6),
-            gtsam.Pose3(),
+            int(stamps[k - 1]),
+            poses[k - 1].compose(offset),
         )
         for k in range(1, 10)
     ]
-    found = object_errors(steps, truth, body)
+    found = object_errors(states, truth, body)
     assert found.switches == 1
     np.testing.assert_allclose(found.tangents, 0.0, atol=1e-9)
     np.testing.assert_allclose(found.poses, 0.0, atol=1e-6)
+
+
+def seen_at(
+    stamp_ns: int, number: int, pose: gtsam.Pose3, before_ns: int, before: gtsam.Pose3
+) -> ObjectState:
+    step = ObjectMotion(before_ns, stamp_ns, before.between(pose), np.eye(6))
+    return ObjectState(
+        stamp_ns, number, 0, pose, np.eye(6), gtsam.Pose3(), step, np.zeros(3), np.eye(3), True, 20
+    )
 
 
 def path_of(stamps: Any, poses: list[gtsam.Pose3]) -> Trajectory:
@@ -391,74 +392,6 @@ def test_the_window_of_the_platform_forgets_the_first_pose() -> None:
     assert last is not None
     assert len(last.stamps_ns) == 6, "half a second at 10 Hz"
     assert np.all(np.linalg.eigvalsh(last.velocity_covariance) > 0)
-
-
-# --- masks ---------------------------------------------------------------------------------------
-
-
-def masked(folder: Path) -> MaskFolder:
-    labels = np.zeros((40, 60), np.uint16)
-    labels[10:30, 20:40] = 7
-    folder.mkdir()
-    cv2.imwrite(str(folder / "100.png"), labels)
-    (folder / "boxes.csv").write_text("#stamp,label,l,t,r,b\n200,3,20,10,39,29\n")
-    (folder / "classes.csv").write_text("7,car\n")
-    return MaskFolder(folder)
-
-
-def test_masks_are_read_as_images_and_as_boxes(tmp_path: Path) -> None:
-    masks = masked(tmp_path / "masks")
-    pixels = np.array([[30.0, 20.0], [5.0, 5.0], [20.0, 20.0], [39.6, 20.0]])
-    found = [masks.labels(stamp, pixels, (60, 40)) for stamp in (100, 200)]
-    assert [labels.tolist() for labels in found if labels is not None] == [
-        [7, 0, 0, 0],
-        [3, 0, 0, 0],
-    ], "at a border a feature may be on either side"
-    assert masks.labels(300, pixels, (60, 40)) is None
-    assert masks.classes == {7: "car"}
-
-
-def test_what_is_wrong_with_masks_is_said(tmp_path: Path) -> None:
-    masks = masked(tmp_path / "masks")
-    with pytest.raises(DataError, match=r"100\.png: a label image has one channel.*30 x 40"):
-        masks.image(100, (30, 40))
-    with pytest.raises(DataError, match="no such folder of masks"):
-        MaskFolder(tmp_path / "none")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="holds neither"):
-        MaskFolder(tmp_path / "empty")
-    (tmp_path / "masks" / "classes.csv").write_text("car,7\n")
-    with pytest.raises(DataError, match=r"classes\.csv:1: expected a label"):
-        MaskFolder(tmp_path / "masks")
-
-
-def test_masks_keep_three_objects_apart() -> None:
-    result = estimated(flight(count=3, motion="mixed", masks=True))
-    found = result.metrics["moving_objects"]
-    assert found["accuracy"]["identity_switches"] == 0
-    assert found["accuracy"]["median_motion_translation_m"] < 0.012
-    assert {row["label"] for row in found["objects"].values()} == {1, 2, 3}
-    assert len(found["objects"]) == 3
-
-
-def test_rendered_objects_come_with_masks_and_true_poses(tmp_path: Path) -> None:
-    objects = {"count": 1, "masks": True}
-    sequence = simulate(kind="images", duration_s=0.5, rate_hz=4.0, objects=objects)
-    sequence.save(tmp_path / "flight")
-    read = open_dataset(tmp_path / "flight")
-    assert isinstance(read, RecordedSequence)
-    masks, truth = read.masks(), read.object_truth()[1]
-    assert masks is not None
-    camera = sequence.rig.cameras[0]
-    size = camera.camera.width, camera.camera.height
-    for stamp_ns, middle in zip(truth.stamps_ns.tolist(), truth.positions, strict=True):
-        image = masks.image(stamp_ns, size)
-        assert image is not None
-        assert set(np.unique(image)) == {0, 1}
-        body = sequence.groundtruth().at(stamp_ns)
-        local = body.compose(camera.body_T_camera).transformTo(middle)
-        u, v = camera.camera.distort(local[None, :2] / local[2])[0][0]
-        assert image[round(v), round(u)] == 1, "the middle of a box is behind its face"
 
 
 def test_images_of_a_rendered_object_show_its_motion() -> None:

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam_graph.config import LimitsConfig, load_config
+from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
@@ -160,9 +160,9 @@ def state(**changes: Any) -> NavState:
     ],
 )
 def test_states_that_cannot_be_true_are_refused(changes: dict[str, Any], message: str) -> None:
-    check_sane(state(), LimitsConfig())
+    check_sane(state(), RunConfig())
     with pytest.raises(DivergenceError, match=message):
-        check_sane(state(**changes), LimitsConfig())
+        check_sane(state(**changes), RunConfig())
 
 
 def test_the_velocity_of_a_truth_without_one_comes_from_its_positions() -> None:

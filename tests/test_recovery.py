@@ -15,7 +15,7 @@ from slam_graph.backend.initialization.segment_joint import moved
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
-from slam_graph.config import LimitsConfig
+from slam_graph.config import RunConfig
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
@@ -161,8 +161,7 @@ def test_without_recovery_a_run_ends_where_it_is_lost() -> None:
 
 
 def test_images_agreed_until_the_rejections_began() -> None:
-    limits = LimitsConfig()
-    agreement, step_ns = Agreement(limits), 10**8
+    agreement, step_ns = Agreement(RunConfig()), 10**8
     assert agreement.agreed_until() is None
     for k in range(55):
         agreement.check(k * step_ns, Innovations(tested=10, rejected=0 if k < 40 else 10))
@@ -173,7 +172,7 @@ def test_images_agreed_until_the_rejections_began() -> None:
 
 def test_agreement_is_remembered_however_slowly_it_is_lost() -> None:
     """A share between good and lost over a long time: what was good before it stays known."""
-    agreement, step_ns = Agreement(LimitsConfig()), 10**8
+    agreement, step_ns = Agreement(RunConfig()), 10**8
     for k in range(1200):
         rejected = 0 if k < 1000 else 4
         agreement.check(k * step_ns, Innovations(tested=10, rejected=rejected))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.config import LimitsConfig, load_config
+from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.pipeline.run_recording import run
 from slam_graph.pipeline.supervision import Agreement, DivergenceError, check_sane
@@ -22,7 +22,7 @@ from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
 
-LIMITS = LimitsConfig()
+CONFIG = RunConfig()
 
 
 def flight(seed: int, trajectory: str = "figure8") -> SimulatedSequence:
@@ -110,8 +110,8 @@ def innovations(rejected: int) -> Innovations:
 
 
 def test_most_must_be_rejected_for_some_time() -> None:
-    agreement = Agreement(LIMITS)
-    frames = round(LIMITS.disagreement_s * 10.0)
+    agreement = Agreement(CONFIG)
+    frames = round(CONFIG.limits.disagreement_s * 10.0)
     rejected = [5] * (4 * frames) + [10] * (frames // 6) + [0] * frames
     for k, count in enumerate(rejected):
         agreement.check(k * 10**8, innovations(count))
@@ -126,7 +126,7 @@ def test_most_must_be_rejected_for_some_time() -> None:
 
 def test_a_pause_gives_no_time() -> None:
     """What is rejected right after a long one does not end a run at once."""
-    agreement = Agreement(LIMITS)
+    agreement = Agreement(CONFIG)
     agreement.check(0, innovations(0))
     for k in range(5):
         agreement.check(60 * 10**9 + k * 10**8, innovations(10))
@@ -136,7 +136,7 @@ def test_a_pause_gives_no_time() -> None:
 def test_a_bias_that_no_sensor_has_is_not_sane(part: str) -> None:
     zeros = {name: np.zeros(3) for name in ("velocity", "accel_bias", "gyro_bias")}
     state = NavState(0, gtsam.Pose3(), **zeros)
-    check_sane(state, LIMITS)
+    check_sane(state, CONFIG)
     changed: dict[str, Any] = {part: np.array([0.0, -4.0, 0.0])}
     with pytest.raises(DivergenceError, match=r"bias of 4"):
-        check_sane(replace(state, **changed), LIMITS)
+        check_sane(replace(state, **changed), CONFIG)

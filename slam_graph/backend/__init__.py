@@ -14,14 +14,14 @@ __all__ = [
     "BackendConfig",
     "Estimator",
     "FeaturePolicy",
-    "FeatureTracks",
     "FinalBa",
     "FinalBaConfig",
     "FrameLog",
     "GainRatioDamping",
-    "Geometry",
     "Innovations",
-    "Observations",
+    "MovingObjects",
+    "ObjectFrame",
+    "ObjectsConfig",
     "PoseSelection",
     "RigProjection",
     "RobustLoss",
@@ -29,16 +29,14 @@ __all__ = [
     "WindowGraph",
     "adjust_worlds",
     "levenberg_marquardt",
-    "triangulate",
     "triangulate_frames",
     "visual_rotation",
 ]
 
 if TYPE_CHECKING:
     from slam_graph.backend.backend_config import BackendConfig
-    from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
     from slam_graph.backend.cost.gating import Innovations
-    from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+    from slam_graph.backend.cost.reprojection import RigProjection
     from slam_graph.backend.cost.robust_loss import RobustLoss
     from slam_graph.backend.cost.selection_policies import (
         FEATURE_POLICIES,
@@ -46,9 +44,12 @@ if TYPE_CHECKING:
         FeaturePolicy,
         PoseSelection,
     )
-    from slam_graph.backend.cost.triangulation import triangulate, triangulate_frames
+    from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
+    from slam_graph.backend.objects.moving_objects import MovingObjects
+    from slam_graph.backend.objects.object_tracker import ObjectFrame
+    from slam_graph.backend.objects.objects_config import ObjectsConfig
     from slam_graph.backend.policies import AlgorithmConfig
     from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_worlds
     from slam_graph.backend.smoothing.frame_log import FrameLog
@@ -65,9 +66,8 @@ else:
         __name__,
         {
             "backend_config": ("BackendConfig",),
-            "cost.feature_tracks": ("FeatureTracks", "Observations"),
             "cost.gating": ("Innovations",),
-            "cost.reprojection": ("Geometry", "RigProjection"),
+            "cost.reprojection": ("RigProjection",),
             "cost.robust_loss": ("RobustLoss",),
             "cost.selection_policies": (
                 "FEATURE_POLICIES",
@@ -75,9 +75,12 @@ else:
                 "FeaturePolicy",
                 "PoseSelection",
             ),
-            "cost.triangulation": ("triangulate", "triangulate_frames"),
+            "cost.triangulation": ("triangulate_frames",),
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),
+            "objects.moving_objects": ("MovingObjects",),
+            "objects.object_tracker": ("ObjectFrame",),
+            "objects.objects_config": ("ObjectsConfig",),
             "policies": ("AlgorithmConfig",),
             "smoothing.final_adjustment": (
                 "FinalBa",

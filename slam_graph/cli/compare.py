@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -20,9 +20,6 @@ from slam_graph.cli.options import (
     TlsKey,
     tls_files,
 )
-
-if TYPE_CHECKING:
-    from slam_graph.experiment import Comparison
 
 
 def compare(
@@ -120,8 +117,12 @@ def compare(
         files = [str(file) for file in comparison.files]
         echo_json({"rows": comparison.rows, "failures": comparison.failures, "files": files})
     else:
-        _echo(comparison)
-    _raise_failures(comparison)
+        _echo(comparison.table)
+        if comparison.skipped:
+            typer.echo(f"\n{comparison.skipped} tasks had been done before")
+        typer.echo(f"\n{comparison.folder}/")
+        typer.echo("  " + " ".join(file.name for file in comparison.files))
+    _raise_failures(comparison.failures)
 
 
 def _truths(texts: list[str]) -> dict[str, str]:
@@ -158,17 +159,13 @@ _MEANING = (
 )
 
 
-def _echo(comparison: Comparison) -> None:
-    """Print a table for each data set, and the names of the files."""
-    titles, *rows = comparison.table
+def _echo(table: list[tuple[str, ...]]) -> None:
+    """Print a table for each data set, of rows under a row of titles."""
+    titles, *rows = table
     names = list(dict.fromkeys(row[0] for row in rows))
     for name in names:
         shown = _informative([titles, *(row for row in rows if row[0] == name)])
         echo_rich_table(shown[0], shown[1:], name, caption=_MEANING if name == names[-1] else "")
-    if comparison.skipped:
-        typer.echo(f"\n{comparison.skipped} tasks had been done before")
-    typer.echo(f"\n{comparison.folder}/")
-    typer.echo("  " + " ".join(file.name for file in comparison.files))
 
 
 def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
@@ -181,12 +178,10 @@ def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
     return list(zip(*columns, strict=True))
 
 
-def _raise_failures(comparison: Comparison) -> None:
+def _raise_failures(failures: dict[str, str]) -> None:
     """Exit with code 1 if a task failed; a run that diverged is a result."""
     from slam_graph.errors import DataError
 
-    if comparison.failures:
-        name, reason = next(iter(comparison.failures.items()))
-        raise DataError(
-            f"{len(comparison.failures)} tasks could not be done; the first: {name}: {reason}"
-        )
+    if failures:
+        name, reason = next(iter(failures.items()))
+        raise DataError(f"{len(failures)} tasks could not be done; the first: {name}: {reason}")

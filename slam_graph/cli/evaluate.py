@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +13,6 @@ from slam_graph.cli.console import echo_json, echo_table
 from slam_graph.cli.options import Json
 
 if TYPE_CHECKING:
-    from slam_graph.evaluation import ErrorSeries
     from slam_graph.geometry import AlignmentMode, Trajectory
 
 _Align = Literal["none", "yaw", "se3", "sim3"]
@@ -68,7 +66,7 @@ def ape(
     mode = _alignment(align_se3, correct_scale, align)
     truth, guess = _read(reference), _read(estimate)
     result = absolute_pose_error(truth, guess, relation, mode, _pairing(t_max_diff), t_max_diff)
-    _report("APE", result, relation, mode, {}, as_json)
+    _report("APE", result.table(), relation, mode, {}, as_json)
 
 
 def rpe(
@@ -120,7 +118,7 @@ def rpe(
         "delta_unit": result.step_unit,
         "all_pairs": all_pairs,
     }
-    _report("RPE", result, relation, mode, steps, as_json)
+    _report("RPE", result.table(), relation, mode, steps, as_json)
 
 
 def _alignment(align_se3: bool, correct_scale: bool, align: _Align | None) -> AlignmentMode:
@@ -148,25 +146,17 @@ def _read(path: Path) -> Trajectory:
 
 def _report(
     metric: str,
-    result: ErrorSeries,
+    errors: dict[str, Any],
     relation: _PoseRelation,
     mode: AlignmentMode,
     steps: dict[str, Any],
     as_json: bool,
 ) -> None:
-    """Print statistics."""
-    statistics = asdict(result.statistics)
-    unit = result.unit
+    """Print errors (`ErrorSeries.table`)."""
+    unit, statistics = errors["unit"], errors["statistics"]
     if as_json:
-        scale = result.similarity.scale
-        about: dict[str, Any] = {
-            "metric": metric.lower(),
-            "relation": relation,
-            "unit": unit,
-            "alignment": mode,
-        }
-        about |= {"scale": scale, "poses": result.poses, "errors": len(result.values), **steps}
-        echo_json({**about, "statistics": statistics})
+        about = {"metric": metric.lower(), "relation": relation, "unit": unit, "alignment": mode}
+        echo_json({**about, **errors, **steps, "statistics": statistics})
         return
     step = ""
     if steps:
@@ -174,6 +164,6 @@ def _report(
         step = f", {pairs} of {steps['delta']:g} {steps['delta_unit']}"
     typer.echo(
         f"{metric} {relation}{f' [{unit}]' if unit else ''}{step}, alignment: {mode}, "
-        f"{result.poses} shared poses, {len(result.values)} errors"
+        f"{errors['poses']} shared poses, {errors['errors']} errors"
     )
     echo_table(((name, f"{statistics[name]:.6f}") for name in _STATISTICS), indent="  ")

@@ -13,7 +13,6 @@ __all__ = [
     "DATASETS",
     "EurocWriter",
     "Format",
-    "Masks",
     "ReaderOptions",
     "RecordedSequence",
     "Rows",
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
     from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence, Sequence, SequenceInfo
     from slam_graph.datasets.streams.csv_rows import Rows
-    from slam_graph.datasets.streams.mask_images import Masks
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -57,6 +55,5 @@ else:
             "memory_sequence": ("dataset_from_arrays",),
             "sequence": ("ReaderOptions", "RecordedSequence", "Sequence", "SequenceInfo"),
             "streams.csv_rows": ("Rows",),
-            "streams.mask_images": ("Masks",),
         },
     )

@@ -23,14 +23,9 @@ from slam_graph.datasets.groundtruth import (
     read_groundtruth,
     resolve_groundtruth,
 )
+from slam_graph.datasets.object_sources import ObjectSources
 from slam_graph.datasets.packets import packetize, packetize_alone
 from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
-from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, Masks
-from slam_graph.datasets.streams.object_truth import (
-    OBJECT_TRUTH,
-    object_truth_file,
-    read_object_truth,
-)
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory
@@ -144,7 +139,7 @@ class ReaderOptions:
         return rig if self.cameras is None else rig.select(self.cameras)
 
 
-class RecordedSequence(Displayed, ABC):
+class RecordedSequence(ObjectSources, Displayed, ABC):
     """Base class of readers: the part of the `Sequence` protocol that is the same in all formats.
 
     A reader is a subclass whose constructor takes a path and `ReaderOptions`.
@@ -194,36 +189,6 @@ class RecordedSequence(Displayed, ABC):
         if isinstance(source, Path):
             self.groundtruth_path = resolve_groundtruth(source)
             check_groundtruth(self.groundtruth_path)
-
-    def object_truth(self) -> dict[int, Trajectory]:
-        """True poses of moving objects by their numbers, at the stamps of frames; none if unknown.
-
-        Raises:
-            DataError: if `objects_truth.csv` cannot be read.
-        """
-        path = getattr(self, "path", None)
-        for folder in () if path is None else (path, path.parent):
-            if (folder / OBJECT_TRUTH).is_file():
-                return read_object_truth(folder / OBJECT_TRUTH)
-        return {}
-
-    def object_truth_file(self) -> dict[str, str]:
-        """Name and text of a file with these poses; empty without any."""
-        return object_truth_file(self.object_truth())
-
-    def masks(self) -> Masks | None:
-        """Masks of objects: those that were named, or the folder `masks` beside the recording.
-
-        Raises:
-            DataError: if they cannot be read.
-        """
-        if MASKS in self.named_aiding:
-            return MaskFolder(Path(self.named_aiding[MASKS]))
-        path = getattr(self, "path", None)
-        for folder in () if path is None else (path, path.parent):
-            if (folder / MASKS).is_dir():
-                return MaskFolder(folder / MASKS)
-        return None
 
     def __repr__(self) -> str:
         info = self.info()

@@ -18,7 +18,7 @@ the numbers are evo's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -99,6 +99,16 @@ class ErrorSeries(Displayed):
             f"{name} {getattr(self.statistics, name):.4g}" for name in ("rmse", "mean", "max")
         )
         return f"ErrorSeries({len(self)} errors{f' [{self.unit}]' * bool(self.unit)}: {parts})"
+
+    def table(self) -> dict[str, Any]:
+        """Unit, scale of the alignment, numbers of poses and errors, and statistics."""
+        return {
+            "unit": self.unit,
+            "scale": self.similarity.scale,
+            "poses": self.poses,
+            "errors": len(self.values),
+            "statistics": asdict(self.statistics),
+        }
 
     def _facts(self) -> dict[str, object]:
         unit = f" {self.unit}" if self.unit else ""

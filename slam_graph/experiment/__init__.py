@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from slam_graph.lazy import lazy_exports
 
 __all__ = [
-    "Comparison",
     "FrontendReport",
     "batch",
     "compare",
@@ -21,7 +20,6 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.experiment.batch_run import batch
     from slam_graph.experiment.comparison import compare
-    from slam_graph.experiment.comparison_plan import Comparison
     from slam_graph.experiment.frontend_comparison import FrontendReport
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -29,7 +27,6 @@ else:
         {
             "batch_run": ("batch",),
             "comparison": ("compare",),
-            "comparison_plan": ("Comparison",),
             "frontend_comparison": ("FrontendReport",),
         },
     )

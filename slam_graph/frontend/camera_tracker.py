@@ -120,6 +120,8 @@ class CameraTracker:
             next_id: id of the first new feature.
         """
         here, there = after.common(before)
+        rest = ~np.isin(after.ids[here], self._moving.ids)  # others would spoil the motion of these
+        here, there = here[rest], there[rest]
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
             candidates = self._associator.propose(before, after, verify)
@@ -130,9 +132,7 @@ class CameraTracker:
             good = np.ones(count, np.bool_)
             flow = np.full((count, 2), np.nan)
             if candidates.origins is not None:
-                # what moves by itself would spoil the motion of the others
-                rest = ~np.isin(after.ids[here], self._moving.ids)
-                motions = self._motions(before.select(there[rest]), after.select(here[rest]))
+                motions = self._motions(before.select(there), after.select(here))
                 unrolled = self._predictor.unrolled
                 origins = unrolled(candidates.origins, origins, before.stamp_ns)
                 ends = unrolled(points, normalized, after.stamp_ns)

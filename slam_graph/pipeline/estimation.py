@@ -212,7 +212,7 @@ class Estimation:
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
         if state is not None:
-            check_sane(state, result.config.limits)
+            check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)

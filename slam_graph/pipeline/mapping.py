@@ -23,7 +23,7 @@ from slam_graph.loop_closure import Keyframe, KeyframeDescriber, KeyframeLog, Lo
 from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
-from slam_graph.results import LocalizationLog, RunInput, RunResult
+from slam_graph.results import RunInput, RunResult
 from slam_graph.sensors import FeatureFrame
 
 NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
@@ -223,7 +223,7 @@ class Localization(Stage):
         self._describer = KeyframeDescriber(camera, loops.keyframes.further_corners)
         self._localizer = self._new_localizer()
         self._name, self._diagnostics = result.input.info.name, diagnostics
-        self._log = result.localization = LocalizationLog(known)
+        self._log = result.begin_localization(known)
 
     def _new_localizer(self) -> MapLocalizer:
         config = self._result.config

@@ -4,23 +4,16 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
 
-from slam_graph.backend import Estimator
+from slam_graph.arrays import IntArray
+from slam_graph.backend import Estimator, MovingObjects, ObjectFrame
 from slam_graph.config import load_config
-from slam_graph.datasets import Masks
+from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
-from slam_graph.objects import (
-    EgoWindow,
-    ObjectFrame,
-    ObjectHistory,
-    ObjectTracker,
-    merged_frame,
-)
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame
@@ -33,7 +26,7 @@ class Objects(NoObjects):
         result: of the run; it is given the objects.
         estimator: of the platform.
         diagnostics: of the run; counts what goes wrong.
-        masks: of objects in the images of the first camera; None without.
+        masks: a recording that has some; None without.
 
     Attributes:
         found: what became of the tracks of the last frame.
@@ -44,34 +37,31 @@ class Objects(NoObjects):
         result: RunResult,
         estimator: Estimator,
         diagnostics: Diagnostics,
-        masks: Masks | None = None,
+        masks: RecordedSequence | None = None,
     ) -> None:
-        self._diagnostics = diagnostics
         super().__init__()
-        self._masks = masks
-        self._estimator = estimator
-        classes = {} if masks is None else masks.classes
-        self._history = result.objects = ObjectHistory(classes=dict(classes))
-        self._config = result.config
-        self._window = EgoWindow(result.config.objects.window_s)
-        self._tracker = self._new_tracker(result)
-        self._result = result
-        self.found = ObjectFrame()
-
-    def _new_tracker(self, result: RunResult) -> ObjectTracker:
         config = result.config
-        policies = load_config(config.objects.algorithm).algorithm
-        return ObjectTracker(result.causal_rig, policies, config.backend, config.objects)
+        self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
+        self._labels = None if masks is None else LabelsOverTime(masks)
+        self._wanted = config.objects.features
+        self._objects = result.objects = MovingObjects(
+            result.causal_rig,
+            load_config(config.objects.algorithm).algorithm,
+            config.backend,
+            config.objects,
+            {} if masks is None else masks.mask_classes,
+        )
+        self.found = ObjectFrame()
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what moves and where objects want more features."""
-        found, wanted = self.found, self._config.objects.features
+        found = self.found
         return replace(
             feedback,
             moving=found.moving,
             static=found.static,
             wrong=found.wrong,
-            hulls=tuple((hull, wanted) for _, hull in found.hulls if len(hull) > 2),
+            hulls=tuple((hull, self._wanted) for _, hull in found.hulls if len(hull) > 2),
         )
 
     def noted(self, frame: EstimatedFrame) -> EstimatedFrame:
@@ -81,36 +71,58 @@ class Objects(NoObjects):
             DataError: if a mask cannot be read.
         """
         self.found = ObjectFrame()
-        features = self._labelled(merged_frame(frame.features, frame.features.moving))
-        with warn_on_failure(self._diagnostics, "objects_failed", "a frame without moving objects"):
-            self._estimate(frame, features)
+        features = frame.features.whole
+        if self._labels is not None:
+            features = self._labels.labelled(features)
+        if frame.restarted:
+            self._objects.begin(self._result.causal_rig)
+        if frame.state is not None and not frame.waits:
+            with warn_on_failure(
+                self._diagnostics, "objects_failed", "a frame without moving objects"
+            ):
+                self.found = self._objects.take(features, frame.state, self._estimator)
+        self.moved = np.union1d(self.moved, self.found.moving)
         return replace(frame, objects=self.found)
 
-    def _estimate(self, frame: EstimatedFrame, features: FeatureFrame) -> None:
-        """Estimate the objects in a frame by all of its features."""
-        if frame.restarted:
-            self._window.forget()
-            self._tracker = self._new_tracker(self._result)
-        if frame.state is None or frame.waits:
-            return
-        begin = time.perf_counter()
-        ego = self._window.add(features.stamp_ns, frame.state, self._estimator)
-        if ego is None:
-            return
-        sigma_px = self._config.backend.noise.pixel_sigma
-        self.found = self._tracker.add(features, ego, sigma_px)
-        self._estimator.exclude(self.found.moving)
-        self.moved = np.union1d(self.moved, self.found.moving)
-        self._history.note(self.found.states, self._tracker.objects)
-        self._history.milliseconds += 1e3 * (time.perf_counter() - begin)
-        self._history.frames += 1
+    def finish(self) -> None:
+        """Say so if no mask belongs to any frame."""
+        if self._labels is not None and self._labels.frames == 0:
+            self._diagnostics.warn(
+                "masks_unused",
+                f"none of the {self._labels.masks} masks has the time of a frame: they are named "
+                "by the stamps of frames of the first camera, in ns",
+            )
 
-    def _labelled(self, frame: FeatureFrame) -> FeatureFrame:
-        """The frame with the labels of the masks in which the first camera sees its features."""
-        if self._masks is None:
-            return frame
-        seen, camera = frame.cameras[0], self._result.rig.cameras[0].camera
-        labels = self._masks.labels(frame.stamp_ns, seen.pixels, (camera.width, camera.height))
-        if labels is None:
-            return frame
+
+class LabelsOverTime:
+    """Labels of tracks: of the masks of a frame, or of the last ones where a frame has none.
+
+    Args:
+        recording: that has masks.
+
+    Attributes:
+        masks: number of all masks.
+        frames: number of frames with a mask so far.
+    """
+
+    def __init__(self, recording: RecordedSequence) -> None:
+        self._recording = recording
+        self.masks, self.frames = recording.masks, 0
+        self._known: dict[int, int] = {}
+
+    def labelled(self, frame: FeatureFrame) -> FeatureFrame:
+        """The frame with the labels of its features in the first camera.
+
+        Raises:
+            DataError: if a mask cannot be read.
+        """
+        seen = frame.cameras[0]
+        found = self._recording.labels(frame.stamp_ns, seen)
+        self.frames += found is not None
+        labels = self._before(seen.ids) if found is None else found
+        self._known = dict(zip(seen.ids.tolist(), labels.tolist(), strict=True))
         return replace(frame, cameras=(replace(seen, labels=labels), *frame.cameras[1:]))
+
+    def _before(self, ids: IntArray) -> IntArray:
+        """Labels (N,) that tracks (N,) had in the frame before; 0 for new ones."""
+        return np.array([self._known.get(number, 0) for number in ids.tolist()], np.int64)

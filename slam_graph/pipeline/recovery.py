@@ -42,7 +42,7 @@ class Recovery:
 
     def __init__(self, result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> None:
         self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
-        self._agreement = Agreement(result.config.limits)
+        self._agreement = Agreement(result.config)
         self._recent: deque[NavState] = deque()
         self._short = 0
 
@@ -71,7 +71,7 @@ class Recovery:
         segments.forget_last()
         since_ns = segments[-1].end_ns + 1 if len(segments) else None
         self._result.forget_states(since_ns)
-        self._agreement = Agreement(self._result.config.limits)
+        self._agreement = Agreement(self._result.config)
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
         self.append(states)
 
@@ -114,7 +114,7 @@ class Recovery:
         self._short = self._short + 1 if lasted_s < _SHORT_S else 0
         if self._short >= _MOST_SHORT:
             raise lost
-        self._agreement = Agreement(result.config.limits)
+        self._agreement = Agreement(result.config)
         self._estimator.begin_segment(before)
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
 

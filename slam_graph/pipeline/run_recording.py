@@ -95,6 +95,7 @@ def run(
         Observers(progress, recorder or NullRecorder()),
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
         *places,
+        objects,
         Verdict(result, diagnostics, objects),
         GraphKeeping(result, estimator, graph_times, diagnostics),
         *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),
@@ -150,7 +151,7 @@ def _objects_stage(sequence: Sequence, result: RunResult, estimator: Estimator) 
         return NoObjects()
     from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
 
-    masks = sequence.masks() if isinstance(sequence, RecordedSequence) else None
+    masks = sequence if isinstance(sequence, RecordedSequence) and sequence.masks else None
     return Objects(result, estimator, sequence.diagnostics, masks)
 
 

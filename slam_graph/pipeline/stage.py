@@ -26,7 +26,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 if TYPE_CHECKING:
-    from slam_graph.objects import ObjectFrame
+    from slam_graph.backend import ObjectFrame
 
 COMPLETED = ("ok", "suspect", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.backend import Estimator, Innovations
-from slam_graph.config import LimitsConfig
+from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.geometry import NavState
 from slam_graph.pipeline.stage import COMPLETED, Stage
@@ -36,12 +36,13 @@ class DivergenceError(EstimationError):
     """The estimate is beyond what is physically possible, or contradicts the images."""
 
 
-def check_sane(state: NavState, limits: LimitsConfig) -> None:
+def check_sane(state: NavState, config: RunConfig) -> None:
     """Refuse a state that cannot be true.
 
     Raises:
         DivergenceError: naming what is beyond its limit.
     """
+    limits = config.limits
     variances = np.zeros(15) if state.covariance is None else np.diag(state.covariance)
     pose, biases = state.world_T_body.matrix().ravel(), (state.gyro_bias, state.accel_bias)
     if not np.isfinite(np.concatenate([pose, state.velocity, *biases, variances])).all():
@@ -91,8 +92,8 @@ class Agreement:
     a pause, such as blank images, an estimate has time to recover.
     """
 
-    def __init__(self, limits: LimitsConfig) -> None:
-        self._limits = limits
+    def __init__(self, config: RunConfig) -> None:
+        self._limits = config.limits
         self._tests: deque[_Test] = deque()
         self._tested_s = 0.0
         self._last_ns: int | None = None

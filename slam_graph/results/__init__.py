@@ -8,7 +8,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "BalResult",
-    "LocalizationLog",
     "PoseGraphResult",
     "ResultFolder",
     "RunInput",
@@ -22,7 +21,6 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.results.localization_result import LocalizationLog
     from slam_graph.results.map_output import export_map, load_map, save_map
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
     from slam_graph.results.result_files import ResultFolder
@@ -34,7 +32,6 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "localization_result": ("LocalizationLog",),
             "map_output": (
                 "export_map",
                 "load_map",

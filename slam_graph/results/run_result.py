@@ -39,10 +39,9 @@ from slam_graph.results.segments import Segments
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
-    from slam_graph.backend import FinalBa, WindowGraph
+    from slam_graph.backend import FinalBa, MovingObjects, WindowGraph
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
-    from slam_graph.objects import ObjectHistory
 
 _TRUTH_MARGIN_NS = 1_000_000_000
 """Ground truth is kept from this long before the part that was run to this long after it."""
@@ -87,7 +86,7 @@ class RunResult(RunSummary):
     loops: LoopClosures | None = None
     slam_map: SlamMap | None = None
     localization: LocalizationLog | None = None
-    objects: ObjectHistory | None = None
+    objects: MovingObjects | None = None
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
@@ -96,6 +95,11 @@ class RunResult(RunSummary):
             f"RunResult({self.input.info.name}, {self.config.algorithm.name}: {self.status}, "
             f"{len(self.history)} states of {self.logs.frames} frames)"
         )
+
+    def begin_localization(self, known: SlamMap) -> LocalizationLog:
+        """Poses in a map are looked for, too: the table that they go in."""
+        self.localization = LocalizationLog(known)
+        return self.localization
 
     def forget_states(self, since_ns: int | None) -> None:
         """Take back the states from a time on, and what was logged of them.

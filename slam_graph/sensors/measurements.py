@@ -154,6 +154,16 @@ class FeatureObservations:
         """No features."""
         return FeatureObservations(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
 
+    def joined(self, other: FeatureObservations) -> FeatureObservations:
+        """These and others of the same image, without descriptors and depths."""
+        labels = [seen.labels for seen in (self, other) if seen.labels is not None]
+        return FeatureObservations(
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.normalized, other.normalized]),
+            labels=np.concatenate(labels) if len(labels) == 2 else None,
+        )
+
     def select(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
         return FeatureObservations(
@@ -185,6 +195,14 @@ class FeatureFrame:
     cameras: tuple[FeatureObservations, ...]
     outliers: tuple[FeatureObservations, ...] = ()
     moving: tuple[FeatureObservations, ...] = ()
+
+    @property
+    def whole(self) -> FeatureFrame:
+        """The frame with the features that move by themselves among the others."""
+        if not self.moving:
+            return self
+        pairs = zip(self.cameras, self.moving, strict=True)
+        return FeatureFrame(self.stamp_ns, tuple(static.joined(moving) for static, moving in pairs))
 
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from slam_graph.arrays import IntArray
 from slam_graph.datasets import (
     EurocWriter,
-    Masks,
     ReaderOptions,
     RecordedSequence,
     SequenceInfo,
@@ -281,12 +280,16 @@ class SimulatedImages(SimulatedSequence):
         began_ns = int(flight.exposures_ns[0])
         return MovingBoard.ahead_of(config, flight.motion, mounting, began_ns, self.config.seed)
 
-    def masks(self) -> Masks | None:
-        """The rendered label images, if they are wanted."""
-        return RenderedMasks(self) if self.bodies and self.config.objects.masks else None
+    @property
+    def masks(self) -> int:
+        """Number of label images: one for each frame, if they are wanted."""
+        wanted = bool(self.bodies) and self.config.objects.masks
+        return len(self.flight.exposures_ns) if wanted else 0
 
-    def label_image(self, stamp_ns: int) -> NDArray[np.uint16]:
-        """The label image (height, width) of the first camera in a frame."""
+    def label_image(self, stamp_ns: int) -> NDArray[np.uint16] | None:
+        """The label image (height, width) of the first camera in a frame, rendered."""
+        if self.masks == 0:
+            return None
         return self.renderer.labels(self.flight.motion, stamp_ns + self._offset_ns)
 
     def frames(
@@ -308,27 +311,10 @@ class SimulatedImages(SimulatedSequence):
                 assert isinstance(packet.frame, CameraFrame)
                 writer.write_imu(packet.imu)
                 writer.write_frame(packet.frame)
-                if self.masks() is not None:
-                    writer.write_mask(
-                        packet.frame.stamp_ns, self.label_image(packet.frame.stamp_ns)
-                    )
+                labels = self.label_image(packet.frame.stamp_ns)
+                if labels is not None:
+                    writer.write_mask(packet.frame.stamp_ns, labels)
                 progress(packet.frame.stamp_ns)
-
-
-class RenderedMasks(Masks):
-    """The masks of a simulation, rendered as they are asked for.
-
-    Args:
-        sequence: the simulation.
-    """
-
-    def __init__(self, sequence: SimulatedImages) -> None:
-        super().__init__()
-        self._sequence = sequence
-
-    def image(self, stamp_ns: int, size: tuple[int, int]) -> NDArray[np.uint16]:
-        """The label image (height, width) of a frame."""
-        return self._sequence.label_image(stamp_ns)
 
 
 def _ignore(stamp_ns: int) -> None:

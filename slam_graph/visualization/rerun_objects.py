@@ -23,7 +23,7 @@ from slam_graph.visualization.rerun_palette import (
 from slam_graph.visualization.rerun_stream import RerunStream
 
 if TYPE_CHECKING:
-    from slam_graph.objects import ObjectFrame
+    from slam_graph.backend import ObjectFrame
 
 _OBJECTS = (ORANGE, PURPLE, YELLOW, VERMILLION, BLUE)
 """Colours of objects: not those of the path and of the features in the state."""

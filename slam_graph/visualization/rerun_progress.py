@@ -16,7 +16,7 @@ from slam_graph.sensors import FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 
 if TYPE_CHECKING:
-    from slam_graph.objects import ObjectFrame
+    from slam_graph.backend import ObjectFrame
 
 
 class ShownFrame(Protocol):

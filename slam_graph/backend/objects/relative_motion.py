@@ -22,11 +22,13 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import AlgorithmConfig, BackendConfig, Estimator
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
-from slam_graph.objects.ego_motion import EgoMotion
-from slam_graph.objects.objects_config import ObjectsConfig
 from slam_graph.sensors import FeatureFrame, Rig
 
 

@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend import Estimator
+from slam_graph.backend.estimator import Estimator
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuData

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.objects.relative_motion import RelativeStep
+from slam_graph.backend.objects.relative_motion import RelativeStep
 
 
 @dataclass(frozen=True, eq=False)

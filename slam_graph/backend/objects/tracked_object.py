@@ -12,12 +12,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import AlgorithmConfig, BackendConfig
-from slam_graph.objects.ego_motion import EgoMotion
-from slam_graph.objects.object_state import ObjectMotion, ObjectState
-from slam_graph.objects.objects_config import ObjectsConfig
-from slam_graph.objects.relative_motion import RelativeMotion
-from slam_graph.objects.track_window import TrackWindow
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import RelativeMotion
+from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.policies import AlgorithmConfig
 
 _MAX_REJECTIONS = 2
 """A track that the gate rejects so often within the frames of the window is not of the object."""

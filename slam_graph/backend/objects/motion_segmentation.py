@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend import triangulate_frames
+from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.sensors import FeatureFrame, Rig
 
 _SAMPLE = 7

@@ -17,18 +17,19 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import AlgorithmConfig, BackendConfig
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.motion_segmentation import rigid_groups
+from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
+from slam_graph.backend.objects.object_regions import region, regions_of_motion
+from slam_graph.backend.objects.object_state import ObjectState
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.track_labels import TrackLabels
+from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.objects.tracked_object import TrackedObject
+from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.errors import EstimationError
-from slam_graph.objects.ego_motion import EgoMotion
-from slam_graph.objects.motion_segmentation import rigid_groups
-from slam_graph.objects.motion_test import MotionTest, Verdict, judge_tracks
-from slam_graph.objects.object_regions import region, regions_of_motion
-from slam_graph.objects.object_state import ObjectState
-from slam_graph.objects.objects_config import ObjectsConfig
-from slam_graph.objects.track_labels import TrackLabels
-from slam_graph.objects.track_window import TrackWindow
-from slam_graph.objects.tracked_object import TrackedObject
-from slam_graph.sensors import FeatureFrame, FeatureObservations, Rig
+from slam_graph.sensors import FeatureFrame, Rig
 
 _LEAST_FRAMES = 3
 """Frames of a track before it is tested."""
@@ -353,22 +354,3 @@ def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> Float
     result = np.full(len(ids), np.inf)
     result[np.isin(ids, found)] = values
     return result
-
-
-def merged_frame(frame: FeatureFrame, moving: tuple[FeatureObservations, ...]) -> FeatureFrame:
-    """A frame with the features that the front end keeps apart because they move."""
-    if not moving:
-        return frame
-    cameras = tuple(_joined(a, b) for a, b in zip(frame.cameras, moving, strict=True))
-    return FeatureFrame(frame.stamp_ns, cameras)
-
-
-def _joined(a: FeatureObservations, b: FeatureObservations) -> FeatureObservations:
-    return FeatureObservations(
-        np.concatenate([a.ids, b.ids]),
-        np.concatenate([a.pixels, b.pixels]),
-        np.concatenate([a.normalized, b.normalized]),
-        labels=None
-        if a.labels is None or b.labels is None
-        else np.concatenate([a.labels, b.labels]),
-    )

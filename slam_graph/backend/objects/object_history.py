@@ -4,42 +4,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.objects.object_errors import ObjectErrors, object_errors
+from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.object_table import csv_lines
+from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.geometry import Trajectory
-from slam_graph.objects.object_state import ObjectMotion, ObjectState
-from slam_graph.objects.tracked_object import TrackedObject
 
 
-@dataclass(eq=False)
 class ObjectHistory:
     """States of the objects of a run, as they were estimated frame by frame.
 
+    Args:
+        classes: name of the class by label, where masks have labels.
+
     Attributes:
+        classes: the same.
         points: (N, 3) by the number of an object: its points, in its own frame, m.
-        classes: name of the class by label, where the masks have one.
         milliseconds: time that the objects took, of all frames with a state.
         frames: number of these frames.
     """
 
-    points: dict[int, FloatArray] = field(default_factory=dict)
-    classes: dict[int, str] = field(default_factory=dict)
-    milliseconds: float = 0.0
-    frames: int = 0
-    _states: dict[int, list[ObjectState]] = field(default_factory=dict)
+    def __init__(self, classes: Mapping[int, str]) -> None:
+        self.classes = classes
+        self.points: dict[int, FloatArray] = {}
+        self.milliseconds, self.frames = 0.0, 0
+        self._states: dict[int, list[ObjectState]] = {}
 
     def __len__(self) -> int:
         return len(self._states)
 
     def __repr__(self) -> str:
         states = sum(map(len, self._states.values()))
-        return f"ObjectHistory({len(self)} objects, {states} states)"
+        return f"{type(self).__name__}({len(self)} objects, {states} states)"
 
     @property
     def numbers(self) -> list[int]:
@@ -75,6 +78,19 @@ class ObjectHistory:
             [state.world_T_object for state in states],
             np.array([state.velocity for state in states]),
         )
+
+    def csv_lines(self) -> Iterator[str]:
+        """`objects.csv`: a row for each object and frame."""
+        return csv_lines(self.all_states(), self.classes)
+
+    def errors(self, truth: Mapping[int, Trajectory], true_body: Trajectory) -> ObjectErrors:
+        """Errors against true poses.
+
+        Args:
+            truth: of objects by their numbers, at the stamps of the frames.
+            true_body: of the platform, on the clock of the cameras.
+        """
+        return object_errors(self.all_states(), truth, true_body)
 
     def label(self, number: int) -> int:
         """Label of the mask of an object; 0 without one."""

@@ -10,14 +10,11 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import (
-    BackendConfig,
-    FeatureTracks,
-    Observations,
-    RigProjection,
-    triangulate,
-)
-from slam_graph.objects.ego_motion import pose_arrays
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.objects.ego_motion import pose_arrays
 from slam_graph.sensors import FeatureFrame, Rig
 
 

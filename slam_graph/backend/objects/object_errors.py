@@ -13,34 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.geometry import Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectStep:
-    """An object as it was estimated at one frame.
-
-    Attributes:
-        stamp_ns, before_ns: times of this frame and of the one before.
-        number: of the object.
-        world_T_object: its pose.
-        motion: before_T_now of its own frame.
-        covariance: (6, 6) of the tangent of the motion.
-        world_T_body: the platform then.
-    """
-
-    stamp_ns: int
-    before_ns: int
-    number: int
-    world_T_object: gtsam.Pose3
-    motion: gtsam.Pose3
-    covariance: FloatArray
-    world_T_body: gtsam.Pose3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +36,7 @@ class ObjectErrors:
         switches: number of times that a true object went on under another number.
     """
 
-    truth: FloatArray
+    truth: IntArray
     tangents: FloatArray
     nees: FloatArray
     poses: FloatArray
@@ -94,7 +74,7 @@ def motion_error(before: gtsam.Pose3, now: gtsam.Pose3, world_motion: gtsam.Pose
 
 
 def object_errors(
-    steps: Sequence[ObjectStep],
+    states: Sequence[ObjectState],
     truth: Mapping[int, Trajectory],
     true_body: Trajectory,
     max_distance_m: float = 2.0,
@@ -102,56 +82,58 @@ def object_errors(
     """Errors of all steps whose object belongs to a true one.
 
     Args:
-        steps: of all objects, in the order of time.
+        states: of all objects, in the order of time.
         truth: poses of the true objects by their numbers, at the stamps of the frames.
         true_body: true poses of the platform.
         max_distance_m: farthest middle of the true object that an estimated one belongs to.
     """
-    rows: list[tuple[int, ObjectStep, FloatArray, float]] = []
+    rows: list[tuple[int, FloatArray, float]] = []
     poses: list[tuple[float, float]] = []
+    seen: list[tuple[int, int, int]] = []
     offsets: dict[tuple[int, int], gtsam.Pose3] = {}
     placed = [
-        (step, true_body.at(step.stamp_ns).compose(step.world_T_body.inverse())) for step in steps
+        (state, true_body.at(state.stamp_ns).compose(state.world_T_body.inverse()))
+        for state in states
     ]
     belongs = _matched(placed, truth, max_distance_m)
-    for step, aligned in placed:
-        number = belongs.get(step.number)
-        if number is None or not _known(truth[number], step):
+    for state, aligned in placed:
+        number, step = belongs.get(state.number), state.step
+        if number is None or step is None or not _known(truth[number], step):
             continue
-        here = aligned.compose(step.world_T_object)
-        before, now = (truth[number].at(stamp) for stamp in (step.before_ns, step.stamp_ns))
+        here = aligned.compose(state.world_T_object)
+        before, now = (truth[number].at(stamp) for stamp in (step.before_ns, step.now_ns))
         was = here.compose(step.motion.inverse())
         tangent = gtsam.Pose3.Logmap(motion_error(before, now, here.compose(was.inverse())))
         adjoint = before.inverse().compose(was).AdjointMap()
         covariance = adjoint @ step.covariance @ adjoint.T
-        nees = float(tangent @ np.linalg.solve(covariance, tangent)) / 6.0
-        rows.append((number, step, tangent, nees))
-        offset = offsets.setdefault((step.number, number), here.between(now))
+        rows.append((number, tangent, float(tangent @ np.linalg.solve(covariance, tangent)) / 6.0))
+        seen.append((state.stamp_ns, number, state.number))
+        offset = offsets.setdefault((state.number, number), here.between(now))
         error = now.between(here.compose(offset))
         turn = float(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))
         poses.append((turn, float(np.linalg.norm(error.translation()))))
     return ObjectErrors(
-        np.array([number for number, _, _, _ in rows], np.float64),
-        np.array([tangent for _, _, tangent, _ in rows]).reshape(-1, 6),
-        np.array([nees for _, _, _, nees in rows]),
+        np.array([number for number, _, _ in rows], np.int64),
+        np.array([tangent for _, tangent, _ in rows]).reshape(-1, 6),
+        np.array([nees for _, _, nees in rows]),
         np.array(poses).reshape(-1, 2),
-        _switches([(number, step.number) for number, step, _, _ in rows]),
+        _switches(seen),
     )
 
 
 def _matched(
-    placed: Sequence[tuple[ObjectStep, gtsam.Pose3]],
+    placed: Sequence[tuple[ObjectState, gtsam.Pose3]],
     truth: Mapping[int, Trajectory],
     max_distance_m: float,
 ) -> dict[int, int]:
     """The true object of each estimated one: the one that is nearest over all of its steps."""
     distances: dict[int, dict[int, list[float]]] = {}
-    for step, aligned in placed:
-        middle = aligned.compose(step.world_T_object).translation()
+    for state, aligned in placed:
+        middle = aligned.compose(state.world_T_object).translation()
         for number, path in truth.items():
-            if _known(path, step):
-                away = float(np.linalg.norm(path.at(step.stamp_ns).translation() - middle))
-                distances.setdefault(step.number, {}).setdefault(number, []).append(away)
+            if state.step is not None and _known(path, state.step):
+                away = float(np.linalg.norm(path.at(state.stamp_ns).translation() - middle))
+                distances.setdefault(state.number, {}).setdefault(number, []).append(away)
     found = {}
     for estimated, others in distances.items():
         mean, number = min((float(np.mean(away)), number) for number, away in others.items())
@@ -160,63 +142,24 @@ def _matched(
     return found
 
 
-def _known(path: Trajectory, step: ObjectStep) -> bool:
+def _known(path: Trajectory, step: ObjectMotion) -> bool:
     """Whether a true object is known at both times of a step."""
-    return bool(path.stamps_ns[0] <= step.before_ns and step.stamp_ns <= path.stamps_ns[-1])
+    return bool(path.stamps_ns[0] <= step.before_ns and step.now_ns <= path.stamps_ns[-1])
 
 
-def _switches(pairs: Sequence[tuple[int, int]]) -> int:
-    """How often a true object is next seen under another number than its own so far.
-
-    Args:
-        pairs: numbers of the true and of the estimated object, in the order of time.
-    """
-    last: dict[int, int] = {}
-    switches = 0
-    for true, estimated in pairs:
-        switches += last.get(true, estimated) != estimated
-        last[true] = estimated
-    return switches
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """How well moving features are told from static ones.
-
-    Attributes:
-        precision: share of those called moving that move.
-        recall: share of those that move that are called so.
-        false_positives, true_positives: (K,) the curve (ROC), from no to all features.
-        area: under the curve; one half is chance.
-    """
-
-    precision: float
-    recall: float
-    false_positives: FloatArray
-    true_positives: FloatArray
-    area: float
-
-
-def detection(probabilities: FloatArray, moving: BoolArray, limit: float = 0.5) -> Detection:
-    """Compare probabilities (N,) that features move with the truth (N,).
+def _switches(seen: Sequence[tuple[int, int, int]]) -> int:
+    """How often a true object goes on under none of the numbers that it had in its last frame.
 
     Args:
-        probabilities: of moving.
-        moving: whether they do.
-        limit: probability from which a feature is called moving.
+        seen: stamp, and numbers of the true and of the estimated object, in the order of time.
     """
-    called = probabilities >= limit
-    hits = int(np.count_nonzero(called & moving))
-    count = max(int(np.count_nonzero(moving)), 1), max(int(np.count_nonzero(~moving)), 1)
-    order = np.argsort(-probabilities, kind="stable")
-    true = np.concatenate([[0.0], np.cumsum(moving[order]) / count[0]])
-    false = np.concatenate([[0.0], np.cumsum(~moving[order]) / count[1]])
-    return Detection(
-        hits / max(int(np.count_nonzero(called)), 1),
-        hits / count[0],
-        false,
-        true,
-        float(np.trapezoid(true, false)),
+    frames: dict[int, dict[int, set[int]]] = {}
+    for stamp_ns, true, estimated in seen:
+        frames.setdefault(true, {}).setdefault(stamp_ns, set()).add(estimated)
+    return sum(
+        not before & now
+        for numbers in frames.values()
+        for before, now in pairwise(numbers.values())
     )
 
 

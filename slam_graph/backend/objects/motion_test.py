@@ -23,9 +23,12 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import BackendConfig, Geometry, Observations, RigProjection, triangulate
-from slam_graph.objects.ego_motion import EgoMotion
-from slam_graph.objects.objects_config import ObjectsConfig
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.objects_config import ObjectsConfig
 
 _STEPS = 4
 """Gauss-Newton steps for position and velocity."""

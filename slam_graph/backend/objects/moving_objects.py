@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Moving objects of a run: estimated frame by frame beside the platform, and what was found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.objects.ego_motion import EgoWindow
+from slam_graph.backend.objects.object_history import ObjectHistory
+from slam_graph.backend.objects.object_tracker import ObjectFrame, ObjectTracker
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, Rig
+
+
+class MovingObjects(ObjectHistory):
+    """Estimates moving objects, and keeps their states.
+
+    Args:
+        rig: the cameras.
+        policies: of the estimators of objects.
+        backend: settings of the estimator of the platform.
+        config: of objects.
+        classes: name of the class by label, where masks have labels.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        policies: AlgorithmConfig,
+        backend: BackendConfig,
+        config: ObjectsConfig,
+        classes: Mapping[int, str],
+    ) -> None:
+        super().__init__(classes)
+        self._settings = policies, backend, config
+        self._sigma_px = backend.noise.pixel_sigma
+        self.begin(rig)
+
+    def begin(self, rig: Rig) -> None:
+        """Begin without objects: the world is another one from now on; states so far stay."""
+        config = self._settings[2]
+        self._window = EgoWindow(config.window_s)
+        self._tracker = ObjectTracker(rig, *self._settings)
+
+    def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
+        """Take a frame, and leave what moves out of the estimate of the platform.
+
+        Args:
+            frame: all features, those that move among them, with labels where there are masks.
+            state: of the platform then.
+            estimator: of the platform, after the frame.
+        """
+        began = time.perf_counter()
+        ego = self._window.add(frame.stamp_ns, state, estimator)
+        if ego is None:
+            return ObjectFrame()
+        found = self._tracker.add(frame, ego, self._sigma_px)
+        estimator.exclude(found.moving)
+        self.note(found.states, self._tracker.objects)
+        self.milliseconds += 1e3 * (time.perf_counter() - began)
+        self.frames += 1
+        return found
