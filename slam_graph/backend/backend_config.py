@@ -239,6 +239,10 @@ class DynamicsConfig(Settings):
     slow platforms."""
     angular_accel_density: float = expert(4.0, gt=0)
     """The same for the angular acceleration, rad/s²/√Hz."""
+    median_depth: float = expert(4.0, gt=0)
+    """The unit of length of one camera without an IMU, which measures none: the features that both
+    views of its start see have this median depth. If it is near the true one, in metres, densities
+    and other settings in metres mean what they say."""
     min_points: int = expert(10, ge=4)
     """Fewest points of a known depth that tell the motion between two images."""
     start_at_images: bool = expert(default=True)

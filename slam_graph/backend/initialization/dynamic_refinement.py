@@ -72,13 +72,13 @@ ROUGH_SCALE_SIGMA = 0.5
 _HOPELESS = 4.0
 """A guess whose scale is so many times less well known than accepted is not refined. Of 20 guesses
 that led to a start, none was above 1 (V1_02, V2_01, room1, right and wrong calibrations)."""
-_MAX_STEP_LEFT = 0.3
+MAX_STEP_LEFT = 0.3
 """Longest accepted step that is left at the end, in σ: with more the steps have not converged."""
 _BEST_FEATURES = 0.1
 """Quantile of the features' relative distance errors that is taken for the error of the scale."""
 
 
-class _BatchCost(Cost):
+class BatchCost(Cost):
     """The cost of a window whose features outside the state follow the poses."""
 
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
@@ -158,19 +158,17 @@ class DynamicRefinement:
         if self._context.algorithm.marginalization.first_estimates:
             points = "first"
         prior = marginalize(posterior, cost.state, keep, points)
-        # the first state that is reported defines the world, not that where the window began
-        sigmas = MOTION_PRIOR.position_m, MOTION_PRIOR.yaw_rad
         start = Window(
             last,
             frames.stamps_ns[-1],
             cost.state,
-            relative_to(prior, cost.state, X(last), sigmas),
+            self._in_gauge(prior, cost.state, last, features),
             state_features=features,
             calibration=calibration,
         )
         return self._doubt(_normalized_cost(cost, linear), start) or start
 
-    def _hopeless(self, cost: _BatchCost, linear: Linearization, static: int) -> Refusal | None:
+    def _hopeless(self, cost: BatchCost, linear: Linearization, static: int) -> Refusal | None:
         """What is missing if the guess already shows that no start will come of it.
 
         The steps cost many times as much as this, and are many where the scale is not determined.
@@ -188,6 +186,22 @@ class DynamicRefinement:
             return Refusal("motion", needs)
         return None
 
+    def _in_gauge(
+        self, prior: SquareRootInformation, state: State, last: int, features: IntArray
+    ) -> SquareRootInformation:
+        """The prior of a start, with what nothing measures taken for known.
+
+        The first state that is reported defines the world, not that where the window began.
+
+        Args:
+            prior: over offsets from the linearisation points.
+            state: the variables.
+            last: index of the frame that is reported first.
+            features: ids (N,) of the features in the state.
+        """
+        sigmas = MOTION_PRIOR.position_m, MOTION_PRIOR.yaw_rad
+        return relative_to(prior, state, X(last), sigmas)
+
     def _doubt(self, normalized_cost: float, start: Window) -> Refusal | None:
         """What is missing if a solution cannot be trusted; None if it can.
 
@@ -196,7 +210,7 @@ class DynamicRefinement:
             start: the window that would begin.
         """
         last = start.prior.marginal(imu_state_keys(start.frame))
-        if not np.linalg.norm(last.d) < _MAX_STEP_LEFT:
+        if not np.linalg.norm(last.d) < MAX_STEP_LEFT:
             return Refusal("fit", "steps that converge")
         if normalized_cost > MAX_NORMALIZED_COST:
             needs = f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
@@ -211,14 +225,27 @@ class DynamicRefinement:
             return Refusal("motion", needs)
         return None
 
-    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> _BatchCost:
+    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> BatchCost:
         """All states of the window, a prior on the first, and the static features they see."""
         context = self._context
         state = State()
-        factors: list[gtsam.NonlinearFactor] = []
         for k, nav in enumerate(guess.states):
             state.insert_imu_state(k, nav)
-        start = guess.states[0]
+        factors = self._factors(frames, guess)
+        known = context.calibration.enter(state, SquareRootInformation.empty())
+        for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
+            context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
+        loss = RobustLoss(context.config.gating.robust_loss)
+        cost = BatchCost(state, context.projection, context.config, known, factors, loss=loss)
+        obs = _lasting(frames)
+        result = cost.triangulated(obs)
+        _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
+        return cost
+
+    def _factors(self, frames: StartFrames, guess: StartGuess) -> list[gtsam.NonlinearFactor]:
+        """The dynamics from frame to frame, and a prior on the first state."""
+        context, start = self._context, guess.states[0]
+        factors: list[gtsam.NonlinearFactor] = []
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         noise = context.propagation.noise
         blocks = frames.imu_between(context.imu)
@@ -227,24 +254,14 @@ class DynamicRefinement:
             params = noise.params(least_factor=_WHITE_NOISE_FACTOR, change=change)
             factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
         first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
-        first = fix_gauge(first, MOTION_PRIOR)
-        factors += _prior_factors(first)
-        known = context.calibration.enter(state, SquareRootInformation.empty())
-        for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
-            context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
-        loss = RobustLoss(context.config.gating.robust_loss)
-        cost = _BatchCost(state, context.projection, context.config, known, factors, loss=loss)
-        obs = _lasting(frames)
-        result = cost.triangulated(obs)
-        _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
-        return cost
+        return factors + prior_factors(fix_gauge(first, MOTION_PRIOR))
 
     def _refine_motions(self, cost: Cost, frames: StartFrames) -> None:
         """Take the velocities of the solution for the motion between rows of rolling shutters."""
         for k, stamp_ns in enumerate(frames.stamps_ns):
             self._context.calibration.refine_motion(cost.state, k, stamp_ns, self._context.imu)
 
-    def _remove_outliers(self, cost: _BatchCost, frames: StartFrames) -> tuple[int, int]:
+    def _remove_outliers(self, cost: BatchCost, frames: StartFrames) -> tuple[int, int]:
         """Triangulate all features again and keep those that fit; their number, and that of all.
 
         Features that the guess took for dynamic count too: a motion that only few features support
@@ -284,7 +301,7 @@ def _set_features(cost: Cost, obs: Observations, result: Triangulation, good: Bo
     cost.tracks = TrackFeatures(obs, result.points, nothing).subset(chosen)
 
 
-def _prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:
+def prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:
     """The prior on frame 0 as factors, so that it is linearised at every step."""
     assert first.covariance is not None
     x, v, b = imu_state_keys(0)

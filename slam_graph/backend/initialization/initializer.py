@@ -44,7 +44,10 @@ class Initializer:
     Attributes:
         scale_sigma: relative standard deviation of the scale of a start in motion; None before it,
             and for a start from standstill.
+        leaves_frame: whether the start has not used the features of its last frame.
     """
+
+    leaves_frame = False
 
     def __init__(
         self, context: EngineContext, mode: str, unknown_scale: UnknownScale | None = None

@@ -9,6 +9,7 @@ import numpy as np
 from slam_graph.arrays import IntArray
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.initializer import Initializer
+from slam_graph.backend.initialization.monocular_start import MonocularStart
 from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
 from slam_graph.backend.initialization.start_review import StartReview
 from slam_graph.backend.initialization.visual_start import VisualStart
@@ -39,7 +40,8 @@ class StartUp:
         self.doubtful = False
         self._context, self._before = context, before
         self._inertial = Initializer(context, mode) if context.rig.has_imu else None
-        self._visual = VisualStart(context)
+        alone = len(context.rig.cameras) == 1
+        self._visual = MonocularStart(context) if alone else VisualStart(context)
         self._review: StartReview | None = None
 
     def try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
@@ -59,7 +61,7 @@ class StartUp:
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
             self.doubtful = True
         window = self._placed(window)
-        if self._inertial is None:  # whose start does not use the features of this frame
+        if search.leaves_frame:
             self._context.add_observations(window, frame)
         return window
 

@@ -33,7 +33,10 @@ class VisualStart:
 
     Attributes:
         outliers: ids (N,) of the features that did not fit it, ascending.
+        leaves_frame: whether the start has not used the features of its last frame.
     """
+
+    leaves_frame = True
 
     def __init__(self, context: EngineContext) -> None:
         self.outliers: IntArray = np.zeros(0, np.int64)
