@@ -171,6 +171,11 @@ class Rig:
         return any(mounted.readout_s != 0.0 for mounted in self.cameras)
 
     @property
+    def has_scale(self) -> bool:
+        """Whether anything measures lengths: an IMU, a second camera, or depth."""
+        return self.has_imu or len(self.cameras) > 1 or self.depth is not None
+
+    @property
     def pose_offset_s(self) -> float:
         """Time of the pose of a frame, on the clock of the IMU, since the frame's stamp.
 

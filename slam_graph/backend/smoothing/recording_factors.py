@@ -119,6 +119,8 @@ _ANCHOR_SIGMA = 1e-3
 """Prior on position (m) and yaw (rad) of the anchor, which are unobservable: it fixes the gauge."""
 DEFINED_SIGMA = 1e-5
 """The same where position and yaw of the anchor define the world."""
+_SCALE_SIGMA = 1e-4
+"""Relative standard deviation of the scale where it is a convention: it fixes the gauge, too."""
 _UNKNOWN_TILT_RAD = 10.0
 """Prior on roll and pitch of the anchor, which gravity determines: none."""
 _UNKNOWN_GAUGE = 1e3
@@ -204,7 +206,23 @@ class RecordingFactors:
         return [
             self.gauge(values, _ANCHOR_SIGMA),
             gtsam.PriorFactorConstantBias(B(0), bias, loose),
+            *self._scale(values),
         ]
+
+    def _scale(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
+        """What holds the scale where nothing measures it: how far away one keyframe is."""
+        if self._rig.has_scale:
+            return []
+        centre = values.atPose3(X(self._anchor)).translation()
+        poses = [values.atPose3(X(k)) for k in range(len(self._segment.keyframes))]
+        away = [pose.translation() - centre for pose in poses]
+        k = int(np.argmax(np.linalg.norm(away, axis=1)))
+        sigma = _SCALE_SIGMA * float(np.linalg.norm(away[k]))
+        toward = poses[k].rotation().unrotate(away[k] / np.linalg.norm(away[k]))
+        information = np.eye(6) / _UNKNOWN_GAUGE**2
+        information[3:, 3:] += np.outer(toward, toward) / sigma**2
+        noise = gtsam.noiseModel.Gaussian.Information(information)
+        return [gtsam.PriorFactorPose3(X(k), poses[k], noise)]
 
     def learn_noise(
         self,
