@@ -19,6 +19,7 @@ from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.gtsam_smoothers.smoother_features import (
     NewObservations,
     SmootherFeatures,
+    features_given_pose,
     joint_prior,
 )
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
@@ -90,6 +91,8 @@ class SmootherEngine:
     ) -> NavState:
         """Predict the state, and add it to the graph if it is time for one."""
         propagation = self._context.propagation
+        if self._solver is None and not self._context.rig.has_scale:
+            self._begin_with_features(window)
         with report.timed("propagation"):
             ahead = Window(window.frame, window.stamp_ns, window.state.copy(), window.prior)
             corrected = self._context.by_images(frame, lambda: self.landmarks(window))
@@ -196,6 +199,17 @@ class SmootherEngine:
         values = _values_of(window.state, window.frame)
         solver.update([prior], values, dict.fromkeys(keys, self._seconds(window.stamp_ns)))
         return solver
+
+    def _begin_with_features(self, window: Window) -> None:
+        """Begin with the features of the start, too: nothing else tells the scale."""
+        ids = window.state_features[: self._policy.max_features]
+        self._solver = self._begin(window)
+        factors = features_given_pose(window.prior, window.state.first, ids, X(window.frame))
+        for j in ids.tolist():
+            self._estimate.insert(L(j), window.state.estimate.atPoint3(L(j)))
+        stamps = {L(j): self._seconds(window.stamp_ns) for j in ids.tolist()}
+        self._solver.update(factors, self._estimate, stamps)
+        self._features.active = ids
 
     # --- the result ------------------------------------------------------------------------------
 

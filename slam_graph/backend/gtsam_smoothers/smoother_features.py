@@ -111,6 +111,27 @@ def joint_prior(prior: SquareRootInformation, at: gtsam.Values) -> gtsam.Nonline
     return gtsam.LinearContainerFactor(gaussian, at)
 
 
+def features_given_pose(
+    prior: SquareRootInformation, at: gtsam.Values, ids: IntArray, pose: int
+) -> list[gtsam.NonlinearFactor]:
+    """What is known of features given a pose, as a factor for each; what they share is left out.
+
+    Args:
+        prior: ‖R δ - d‖² on the features, the pose and others.
+        at: the linearisation point, at which δ is zero.
+        ids: (N,) of the features.
+        pose: key of the pose.
+    """
+    factors = []
+    for j in ids.tolist():
+        known = prior.marginal([L(j), pose])
+        of_point, of_pose = (known.layout.columns[key] for key in (L(j), pose))
+        R, noise = known.R[:3], gtsam.noiseModel.Unit.Create(3)
+        rows = gtsam.JacobianFactor(L(j), R[:, of_point], pose, R[:, of_pose], known.d[:3], noise)
+        factors.append(gtsam.LinearContainerFactor(rows, at))
+    return factors
+
+
 _GATE_SCALE = 4.0
 """The gate knows the covariance of the pose only, not of the feature: it is this much wider."""
 OUTLIER_SIGMAS = 3.0
