@@ -114,6 +114,8 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
             f"{extent['estimated_frames']} frames, {extent['coverage']:.1%} of the time, "
             f"from {extent['initialization_s']:.2f} s on",
         )
+    if extent["scale"] == "unknown":
+        yield "scale", "unknown: lengths are up to scale"
     if timing["frames_per_s"] is not None:
         yield (
             "speed",

@@ -76,13 +76,16 @@ def nees(
         estimate: N estimated poses.
         pose_covariances: (N, 6, 6) rotation before position, body frame; NaN where unknown.
         truth: interpolated at the times of the estimate; states outside it are left out.
-        similarity: rigid map from the estimate's world to that of the truth.
+        similarity: map from the estimate's world to that of the truth; covariances are scaled, too.
     """
     similarity = similarity or Similarity.identity()
     estimate = similarity.apply(estimate)
     known = np.flatnonzero(np.isfinite(pose_covariances).all(axis=(1, 2)))
     true, rows = paired(truth, estimate.select(known))
     own, P = estimate.select(known[rows]), pose_covariances[known[rows]]
+    if similarity.scale != 1.0:
+        units = np.repeat([1.0, similarity.scale], 3)
+        P = units[:, None] * P * units
     rotations = Rotation.from_quat(own.quaternions)
     e_rotation = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
     e_position = rotations.inv().apply(true.positions - own.positions)

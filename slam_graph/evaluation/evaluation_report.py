@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,11 +34,19 @@ _REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 _RPE_DELTA_M = 1.0
 """Relative errors are taken over all pairs of poses about one metre of path apart."""
 
+_NO_SCALE = "the scale is unknown: see sim3"
+
 Table = dict[str, Any]
 
 
-def accuracy_report(reference: Trajectory, estimate: Trajectory) -> Table:
+def accuracy_report(reference: Trajectory, estimate: Trajectory, has_scale: bool = True) -> Table:
     """Absolute and relative errors, translation (m) and rotation (deg), under each alignment.
+
+    Args:
+        reference: the true trajectory.
+        estimate: the other one.
+        has_scale: whether lengths of the estimate are metres; if not, there are errors after an
+            alignment in scale only.
 
     Returns:
         For each alignment `{"scale", "poses", "ate": {"translation_m", "rotation_deg"}, "rpe":
@@ -47,6 +55,8 @@ def accuracy_report(reference: Trajectory, estimate: Trajectory) -> Table:
     """
     return {
         mode: _or_reason(partial(_errors_under, reference, estimate, mode))
+        if has_scale or mode == "sim3"
+        else {"unavailable": _NO_SCALE}
         for mode in _REPORTED_ALIGNMENTS
     }
 
@@ -126,7 +136,7 @@ def nees_of_run(
     history: StateHistory,
     aligned: bool,
     smoothed: FinalBa | None = None,
-) -> tuple[Nees, AlignmentMode | Literal["first_pose"]]:
+) -> tuple[Nees, AlignmentMode | Literal["first_pose", "first_pose_and_scale"]]:
     """NEES of the states of a run, and the alignment under which it was taken.
 
     An estimate that does not live in the world of the truth is aligned in yaw and position, which
@@ -135,7 +145,9 @@ def nees_of_run(
 
     - `yaw`: over the whole run, by the smoothed trajectory (`alignment_covariance.py`);
     - `first_pose`, without one: at the first state, relative to which covariances are. A truth
-      whose orientation is wrong there turns all positions.
+      whose orientation is wrong there turns all positions;
+    - `first_pose_and_scale`, where nothing measures lengths: the scale is that of `sim3` over the
+      whole run. So a wrong scale as a whole is no error, and one that drifts is.
 
     Args:
         truth: the true trajectory.
@@ -154,6 +166,13 @@ def nees_of_run(
         found = None if smoothed is None else aligned_by_smoothed(truth, history, smoothed)
         if found is not None:
             return nees(estimate, found[1], truth, found[0]), "yaw"
+    if not history.has_scale:
+        scale = Similarity.of_positions(true.positions, own.positions, "sim3").scale
+        scaled = Similarity(np.eye(3), np.zeros(3), scale)
+        first = Similarity.of_first_pose(true, scaled.apply(own), level=False)
+        return nees(
+            estimate, covariances, truth, replace(first, scale=scale)
+        ), "first_pose_and_scale"
     first = Similarity.of_first_pose(true, own, history.level)
     return nees(estimate, covariances, truth, first), "first_pose"
 

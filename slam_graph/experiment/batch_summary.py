@@ -28,7 +28,8 @@ NOT_DONE = "not_done"
 """Status of a recording of which there is no result."""
 
 _ALIGNMENT = "yaw"
-"""Errors are those after alignment of yaw and position, which the IMU does not observe."""
+"""Errors are those after alignment of yaw and position, which the IMU does not observe; where the
+scale is unknown, after that in rotation, position and scale."""
 
 
 _ORDINARY = frozenset({"feature_not_triangulated", "feature_rejected_by_gate"})
@@ -77,8 +78,9 @@ def _measured(metrics: Mapping[str, Any]) -> Row:
     dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
     adjusted = metrics["final_ba"]
     warnings = {kind: n for kind, n in metrics["warnings"].items() if kind not in _ORDINARY}
-    causal = _errors(metrics["accuracy"])
-    smoothed = _errors(adjusted["accuracy"] if adjusted else None)
+    mode = "sim3" if extent.get("scale") == "unknown" else _ALIGNMENT
+    causal = _errors(metrics["accuracy"], mode)
+    smoothed = _errors(adjusted["accuracy"] if adjusted else None, mode)
     return {
         "status": metrics["status"],
         "message": metrics["message"],
@@ -102,9 +104,9 @@ def _measured(metrics: Mapping[str, Any]) -> Row:
     }
 
 
-def _errors(accuracy: Mapping[str, Any] | None) -> tuple[float | None, float | None]:
+def _errors(accuracy: Mapping[str, Any] | None, mode: str) -> tuple[float | None, float | None]:
     """Root mean square errors of position, m, and orientation, degrees; None without a truth."""
-    table = (accuracy or {}).get(_ALIGNMENT)
+    table = (accuracy or {}).get(mode)
     if table is None or "unavailable" in table:
         return None, None
     return table["ate"]["translation_m"]["rmse"], table["ate"]["rotation_deg"]["rmse"]

@@ -36,7 +36,7 @@ from slam_graph.results import ResultFolder, RunResult
 
 SCHEMA_VERSION = 2
 
-ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3")
+ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
 SHOWN_ALIGNMENT: AlignmentMode = "yaw"
 """The alignment of the figures: what nothing tells a visual-inertial estimate is taken away."""
@@ -125,14 +125,15 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
         "true_path": true.positions,
     }
-    for mode in ALIGNMENTS:
+    shown = SHOWN_ALIGNMENT if result.history.has_scale else "sim3"
+    for mode in ALIGNMENTS if result.history.has_scale else ("sim3",):
         try:
             translation = ape(true, estimate, "trans_part", mode)
         except DataError:
             continue  # without motion the alignment is undetermined
         series[f"translation_m_{mode}"] = translation.values
         series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
-        if mode == SHOWN_ALIGNMENT:
+        if mode == shown:
             series["path"] = translation.similarity.apply(estimate).positions
     return series
 

@@ -6,12 +6,15 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.geometry.trajectory import NavState, Trajectory
+
+if TYPE_CHECKING:
+    from slam_graph.geometry.trajectory_alignment import AlignmentMode
 
 _STATE_WIDTH = 16
 """Position, quaternion (x y z w), velocity, accelerometer bias, gyroscope bias."""
@@ -28,11 +31,12 @@ class StateHistory:
 
     Attributes:
         level: whether gravity was measured, so that the vertical of its world is known.
+        has_scale: whether anything measured lengths; if not, they are known up to a common scale.
     """
 
-    def __init__(self, level: bool = True) -> None:
-        """Begin without states; see the class for `level`."""
-        self.level = level
+    def __init__(self, level: bool = True, has_scale: bool = True) -> None:
+        """Begin without states; see the class for `level` and `has_scale`."""
+        self.level, self.has_scale = level, has_scale
         self._stamps_ns = array("q")
         self._states = array("d")
         self._sigmas = array("d")
@@ -40,6 +44,17 @@ class StateHistory:
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
+
+    @property
+    def free(self) -> AlignmentMode:
+        """The alignment with a truth that takes away what nothing measured, and no more."""
+        if not self.has_scale:
+            return "sim3"
+        return "yaw" if self.level else "se3"
+
+    def like(self) -> StateHistory:
+        """A history of the same kind of world without states."""
+        return StateHistory(self.level, self.has_scale)
 
     def __repr__(self) -> str:
         return f"StateHistory({len(self)} states)"

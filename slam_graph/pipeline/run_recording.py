@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
 
 
+_NO_SCALE = "one camera without an IMU: all lengths are up to scale"
+
+
 def run(
     recording: Sequence | Path | str,
     config: RunConfig | Path | str | None = None,
@@ -83,7 +86,10 @@ def run(
     settings = _settings(config, overrides, options)
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
-    result.history.level = result.input.rig.has_imu
+    rig = result.input.rig
+    result.history.level, result.history.has_scale = rig.has_imu, rig.has_scale
+    if not rig.has_scale:
+        sequence.diagnostics.warn("scale_unknown", _NO_SCALE)
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)

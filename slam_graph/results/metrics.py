@@ -77,11 +77,19 @@ def peak_memory_mb() -> float | None:
     return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
-def accuracy_table(truth: Trajectory | None, trajectory: Trajectory) -> Table | None:
-    """Errors against ground truth, or None where there is nothing to compare."""
-    if truth is None or len(trajectory) == 0:
+def accuracy_table(
+    truth: Trajectory | None, trajectory: Trajectory | None, has_scale: bool = True
+) -> Table | None:
+    """Errors against ground truth, or None where there is nothing to compare.
+
+    Args:
+        truth: the true trajectory.
+        trajectory: the estimate.
+        has_scale: whether anything measured lengths; see `evaluation.accuracy_report`.
+    """
+    if truth is None or trajectory is None or len(trajectory) == 0:
         return None
-    return evaluation.accuracy_report(truth, trajectory)
+    return evaluation.accuracy_report(truth, trajectory, has_scale)
 
 
 def consistency_table(
@@ -139,8 +147,11 @@ def world_table(history: StateHistory, given: bool) -> Table:
         history: the causal estimate.
         given: whether the start was given in the world of the truth.
     """
-    free = "yaw" if history.level else "se3"
-    return {"start_was_given": given, "alignment": "none" if given else free}
+    return {
+        "start_was_given": given,
+        "alignment": "none" if given and history.has_scale else history.free,
+        "scale": "metres" if history.has_scale else "unknown",
+    }
 
 
 def coverage(start_ns: int, end_ns: int, segments: Segments) -> float:
@@ -153,7 +164,7 @@ def coverage(start_ns: int, end_ns: int, segments: Segments) -> float:
 
 
 def segments_table(
-    segments: Segments, trajectory: Trajectory, truth: Trajectory | None
+    segments: Segments, trajectory: Trajectory, truth: Trajectory | None, has_scale: bool = True
 ) -> list[Table]:
     """What each segment reached, each aligned on its own; empty for a run in one piece."""
     if len(segments) < 2:
@@ -164,7 +175,7 @@ def segments_table(
             "end_ns": segment.end_ns,
             "joined_by": segment.joined_by,
             "ended_by": segment.ended_by,
-            "accuracy": accuracy_table(truth, segment.part_of(trajectory)),
+            "accuracy": accuracy_table(truth, segment.part_of(trajectory), has_scale),
         }
         for segment in segments
     ]
@@ -174,13 +185,16 @@ def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table 
     """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one."""
     if final_ba is None:
         return None
-    accuracy = None if truth is None else evaluation.accuracy_report(truth, final_ba.trajectory)
+    accuracy = accuracy_table(truth, final_ba.trajectory, final_ba.history.has_scale)
     nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
     return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees}
 
 
 def loop_closure_table(
-    loops: LoopClosures | None, corrected: Trajectory | None, truth: Trajectory | None
+    loops: LoopClosures | None,
+    corrected: Trajectory | None,
+    truth: Trajectory | None,
+    has_scale: bool = True,
 ) -> Table | None:
     """What loop closure found and reached, if loops were to be closed.
 
@@ -188,6 +202,7 @@ def loop_closure_table(
         loops: what was found.
         corrected: the trajectory after loop closure.
         truth: the true trajectory.
+        has_scale: whether anything measured lengths.
     """
     if loops is None or corrected is None:
         return None
@@ -195,7 +210,7 @@ def loop_closure_table(
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
         "accepted": int(loops.accepted.sum()),
-        "accuracy": None if truth is None else evaluation.accuracy_report(truth, corrected),
+        "accuracy": accuracy_table(truth, corrected, has_scale),
     }
 
 

@@ -25,6 +25,7 @@ ALIGNED_IN = {
     "none": "not aligned",
     "yaw": "aligned in yaw and position",
     "se3": "aligned in rotation and position",
+    "sim3": "aligned in rotation, position and scale",
 }
 """What the alignments of runs mean."""
 
@@ -100,7 +101,7 @@ class RunView:
             {name: estimate.moved(similarity) for name, estimate in self.estimates.items()},
             {name: similarity.apply(path) for name, path in self.paths.items()},
             self.truth,
-            self.points @ similarity.rotation.T + similarity.translation,
+            similarity.scale * self.points @ similarity.rotation.T + similarity.translation,
             self.start_ns,
         )
 
@@ -168,7 +169,7 @@ def with_covariances_after_alignment(
                 estimates[name] = PoseEstimate(mapped, covariances)
                 similarity = judged.similarity
     if similarity is None:
-        return view.aligned("yaw" if histories[CAUSAL].level else "se3")
+        return view.aligned(histories[CAUSAL].free)
     moved = view.moved(similarity)
     return RunView(
         {**moved.estimates, **estimates}, moved.paths, view.truth, moved.points, view.start_ns
@@ -302,7 +303,8 @@ def _title(metrics: Mapping[str, Any]) -> str:
         how = ALIGNED_IN[mode]
         lines.append(f"RMSE ({how}): {'  ·  '.join(errors)}")
     elif metrics["extent"]["estimated_frames"]:
-        lines.append("no ground truth; ±3σ is relative to the first state")
+        lengths = "" if metrics["extent"].get("scale") != "unknown" else "; lengths up to scale"
+        lines.append(f"no ground truth; ±3σ is relative to the first state{lengths}")
     else:
         lines.append(metrics["message"] or "no estimate")
     return "\n".join(lines)

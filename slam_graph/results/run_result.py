@@ -108,7 +108,7 @@ class RunResult(RunSummary):
             since_ns: the time; None for all states. The points of the map begin anew with these.
         """
         if since_ns is None:
-            self.history, self.point_map = StateHistory(self.history.level), PointMap()
+            self.history, self.point_map = self.history.like(), PointMap()
         else:
             self.history.forget_from(since_ns)
         self.logs.forget_states(since_ns)
@@ -248,10 +248,14 @@ class RunResult(RunSummary):
                 "seed": self.config.seed,
                 "world": {"of_fixes": self.georeferenced, "datum": asked.datum},
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
-                "segments": tables.segments_table(self.segments, self.trajectory, truth),
-                "accuracy": tables.accuracy_table(truth, self.trajectory),
+                "segments": tables.segments_table(
+                    self.segments, self.trajectory, truth, self.history.has_scale
+                ),
+                "accuracy": tables.accuracy_table(truth, self.trajectory, self.history.has_scale),
                 "final_ba": tables.final_ba_table(self.final_ba, truth),
-                "loop_closure": tables.loop_closure_table(self.loops, self.loop_closed, truth),
+                "loop_closure": tables.loop_closure_table(
+                    self.loops, self.loop_closed, truth, self.history.has_scale
+                ),
                 "slam_map": None if self.slam_map is None else self.slam_map.summary(),
                 "localization": (
                     None

@@ -201,6 +201,9 @@ class RunSummary(Displayed):
             "status": f"{metrics['status']}. {metrics['message']}".rstrip(". "),
             "estimated": f"{extent['estimated_frames']} of {extent['frames']} frames, "
             f"{extent['coverage']:.1%} of {extent['recorded_s']:.1f} s",
+            "scale": "unknown: lengths are up to scale"
+            if extent.get("scale") == "unknown"
+            else None,
             "error": _errors(metrics["accuracy"], mode),
             "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy"), mode),
             "error, loops closed": _errors(loops["accuracy"], mode)

@@ -64,7 +64,9 @@ def two_view_motion(first: FloatArray, second: FloatArray, sigma: float) -> TwoV
         sigma: standard deviation of these coordinates.
     """
     if len(first) < MIN_POINTS:
-        return Refusal("tracks", f"{MIN_POINTS} features that two views share ({len(first)} so far)")
+        return Refusal(
+            "tracks", f"{MIN_POINTS} features that two views share ({len(first)} so far)"
+        )
     shift = float(np.median(np.linalg.norm(second - first, axis=1)))
     if shift < np.tan(MIN_PARALLAX):
         return Refusal("motion", "motion of the camera (its features hardly move)")

@@ -120,7 +120,7 @@ def adjust_worlds(
             parts.append(found)
     if len(parts) < 2:
         return parts[0] if parts else None
-    history = StateHistory(parts[0].history.level)
+    history = parts[0].history.like()
     for found in parts:
         history.extend(found.history)
     return FinalBa(history, total_of([found.summary for found in parts]), None)
@@ -175,7 +175,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     else:
         causal = _extended_backward(log, causal, task, report)
     level = task.rig.has_imu
-    history = StateHistory(level)
+    history = StateHistory(level, task.rig.has_scale)
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):
