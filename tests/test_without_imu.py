@@ -138,13 +138,6 @@ def test_what_is_known_without_an_imu_is_what_the_covariance_says() -> None:
     assert (np.mean(values, axis=0) > 1.0).all(), values
 
 
-def test_one_camera_alone_is_told_what_is_missing() -> None:
-    recording = simulated(cameras=1, duration_s=3.0)
-    result = run(recording, algorithm="msckf", overrides=[OWN_START])
-    assert result.status == "not_initialized"
-    assert "a second camera or a depth image gives the depth" in result.message
-
-
 def test_a_recording_with_an_imu_can_be_run_without_it(data_dir: Path) -> None:
     result = run(
         data_dir / "euroc" / "MH_01_easy_17s",

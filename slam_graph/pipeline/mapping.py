@@ -50,8 +50,8 @@ def require_places(sequence: Sequence, asked: RunInput, known_map: SlamMap | Non
     wanted = asked.config.map.enabled or known_map is not None
     if wanted and not asked.rig.has_scale:
         raise DataError(
-            f"{asked.info.name}: one camera without an IMU does not know the scale, and maps are in "
-            "metres; add a second camera, depth or an IMU, or leave out the map"
+            f"{asked.info.name}: one camera without an IMU does not know the scale, and maps are "
+            "in metres; add a second camera, depth or an IMU, or leave out the map"
         )
     if not wanted or asked.info.content != "tracks":
         return

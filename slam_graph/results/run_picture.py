@@ -64,8 +64,10 @@ class PoseEstimate:
         return PoseEstimate(history.trajectory(), history.pose_covariances())
 
     def moved(self, similarity: Similarity) -> PoseEstimate:
-        """The same in another world; covariances are in the body and stay."""
-        return PoseEstimate(similarity.apply(self.trajectory), self.covariances)
+        """The same in another world; covariances are in the body, in the units of that world."""
+        units = np.repeat([1.0, similarity.scale], 3)
+        covariances = units[:, None] * self.covariances * units
+        return PoseEstimate(similarity.apply(self.trajectory), covariances)
 
     def world_sigmas(self) -> FloatArray:
         """(N, 4) standard deviations of x, y, z [m] and yaw [deg], in the axes of the world."""

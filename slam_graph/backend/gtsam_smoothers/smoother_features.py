@@ -122,7 +122,7 @@ def features_given_pose(
         ids: (N,) of the features.
         pose: key of the pose.
     """
-    factors = []
+    factors: list[gtsam.NonlinearFactor] = []
     for j in ids.tolist():
         known = prior.marginal([L(j), pose])
         of_point, of_pose = (known.layout.columns[key] for key in (L(j), pose))

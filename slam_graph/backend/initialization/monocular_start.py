@@ -39,8 +39,7 @@ from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGu
 from slam_graph.backend.initialization.segment_joint import moved
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import MIN_POINTS, TwoViews, two_view_motion
-from slam_graph.backend.marginalization.marginalize import triangularize
-from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import State, imu_state_keys
 from slam_graph.backend.visual_motion import ERROR_PX
 from slam_graph.backend.window import Window

@@ -34,6 +34,8 @@ _MIN_GOOD = 0.75
 _RIVAL = 0.75
 """Another motion with more than this part of the good points makes the choice ambiguous."""
 _CONFIDENCE = 0.999
+_SINGULAR = 1e-9
+"""Smallest determinant of a homography that can be inverted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,45 +72,85 @@ def two_view_motion(first: FloatArray, second: FloatArray, sigma: float) -> TwoV
     shift = float(np.median(np.linalg.norm(second - first, axis=1)))
     if shift < np.tan(MIN_PARALLAX):
         return Refusal("motion", "motion of the camera (its features hardly move)")
-    E, _ = cv2.findEssentialMat(
-        first, second, np.eye(3), cv2.RANSAC, _CONFIDENCE, np.sqrt(_LINE) * sigma
-    )
-    H, _ = cv2.findHomography(first, second, cv2.RANSAC, np.sqrt(_POINT) * sigma)
-    line_score = line_fits = plane_score = plane_fits = None
-    if E is not None and E.shape == (3, 3):
-        line_score, line_fits = _score(_line_errors(E, first, second) / sigma**2, _LINE)
-    if H is not None:
-        plane_score, plane_fits = _score(_point_errors(H, first, second) / sigma**2, _POINT)
-    if not line_score and not plane_score:
+    models = _Model.of_lines(first, second, sigma), _Model.of_plane(first, second, sigma)
+    total = sum(model.score for model in models)
+    if total == 0.0:
         return Refusal("fit", "features of two views that fit one motion")
-    plane = (plane_score or 0.0) > _PLANE_SHARE * ((line_score or 0.0) + (plane_score or 0.0))
-    motions, fits = (_of_plane(H), plane_fits) if plane else (_of_lines(E), line_fits)
-    views = [_seen(R, t, first, second, sigma) for R, t in motions]
-    return _chosen(views, np.asarray(fits), "homography" if plane else "essential")
+    model = models[1] if models[1].score > _PLANE_SHARE * total else models[0]
+    return _chosen([_seen(R, t, first, second, sigma) for R, t in model.motions()], model)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Model:
+    """An essential matrix or a homography of two views.
+
+    Attributes:
+        name: which of them.
+        matrix: (3, 3).
+        score: how well it explains the features.
+        fits: (N,) which features fit it.
+    """
+
+    name: Literal["essential", "homography"]
+    matrix: FloatArray
+    score: float
+    fits: BoolArray
+
+    @staticmethod
+    def of_lines(first: FloatArray, second: FloatArray, sigma: float) -> _Model:
+        """The essential matrix; its score is 0 if there is none."""
+        reach = float(np.sqrt(_LINE)) * sigma
+        found, _ = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, _CONFIDENCE, reach)
+        if found is None or found.shape != (3, 3):
+            return _Model("essential", np.eye(3), 0.0, np.zeros(len(first), np.bool_))
+        E = np.asarray(found, dtype=np.float64)
+        return _Model("essential", E, *_score(_line_errors(E, first, second) / sigma**2, _LINE))
+
+    @staticmethod
+    def of_plane(first: FloatArray, second: FloatArray, sigma: float) -> _Model:
+        """The homography; its score is 0 if there is none."""
+        found, _ = cv2.findHomography(first, second, cv2.RANSAC, float(np.sqrt(_POINT)) * sigma)
+        if found is None or abs(np.linalg.det(np.asarray(found, np.float64))) < _SINGULAR:
+            return _Model("homography", np.eye(3), 0.0, np.zeros(len(first), np.bool_))
+        H = np.asarray(found, dtype=np.float64)
+        return _Model("homography", H, *_score(_point_errors(H, first, second) / sigma**2, _POINT))
+
+    def motions(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """The motions second_T_first that it allows, four at most; translations of length 1."""
+        if self.name == "essential":
+            parts = cv2.decomposeEssentialMat(self.matrix)
+            R_1, R_2, t = (np.asarray(part, np.float64) for part in parts)
+            yield from ((R, sign * t[:, 0]) for R in (R_1, R_2) for sign in (1.0, -1.0))
+            return
+        _, rotations, translations, _ = cv2.decomposeHomographyMat(self.matrix, np.eye(3))
+        for rotation, translation in zip(rotations, translations, strict=True):
+            t = np.asarray(translation, np.float64)[:, 0]
+            length = float(np.linalg.norm(t))
+            if length > 0.0:
+                yield np.asarray(rotation, np.float64), t / length
 
 
 def _chosen(
     views: list[tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray]],
-    fits: BoolArray,
-    model: Literal["essential", "homography"],
+    model: _Model,
 ) -> TwoViews | Refusal:
     """The motion that has the features in front of both views, if it is one."""
-    counts = [np.count_nonzero(good & fits) for *_, good, _ in views]
+    counts = [np.count_nonzero(good & model.fits) for *_, good, _ in views]
     order = np.argsort(counts)[::-1]
     if not len(order) or counts[order[0]] < MIN_POINTS:
         return Refusal("motion", "motion with parallax (a camera that only turns shows no depth)")
     R, t, points, good, parallax = views[order[0]]
-    good = good & fits
+    good = good & model.fits
     angle = float(np.median(parallax[good]))
     if angle < MIN_PARALLAX:
         needs = f"motion with parallax ({np.degrees(angle):.1f}° of {np.degrees(MIN_PARALLAX):.0f}°"
         return Refusal("motion", needs + "; a camera that only turns shows no depth)")
-    if counts[order[0]] < _MIN_GOOD * np.count_nonzero(fits):
+    if counts[order[0]] < _MIN_GOOD * np.count_nonzero(model.fits):
         return Refusal("fit", "features of two views that fit one motion")
     if len(order) > 1 and counts[order[1]] > _RIVAL * counts[order[0]]:
         return Refusal("motion", "views of more than one plane, or other motion (two motions fit)")
     pose = gtsam.Pose3(gtsam.Rot3(R), t).inverse()
-    return TwoViews(pose, points, good, parallax, model)
+    return TwoViews(pose, points, good, parallax, model.name)
 
 
 # --- models --------------------------------------------------------------------------------------
@@ -135,23 +177,6 @@ def _point_errors(H: FloatArray, first: FloatArray, second: FloatArray) -> Float
     there, back = _homogeneous(first) @ H.T, _homogeneous(second) @ np.linalg.inv(H).T
     errors = [there[:, :2] / there[:, 2:] - second, back[:, :2] / back[:, 2:] - first]
     return np.stack([np.sum(error**2, axis=1) for error in errors], axis=1)
-
-
-def _of_lines(E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """The four motions second_T_first that an essential matrix allows."""
-    R_1, R_2, t = cv2.decomposeEssentialMat(E)
-    for R in (R_1, R_2):
-        for sign in (1.0, -1.0):
-            yield R, sign * t[:, 0]
-
-
-def _of_plane(H: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """The motions second_T_first that a homography allows, four at most."""
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
-    for R, t in zip(rotations, translations, strict=True):
-        length = np.linalg.norm(t)
-        if length > 0.0:
-            yield R, t[:, 0] / length
 
 
 def _seen(
