@@ -56,7 +56,7 @@ _POSE_SIGMA, _VELOCITY_SIGMA, _RATE_SIGMA = 1e-3, 10.0, 3.0
 """Standard deviations of the first state: its pose is the gauge, the rest is not known."""
 _SCALE_SIGMA = 1e-3
 """Relative standard deviation of the scale at the start: it is a convention."""
-_MAX_DEPTH_SIGMA = 0.1
+_MAX_DEPTH_SIGMA = 0.03
 """Largest accepted relative standard deviation of the depths that are known best."""
 
 
