@@ -195,7 +195,7 @@ class Estimation:
         if not estimator.initialized:
             self._start_from_known_state(tracked.packet.frame.stamp_ns)
         estimator.add_imu(tracked.packet.imu)
-        if tracked.packet.aiding is not None:
+        if tracked.packet.aiding is not None and estimator.rig.has_scale:
             estimator.aiding.add(tracked.packet.aiding)
         self._recovery.check_recorded(stamp_ns, tracked.packet.imu)
         try:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
 
 
-_NO_SCALE = "one camera without an IMU: all lengths are up to scale"
+_NO_SCALE = "one camera without an IMU: all lengths are up to scale; fixes and odometry, if any, are not used"
 
 
 def run(

@@ -59,7 +59,8 @@ class Smoothing(Stage):
             return
         try:
             packet = frame.packet
-            self._log.add(packet.imu, frame.features, frame.imu_noise, packet.aiding)
+            aiding = packet.aiding if self._log.rig.has_scale else None
+            self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
             self._log.georeferenced = frame.georeferenced
         except (OSError, SlamGraphError) as error:
             self._give_up(error)
