@@ -41,7 +41,9 @@ if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
 
 
-_NO_SCALE = "one camera without an IMU: all lengths are up to scale; fixes and odometry, if any, are not used"
+_NO_SCALE = (
+    "one camera without an IMU: all lengths are up to scale, and fixes and odometry are not used"
+)
 
 
 def run(
