@@ -55,6 +55,28 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     return folder, json.loads(done.stdout)
 
 
+@pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), (1, "sim3")])
+def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
+    tmp_path: Path, cameras: int, alignment: str
+) -> None:
+    found = compare_algorithms(
+        "sim:random",
+        "msckf",
+        seeds=[4],
+        output=tmp_path,
+        simulation=[
+            f"cameras={cameras}", "with_imu=false", "duration_s=6", "tracks.features=60"
+        ],
+        overrides=["backend.initialization.mode=motion"],
+    )  # fmt: skip
+    (row,) = found.rows
+    assert row["alignment"] == alignment
+    assert found.table[1][found.table[0].index("aligned in")] == alignment
+    assert row["ate_m"][alignment] < 0.05
+    assert (row["ate_m"]["yaw"] is None) == (cameras == 1)
+    assert (tmp_path / "figures" / "sim_random_errors.png").is_file()
+
+
 def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path, dict]) -> None:
     folder, printed = simulated
     assert [(row["data"], row["algorithm"]) for row in printed["rows"]] == [

@@ -22,7 +22,7 @@ from slam_graph.pose_graph import optimize_pose_graph
 from slam_graph.results import BalResult, PoseGraphResult
 from slam_graph.visualization import RerunRecording
 
-SERIES = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
+SERIES = ("time_s", "translation_m", "rotation_deg")
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def _other_titles(path: Path) -> None:
 
 
 def _other_arrays(path: Path) -> None:
-    np.savez_compressed(path, time_s=np.zeros(3), translation_m_yaw=np.zeros(2))
+    np.savez_compressed(path, time_s=np.zeros(3), translation_m=np.zeros(2))
 
 
 def _no_mapping(path: Path) -> None:

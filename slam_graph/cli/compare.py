@@ -142,7 +142,8 @@ def _print_task(task: str, failure: str | None, count: int, total: int) -> None:
 
 _SHOWN = {
     "algorithm": "algorithm",
-    "ATE yaw [m]": "ATE [m]",
+    "aligned in": "aligned in",
+    "ATE [m]": "ATE [m]",
     "orientation [deg]": "rot. [°]",
     "NEES pose": "NEES",
     "NIS / expected": "NIS",
@@ -154,8 +155,8 @@ _SHOWN = {
 """Columns of the table that are printed, and their titles there; the report has all."""
 
 _MEANING = (
-    "ATE, rot.: root mean square errors, aligned in yaw and position. NEES of the pose (ideal 6). "
-    "NIS over its expected value (ideal 1). The report has all columns."
+    "ATE, rot.: root mean square errors, aligned in what nothing measured. NEES of the pose (ideal "
+    "6). NIS over its expected value (ideal 1). The report has all columns."
 )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from slam_graph.visualization import RerunRecording
 
 _Show = Callable[["RerunRecording"], None]
-_ERRORS = ("time_s", "translation_m_yaw", "rotation_deg_yaw")
+_ERRORS = ("time_s", "translation_m", "rotation_deg")
 _ERROR_TITLES = ("time_s", "position error [m]", "orientation error [deg]")
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
 """What NumPy raises for a file that is no archive of arrays, or lacks one."""
@@ -224,7 +224,7 @@ def _comparison(folder: Path) -> _Show:
                     "path": series.get("path", np.zeros(0)).reshape(-1, 3),
                     "time_s": np.zeros(0),
                 }
-                if "time_s" in series and "translation_m_yaw" in series:
+                if "time_s" in series and "translation_m" in series:
                     columns = np.stack([series[name] for name in _ERRORS])
                     run |= dict(zip(_ERROR_TITLES, columns, strict=True))
                 elif len(run["path"]) == 0:

@@ -91,8 +91,8 @@ _NUMBERS: tuple[tuple[str, str, Callable[[float], str], str], ...] = (
 
 _EXPLANATION = (
     "ATE and rotation: root mean square errors against the ground truth, where there is one, after "
-    "alignment of yaw and position. Speed: recorded time over the time of the causal estimate. "
-    "A dot is the start. "
+    "alignment of what nothing measured (yaw and position with an IMU). Speed: recorded time over "
+    "the time of the causal estimate. A dot is the start. "
     "A click on the title of a column sorts, one on a path shows more of the run."
 )
 

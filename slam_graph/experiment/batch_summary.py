@@ -28,8 +28,7 @@ NOT_DONE = "not_done"
 """Status of a recording of which there is no result."""
 
 _ALIGNMENT = "yaw"
-"""Errors are those after alignment of yaw and position, which the IMU does not observe; where the
-scale is unknown, after that in rotation, position and scale."""
+"""Errors are those after alignment of what nothing measured: with an IMU, yaw and position."""
 
 
 _ORDINARY = frozenset({"feature_not_triangulated", "feature_rejected_by_gate"})
@@ -78,7 +77,7 @@ def _measured(metrics: Mapping[str, Any]) -> Row:
     dataset, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
     adjusted = metrics["final_ba"]
     warnings = {kind: n for kind, n in metrics["warnings"].items() if kind not in _ORDINARY}
-    mode = "sim3" if extent.get("scale") == "unknown" else _ALIGNMENT
+    mode = extent.get("unmeasured", _ALIGNMENT)  # not in results of before there were others
     causal = _errors(metrics["accuracy"], mode)
     smoothed = _errors(adjusted["accuracy"] if adjusted else None, mode)
     return {

@@ -15,10 +15,10 @@ from slam_graph.arrays import FloatArray
 from slam_graph.evaluation import mean_bounds
 from slam_graph.experiment.comparison_plan import Comparison
 from slam_graph.experiment.comparison_results import (
-    SHOWN_ALIGNMENT,
     STAGE,
     Series,
     Table,
+    alignment_of,
     numbers,
     read_result,
     read_series,
@@ -63,11 +63,8 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     yield from _draw_panels(folder, f"{data}_paths.png", f"{data}: causal paths", _paths(runs))
     title = f"{data}: errors (root mean square of a run) and cost{over}"
     yield from _draw_panels(folder, f"{data}_summary.png", title, _summary_panels(tasks))
-    panels = [
-        Panel(_TIME, label, _curves(runs, "time_s", f"{part}_{SHOWN_ALIGNMENT}"))
-        for part, label in _ERRORS
-    ]
-    title = f"{data}: errors over time, aligned in yaw and position{mean}"
+    panels = [Panel(_TIME, label, _curves(runs, "time_s", part)) for part, label in _ERRORS]
+    title = f"{data}: errors over time, aligned in what nothing measured{mean}"
     yield from _draw_panels(folder, f"{data}_errors.png", title, panels)
     panels = _consistency_panels(runs, max(seeds, 1))
     yield from _draw_panels(folder, f"{data}_nees.png", f"{data}: consistency{mean}", panels)
@@ -108,7 +105,7 @@ def _summary_panels(tasks: list[RunTask]) -> list[Panel]:
         if result is not None and result["metrics"]["status"] == "ok":
             runs[task.algorithm].append(result["metrics"])
     quantities: dict[str, Callable[[Table], Any]] = {
-        label: lambda m, part=part: m["accuracy"][SHOWN_ALIGNMENT]["ate"][part]["rmse"]  # type: ignore[misc]
+        label: lambda m, part=part: m["accuracy"][alignment_of(m)]["ate"][part]["rmse"]  # type: ignore[misc]
         for part, label in _ERRORS
     }
     quantities[_NEES_LABEL] = lambda m: m["nees"]["pose"]["mean"]

@@ -61,8 +61,8 @@ class Comparison(Displayed):
 def _short(row: dict[str, Any]) -> str:
     """Errors, consistency and cost of one algorithm, as far as they are known."""
     values = (
-        ("ATE {:.4f} m", row["ate_m"]["yaw"]),
-        ("{:.3f}°", row["orientation_deg"]["yaw"]),
+        ("ATE {:.4f} m", row["ate_m"][row["alignment"]]),
+        ("{:.3f}°", row["orientation_deg"][row["alignment"]]),
         ("NEES {:.2f}", row["nees"]["pose"]),
         ("{:.1f} ms a frame", row["ms_per_frame"]),
     )

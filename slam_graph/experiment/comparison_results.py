@@ -5,8 +5,10 @@
 Series of the NPZ file, over the N frames that have a true pose, the K of them that also have a
 covariance, or all F frames:
 
-- `path`, `true_path` (N, 3): positions, aligned with the truth in yaw and position, and the true
-  ones; without a truth only `path` (S, 3) of all states, in the world of the run;
+- `path`, `true_path` (N, 3): positions, aligned with the truth in what nothing measured (yaw and
+  position with an IMU), and the true ones; without a truth only `path` (S, 3) of all states, in
+  the world of the run;
+- `translation_m`, `rotation_deg` (N,): errors after that alignment;
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
 - `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
 - `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
@@ -34,12 +36,9 @@ from slam_graph.evaluation import ape, nees_of_run, synchronize
 from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import ResultFolder, RunResult
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
-
-SHOWN_ALIGNMENT: AlignmentMode = "yaw"
-"""The alignment of the figures: what nothing tells a visual-inertial estimate is taken away."""
 
 STAGE = "backend"
 """The stage of the pipeline in which algorithms differ."""
@@ -125,7 +124,6 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
         "true_path": true.positions,
     }
-    shown = SHOWN_ALIGNMENT if result.history.has_scale else "sim3"
     for mode in ALIGNMENTS if result.history.has_scale else ("sim3",):
         try:
             translation = ape(true, estimate, "trans_part", mode)
@@ -133,7 +131,9 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
             continue  # without motion the alignment is undetermined
         series[f"translation_m_{mode}"] = translation.values
         series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
-        if mode == shown:
+        if mode == result.history.free:
+            series["translation_m"] = series[f"translation_m_{mode}"]
+            series["rotation_deg"] = series[f"rotation_deg_{mode}"]
             series["path"] = translation.similarity.apply(estimate).positions
     return series
 
@@ -161,6 +161,12 @@ def _innovation_series(result: RunResult) -> Series:
         "nis_ratio": ratio,
         **{f"nis_{name}": values for name, values in columns.items()},
     }
+
+
+def alignment_of(metrics: Table) -> AlignmentMode:
+    """The alignment that takes away what nothing measured in a run, and no more."""
+    mode: AlignmentMode = metrics["extent"]["unmeasured"]
+    return mode
 
 
 def numbers(metrics: list[Table], get: Callable[[Table], Any]) -> Iterator[float]:

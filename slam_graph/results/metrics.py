@@ -150,6 +150,7 @@ def world_table(history: StateHistory, given: bool) -> Table:
     return {
         "start_was_given": given,
         "alignment": "none" if given and history.has_scale else history.free,
+        "unmeasured": history.free,
         "scale": "metres" if history.has_scale else "unknown",
     }
 
