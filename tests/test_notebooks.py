@@ -41,8 +41,8 @@ def shows_something(cell: Cell) -> bool:
     return re.search(r"^\s*print\(", source, re.MULTILINE) is not None or expression
 
 
-def test_there_are_nine_notebooks() -> None:
-    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k:02d}" for k in range(1, 10)]
+def test_there_are_twelve_notebooks() -> None:
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k:02d}" for k in range(1, 13)]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=name)
