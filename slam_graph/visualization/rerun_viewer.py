@@ -181,7 +181,8 @@ class RerunViewer:
         if not self._keyframes:
             self._outcome.show_keyframes(result)
         best = result.smoothed or result.trajectory
-        eye = Eye.on(best.positions, self._map.points, around=RIG_M)
+        ways = np.concatenate([best.positions, self._objects.places])
+        eye = Eye.on(ways, self._map.points, around=RIG_M)
         self._arrange(plots, eye, places_in_map(result, self._known_map), self._series.spans)
 
     def close(self) -> None:
