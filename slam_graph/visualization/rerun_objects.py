@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from slam_graph.backend import ObjectFrame
 
 TRAILS = "trails"
-"""Entity, below that of all objects, of the ways they have come: one for all, so that the layout can
-say that it accumulates before any object is known."""
+"""Entity, below that of all objects, of the ways they have come: one for all, so that the layout
+can say that it accumulates before any object is known."""
 
 _POINT_RADIUS, _TRAIL_RADIUS, _TRACK_RADIUS, _REGION_RADIUS = -4.0, -1.5, -3.0, -1.5
 """In points of the screen."""

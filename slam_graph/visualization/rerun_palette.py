@@ -50,10 +50,10 @@ OBJECTS: tuple[Colour, ...] = (
     (170, 255, 102),
     (85, 238, 170),
 )
-"""Colours of moving objects. Okabe and Ito have too few: these were chosen one after another, each as
-far as possible in CIELAB from the background, from what else is beside objects (green, grey, purple,
-white, light blue, red) and from one another, also as people without red or green cones see them
-(Machado et al. 2009)."""
+"""Colours of moving objects. Okabe and Ito have too few: these were chosen one after another, each
+as far as possible in CIELAB from the background, from what else is beside objects (green, grey,
+purple, white, light blue, red) and from one another, also as people without red or green cones see
+them (Machado et al. 2009)."""
 
 _VIRIDIS: Colours = np.ascontiguousarray(
     cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8

@@ -17,6 +17,7 @@ from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
+from slam_graph.visualization.rerun_depth import DepthView
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
 from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
 from slam_graph.visualization.rerun_objects import ObjectViews
@@ -100,6 +101,7 @@ class RerunViewer:
         brief = self._images == "none"
         self._cameras = CameraViews(self._stream, rig, f"{self._world}/body", brief)
         self._cameras.mount(rig)
+        self._depth = DepthView(self._stream, f"{self._world}/depth", rig)
         self._objects = ObjectViews(self._stream, self._world, *self._cameras.first)
         self._outcome.style(f"{self._world}/path/causal", CAUSAL)
         for name, radius in {"features": -2.4, "map/points": POINT_RADIUS, "window": -3.0}.items():
@@ -148,6 +150,8 @@ class RerunViewer:
         images = frame.packet.frame
         if isinstance(images, CameraFrame) and self._wants_images(estimator, stamp_ns):
             self._cameras.show_images(images)
+            if frame.state is not None and not frame.waits:
+                self._depth.show(images, frame.state.world_T_body)
         self._cameras.show_tracks(features, frame.rejected, estimator.dynamic)
         if frame.objects is not None:
             self._objects.show(frame.objects, features)
