@@ -10,7 +10,7 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
+from rerun_rows import Row, rows_of
 from scipy.spatial import cKDTree
 
 import slam_graph as sg
@@ -19,7 +19,7 @@ from slam_graph.sensors import Camera, CameraFrame, DepthSensor
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulator import euroc_rig
 from slam_graph.visualization import RerunRecording
-from slam_graph.visualization.rerun_depth import DEPTH_WIDTH, DepthView
+from slam_graph.visualization.rerun_depth import DepthView
 from slam_graph.visualization.rerun_stream import RerunStream
 
 NORMAL, DISTANCE = np.array([0.2, -0.3, 0.9]), 2.5
@@ -41,17 +41,7 @@ def plane_seen_by(camera: Camera) -> Any:
     return depth.reshape(camera.height, camera.width).astype(np.float32)
 
 
-def rows_of(path: Path, entity: str) -> list[dict[str, Any]]:
-    """Components of each row of an entity, in the order of the frames."""
-    rows = []
-    for chunk in RrdReader(path).stream():
-        if str(chunk.entity_path) == entity and not chunk.is_static:
-            for row in chunk.to_record_batch().to_pylist():
-                rows.append({k.split(":")[-1]: v for k, v in row.items() if v is not None})
-    return sorted(rows, key=lambda row: row["frame"])
-
-
-def points_in_world(row: dict[str, Any]) -> FloatArray:
+def points_in_world(row: Row) -> FloatArray:
     """The cloud that Rerun makes of a depth image: pixel (0, 0) is at (0, 0) in its calibration."""
     units = cv2.imdecode(np.frombuffer(bytes(row["blob"][0]), np.uint8), cv2.IMREAD_UNCHANGED)
     K = np.reshape(row["image_from_camera"][0], (3, 3)).T
@@ -73,7 +63,7 @@ def test_a_plane_stays_a_plane_through_every_lens(lens: str, tmp_path: Path) -> 
     stream.at(0, 0)
     view.show(CameraFrame(0, (None,), plane_seen_by(camera)), world_T_body)
     stream.close()
-    (row,) = rows_of(tmp_path / "plane.rrd", "/world/depth")
+    (row,) = rows_of(tmp_path / "plane.rrd")["/world/depth"]
     points = points_in_world(row)
     camera_T_world = (world_T_body * mounted.body_T_camera).inverse()
     local = points @ camera_T_world.rotation().matrix().T + camera_T_world.translation()
@@ -98,7 +88,7 @@ def test_frames_without_depth_take_the_last_one_away_once(tmp_path: Path) -> Non
         stream.at(frame, frame)
         view.show(CameraFrame(frame, (None,), depth if has_depth else None))
     stream.close()
-    rows = rows_of(tmp_path / "gaps.rrd", "/world/depth")
+    rows = rows_of(tmp_path / "gaps.rrd")["/world/depth"]
     assert [row["frame"] for row in rows if "blob" in row] == [1, 2, 5]
     assert [row["frame"] for row in rows if "is_recursive" in row] == [3]
 
@@ -111,7 +101,7 @@ def test_a_run_shows_depth_where_the_walls_are(tmp_path: Path) -> None:
     viewer = RerunRecording("save", "depth", tmp_path / "depth.rrd").viewer()
     result = sg.run(sequence, viewer=viewer, final_ba={"enabled": False})
     assert not result.warnings["viewer_failed"]
-    rows = rows_of(tmp_path / "depth.rrd", "/world/depth")
+    rows = rows_of(tmp_path / "depth.rrd")["/world/depth"]
     assert len(rows) == len(result.trajectory)
     first, last = points_in_world(rows[0]), points_in_world(rows[-1])
     assert np.linalg.norm(np.subtract(rows[0]["translation"], rows[-1]["translation"])) > 0.2
@@ -123,5 +113,5 @@ def test_a_recording_without_depth_has_none(tmp_path: Path) -> None:
     sequence = simulate(kind="images", duration_s=1.0, rate_hz=10.0, cameras=1)
     with RerunRecording("save", "plain", tmp_path / "plain.rrd") as recording:
         recording.show_recording(sequence)
-    assert not rows_of(tmp_path / "plain.rrd", "/world/body/depth")
-    assert len(rows_of(tmp_path / "plain.rrd", "/world/body/cam0/image")) > 5
+    assert not rows_of(tmp_path / "plain.rrd")["/world/body/depth"]
+    assert len(rows_of(tmp_path / "plain.rrd")["/world/body/cam0/image"]) > 5

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Moving objects in Rerun: a frame adds what is new in it, and colours tell what is what."""
 
-from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import cv2
 import gtsam
 import numpy as np
 from rerun.chunk import RrdReader
+from rerun_rows import colour, rows_of
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import ObjectFrame
@@ -71,7 +70,7 @@ class Recorded:
     """What was recorded of objects.
 
     Attributes:
-        rows: of each entity, the number of its frame and its components.
+        rows: of each entity.
         bytes: of all entities of objects.
     """
 
@@ -82,21 +81,17 @@ class Recorded:
             stream.at(number, number * PERIOD_NS)
             views.show(frame, features(number))
         stream.close()
-        self.rows: dict[str, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        self.bytes = 0
-        for chunk in RrdReader(path).stream():
-            if chunk.is_static or "objects" not in str(chunk.entity_path):
-                continue
-            table = chunk.to_record_batch()
-            self.bytes += table.nbytes
-            for row in table.to_pylist():
-                values = {k.split(":")[-1]: v for k, v in row.items() if v is not None}
-                self.rows[str(chunk.entity_path)].append((values.pop("frame"), values))
+        self.rows = rows_of(path)
+        self.bytes = sum(
+            chunk.to_record_batch().nbytes
+            for chunk in RrdReader(path).stream()
+            if not chunk.is_static and "objects" in str(chunk.entity_path)
+        )
 
     def pieces(self) -> list[tuple[int, FloatArray]]:
         """Ways (2, 3) of all trails, and the frames at which they were added."""
-        rows = sorted(self.rows[f"/world/objects/{TRAILS}"], key=lambda row: row[0])
-        return [(at, np.array(way)) for at, values in rows for way in values["strips"]]
+        rows = self.rows[f"/world/objects/{TRAILS}"]
+        return [(row["frame"], np.array(way)) for row in rows for way in row["strips"]]
 
 
 def test_a_recording_grows_by_the_same_with_every_frame(tmp_path: Path) -> None:
@@ -123,13 +118,13 @@ def test_an_object_is_cleared_once_when_it_goes_out_of_sight(tmp_path: Path) -> 
     seen = [*[True] * 10, *[False] * 15, *[True] * 5, *[False] * 20]
     frames = [found(frame, seen=visible) for frame, visible in enumerate(seen)]
     recorded = Recorded(tmp_path / "clear.rrd", frames)
-    cleared = [at for at, values in recorded.rows["/world/objects/1"]]
-    assert cleared == [10, 30]
-    assert all(values["is_recursive"] == [True] for _, values in recorded.rows["/world/objects/1"])
+    cleared = recorded.rows["/world/objects/1"]
+    assert [row["frame"] for row in cleared] == [10, 30]
+    assert all(row["is_recursive"] == [True] for row in cleared)
     regions = recorded.rows["/world/body/cam0/objects/regions"]
-    assert [at for at, values in regions if not values["strips"]] == [10, 30]
+    assert [row["frame"] for row in regions if not row["strips"]] == [10, 30]
     for part in ("points", "velocity"):
-        at = [at for at, _ in recorded.rows[f"/world/objects/1/{part}"]]
+        at = [row["frame"] for row in recorded.rows[f"/world/objects/1/{part}"]]
         assert at == np.flatnonzero(seen).tolist()
     # the trail stays, and leads over the gap to where the object is found again
     (gap,) = [way for at, way in recorded.pieces() if at == 25]
@@ -138,8 +133,8 @@ def test_an_object_is_cleared_once_when_it_goes_out_of_sight(tmp_path: Path) -> 
 
 def test_features_are_coloured_by_what_is_known_of_their_motion(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path / "tracks.rrd", [found(0, number=3)])
-    ((_, values),) = recorded.rows["/world/body/cam0/objects/tracks"]
-    colours = [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in values["colors"]]
+    (row,) = recorded.rows["/world/body/cam0/objects/tracks"]
+    colours = [colour(packed) for packed in row["colors"]]
     assert {colours[i] for i in MEMBERS} == {object_colour(3)}
     assert colours[STATIC] == GREEN
     assert colours[PERHAPS] == colours[WRONG] == GREY

@@ -256,6 +256,8 @@ GROWING = (
     "map/points",
     "keyframes",
     "objects/trails",
+    "fixes",
+    "fixes/sigma",
 )
 """What accumulates in the world of a run."""
 

@@ -93,7 +93,7 @@ def pinhole_pixels(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.floa
         camera: of any model.
 
     Returns:
-        Pixels (H, W, 2) of the camera, and the pinhole camera's calibration matrix (3, 3), for
+        Columns and rows (2, H, W) of pixels of the camera, and the pinhole camera's calibration matrix (3, 3), for
         which the middles of pixels have whole numbers. Where it looks beyond what the camera can
         see, pixels are outside of the image.
     """
@@ -112,15 +112,15 @@ def pinhole_pixels(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.floa
     pixels = camera.pixels(rays)
     # many models project rays that they do not see to somewhere in the image
     pixels[np.linalg.norm(rays, axis=1) >= camera.max_tangent] = -1.0
-    return pixels.reshape(height, width, 2).astype(np.float32), K
+    return pixels.T.reshape(2, height, width).astype(np.float32), K
 
 
 def sampled(depth: NDArray[np.float32], pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W) at pixels (H, W, 2) in m; NaN outside. Depths are not mixed across edges."""
-    return np.asarray(
-        cv2.remap(depth, pixels, None, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, np.nan),
-        np.float32,
+    """Depth (H, W) at pixels (2, H, W) in m; NaN outside. Depths are not mixed across edges."""
+    nearest = cv2.remap(
+        depth, *pixels, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
     )
+    return np.asarray(nearest, np.float32)
 
 
 def _png(depth: NDArray[np.float32]) -> bytes:

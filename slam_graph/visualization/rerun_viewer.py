@@ -18,6 +18,7 @@ from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
 from slam_graph.visualization.rerun_depth import DepthView
+from slam_graph.visualization.rerun_fixes import FixViews
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
 from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
 from slam_graph.visualization.rerun_objects import ObjectViews
@@ -70,6 +71,7 @@ class RerunViewer:
         self._known_map = known_map
         self._series = SeriesLog(self._stream)
         self._steps = StepSeries(self._series)
+        self._fixes = FixViews(self._stream)
         self._log_handler = _LogHandler(self._stream)
         self._truth: Trajectory | None = None
         self._stamps_ns: list[int] = []
@@ -85,6 +87,7 @@ class RerunViewer:
         self._map = MapLog(self._stream, world)
         self._keyframes: set[int] = set()
         self._image_ns: int | None = None
+        self._fixes.begin(world)
 
     def open(self, rig: Rig, truth: Trajectory | None) -> None:
         """Send what does not change, and the layout."""
@@ -155,6 +158,7 @@ class RerunViewer:
         self._cameras.show_tracks(features, frame.rejected, estimator.dynamic)
         if frame.objects is not None:
             self._objects.show(frame.objects, features)
+        self._fixes.show(frame, estimator)
         self._steps.add(number, stamp_ns, frame, estimator)
         if frame.state is None:
             return

@@ -25,6 +25,7 @@ from slam_graph.visualization.rerun_blueprints import (
     odometry,
 )
 from slam_graph.visualization.rerun_depth import DepthView
+from slam_graph.visualization.rerun_fixes import FixLog
 from slam_graph.visualization.rerun_images import CameraViews
 from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
@@ -52,6 +53,7 @@ class SavedDetails:
         known_map: the map that the run was located in, if it is at hand.
         recording: that was run, if its images or tracks and IMU samples are to be shown.
         images: whether images of the recording are shown.
+        of_fixes: whether the world of the run is that of position fixes.
     """
 
     rig: Rig | None
@@ -62,6 +64,7 @@ class SavedDetails:
     known_map: SlamMap | None = None
     recording: Sequence | None = None
     images: bool = True
+    of_fixes: bool = False
 
 
 def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails) -> None:
@@ -181,7 +184,9 @@ def _show_inputs(
         DataError: if the recording has none of these frames.
     """
     assert details.recording is not None
-    inputs = _Inputs(stream, series, cameras, details.recording.rig, details.images)
+    inputs = _Inputs(
+        stream, series, cameras, details.recording.rig, details.images, details.of_fixes
+    )
     known, shown = set(stamps_ns.tolist()), 0
     for packet in details.recording.packets():
         if packet.frame.stamp_ns not in known:
@@ -215,6 +220,7 @@ class _Inputs:
         cameras: of the world.
         rig: of the recording.
         images: whether images and depth are sent.
+        of_fixes: whether the world is that of position fixes.
 
     Attributes:
         depth: where depth images go.
@@ -227,7 +233,9 @@ class _Inputs:
         cameras: CameraViews,
         rig: Rig,
         images: bool,
+        of_fixes: bool = False,
     ) -> None:
+        self._fixes = FixLog(stream, "world") if of_fixes else None
         self._stream, self._series, self._cameras = stream, series, cameras
         self.depth, self._images = DepthView(stream, "world/body/depth", rig), images
 
@@ -240,6 +248,9 @@ class _Inputs:
             self.depth.show(packet.frame)
         elif isinstance(packet.frame, FeatureFrame):
             self._cameras.show_tracks(packet.frame, none, none)
+        if packet.aiding is not None and self._fixes is not None:
+            fixes = packet.aiding.fix_positions, packet.aiding.fix_covariances
+            self._fixes.add(*fixes, np.zeros(len(fixes[0]), np.bool_))
         add_imu(self._series, number, packet)
 
 
