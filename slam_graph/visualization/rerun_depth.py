@@ -93,9 +93,9 @@ def pinhole_pixels(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.floa
         camera: of any model.
 
     Returns:
-        Columns and rows (2, H, W) of pixels of the camera, and the pinhole camera's calibration matrix (3, 3), for
-        which the middles of pixels have whole numbers. Where it looks beyond what the camera can
-        see, pixels are outside of the image.
+        Columns and rows (2, H, W) of the camera's pixels, and the pinhole camera's calibration
+        matrix (3, 3), for which the middles of pixels have whole numbers. Where it looks beyond
+        what the camera can see, pixels are outside of the image.
     """
     step = -(-camera.width // DEPTH_WIDTH)
     height, width = camera.height // step, camera.width // step
@@ -117,8 +117,9 @@ def pinhole_pixels(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.floa
 
 def sampled(depth: NDArray[np.float32], pixels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth (H, W) at pixels (2, H, W) in m; NaN outside. Depths are not mixed across edges."""
+    u, v = pixels[0], pixels[1]
     nearest = cv2.remap(
-        depth, *pixels, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+        depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
     )
     return np.asarray(nearest, np.float32)
 
