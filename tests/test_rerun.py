@@ -130,7 +130,8 @@ def test_objects_have_points_a_trail_and_a_velocity(tmp_path: Path) -> None:
     assert result.objects is not None
     found, number = content(tmp_path / "objects.rrd"), result.objects.numbers[0]
     frames = len(result.objects.states(number))
-    for part in ("trail", "points", "velocity"):
+    assert found.rows["/world/objects/trails"] >= frames - 1
+    for part in ("points", "velocity"):
         assert found.rows[f"/world/objects/{number}/{part}"] >= frames > 5
     assert found.rows["/world/body/cam0/objects/regions"] > frames
     assert found.rows["/world/body/cam0/objects/tracks"] > frames

@@ -255,6 +255,9 @@ GROWING = (
     "path/groundtruth",
     "map/points",
     "keyframes",
+    "objects/trails",
+    "fixes",
+    "fixes/sigma",
 )
 """What accumulates in the world of a run."""
 
@@ -276,7 +279,7 @@ def odometry(shown: Shown, eye: Eye | None = None) -> Any:
     flat = [
         f"- {body}/cam{number}/{what}/**"
         for number in range(shown.cameras)
-        for what in ("tails", "features", "residuals", "rejected")
+        for what in ("tails", "features", "residuals", "rejected", "objects")
     ]
     grown = [f"{root}/{name}" for name in GROWING]
     spaces = [space(shown.title, root, ["$origin/**", *flat], grown, eye, body)]

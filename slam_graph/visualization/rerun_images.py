@@ -153,7 +153,7 @@ class CameraViews:
             if index >= self._detailed and not due:
                 continue
             entity = self._entity(index)
-            places = _on_screen(camera.pixels, shrink)
+            places = on_screen(camera.pixels, shrink)
             named = f"{entity}/features"
             self._stream.log_rows(named, rr.Points2D, positions=places, class_ids=fates)
             if due and index < self._detailed:
@@ -170,7 +170,7 @@ class CameraViews:
             self._rejecting.add(index)
             if not len(outliers):
                 self._rejecting.remove(index)
-            places = _on_screen(outliers.pixels, self._shrink[index])
+            places = on_screen(outliers.pixels, self._shrink[index])
             marks = rr.Points2D.from_fields(positions=places)
             self._stream.log(f"{self._entity(index)}/rejected", marks)
 
@@ -196,11 +196,11 @@ class CameraViews:
             seen = camera.pixels[rows][in_front]
             ends = seen + RESIDUAL_GAIN * (predicted - seen)
             shrink = self._shrink[index]
-            ways = _on_screen(np.stack([seen, ends], axis=1), shrink)
+            ways = on_screen(np.stack([seen, ends], axis=1), shrink)
             entity = f"{self._entity(index)}/residuals"
             ways = ways[self._visible(ways, _UNSEEN_RESIDUAL)]
             self._stream.log_rows(entity, rr.LineStrips2D, strips=ways)
-            marks = _on_screen(predicted, shrink)
+            marks = on_screen(predicted, shrink)
             self._stream.log_rows(f"{entity}/reprojected", rr.Points2D, positions=marks)
 
     def _visible(self, ways: FloatArray, least: float) -> NDArray[np.bool_]:
@@ -231,7 +231,7 @@ class _Tails:
         )
         ages = np.ones(len(camera), np.int64)
         ages[now] += self.ages[before]
-        self._ids, self._pixels, self.ages = camera.ids, _on_screen(camera.pixels, shrink), ages
+        self._ids, self._pixels, self.ages = camera.ids, on_screen(camera.pixels, shrink), ages
 
     def pieces(self) -> tuple[FloatArray, FloatArray]:
         """Ways (M, 2, 2) of the features since this was asked for last, and ages (M,)."""
@@ -243,7 +243,7 @@ class _Tails:
         return ways, self.ages[now].astype(np.float64)
 
 
-def _on_screen(pixels: FloatArray, shrink: int) -> FloatArray:
+def on_screen(pixels: FloatArray, shrink: int) -> FloatArray:
     """Where pixels (…, 2) are on the shrunken image: Rerun's pixel (0, 0) is from 0 to 1."""
     return np.asarray((pixels + 0.5) / shrink)
 

@@ -49,7 +49,12 @@ is high). Larger points are features of this frame: green, in the state; yellow,
 red, rejected by the gate. White points: past poses in the window; purple: keyframes of the
 algorithm or, where it has none, of loop closure or of the map, at the end of the run. Green: loop
 closures, large points at their ends, and the path after them. The arrow at the start is gravity.
-Ellipsoids at the body: 1σ and 3σ of its position.
+Ellipsoids at the body: 1σ and 3σ of its position. A dense cloud is the last depth image, coloured
+by depth. Orange points with ellipsoids (1σ) are position fixes; red, rejected by the gate.
+
+**Moving objects.** Each has a colour of its own: points, trail, arrow of its velocity, and in the
+first camera its features and the region around them, with its number. Purple: what moves and is of
+no object. Other features there go from green (static) to grey (it may move).
 
 **Cameras.** Tails are the last 12 places of a feature; dark is young, yellow is old. Points: green,
 tracked; yellow, new; light blue, seen by another camera too; red, rejected by the gate; orange,

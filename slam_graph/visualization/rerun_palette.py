@@ -38,6 +38,23 @@ AXES = (VERMILLION, GREEN, SKY)
 CYCLE = (ORANGE, SKY, GREEN, PURPLE, YELLOW, VERMILLION, BLUE, LIGHT_GREY)
 """Colours of things of which there is any number."""
 
+OBJECTS: tuple[Colour, ...] = (
+    (68, 68, 255),
+    (255, 255, 0),
+    (0, 255, 136),
+    (221, 0, 68),
+    (85, 221, 238),
+    (238, 187, 34),
+    (68, 102, 204),
+    (153, 68, 153),
+    (170, 255, 102),
+    (85, 238, 170),
+)
+"""Colours of moving objects. Okabe and Ito have too few: these were chosen one after another, each
+as far as possible in CIELAB from the background, from what else is beside objects (green, grey,
+purple, white, light blue, red) and from one another, also as people without red or green cones see
+them (Machado et al. 2009)."""
+
 _VIRIDIS: Colours = np.ascontiguousarray(
     cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8
 )

@@ -63,6 +63,11 @@ class ShownFrame(Protocol):
         ...
 
     @property
+    def georeferenced(self) -> bool:
+        """Whether the world is that of position fixes."""
+        ...
+
+    @property
     def objects(self) -> ObjectFrame | None:
         """What moves."""
         ...

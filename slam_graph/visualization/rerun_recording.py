@@ -119,8 +119,9 @@ class RerunRecording:
             recording: that was run, if its images or tracks and IMU samples are to be shown.
             images: whether images of the recording are shown.
         """
+        of_fixes = bool(run.metrics.get("world", {}).get("of_fixes", False))
         details = SavedDetails(
-            rig, points, timing, by_frame or {}, log, known_map, recording, images
+            rig, points, timing, by_frame or {}, log, known_map, recording, images, of_fixes
         )
         show_saved_run(self._stream, run, details)
 

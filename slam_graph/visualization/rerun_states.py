@@ -83,10 +83,15 @@ def _ellipsoid(covariance: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Half sizes (2, 3) of 1σ and 3σ of the position, m, and the rotation to their axes."""
     if covariance is None:
         return np.zeros((2, 3)), np.array([0.0, 0.0, 0.0, 1.0])
-    values, vectors = np.linalg.eigh(covariance[3:6, 3:6])
+    sigmas, quaternion = ellipsoid_axes(covariance[3:6, 3:6])
+    return np.array([sigmas, 3 * sigmas]), quaternion
+
+
+def ellipsoid_axes(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (3,) along the axes of a covariance (3, 3), and the rotation to them."""
+    values, vectors = np.linalg.eigh(covariance)
     vectors[:, 0] *= np.sign(np.linalg.det(vectors))
-    sigmas = np.sqrt(np.maximum(values, 0.0))
-    return np.array([sigmas, 3 * sigmas]), _quaternion(gtsam.Rot3(vectors))
+    return np.sqrt(np.maximum(values, 0.0)), _quaternion(gtsam.Rot3(vectors))
 
 
 def _quaternion(rotation: gtsam.Rot3) -> FloatArray:

@@ -17,6 +17,8 @@ from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.maps import SlamMap
 from slam_graph.sensors import CameraFrame, Rig
 from slam_graph.visualization.rerun_blueprints import KNOWN_MAP, RIG_M, Eye, Shown, odometry
+from slam_graph.visualization.rerun_depth import DepthView
+from slam_graph.visualization.rerun_fixes import FixViews
 from slam_graph.visualization.rerun_images import CameraViews, ImagesMode
 from slam_graph.visualization.rerun_map import MapLog, log_map, places_in_map
 from slam_graph.visualization.rerun_objects import ObjectViews
@@ -69,6 +71,7 @@ class RerunViewer:
         self._known_map = known_map
         self._series = SeriesLog(self._stream)
         self._steps = StepSeries(self._series)
+        self._fixes = FixViews(self._stream)
         self._log_handler = _LogHandler(self._stream)
         self._truth: Trajectory | None = None
         self._stamps_ns: list[int] = []
@@ -84,6 +87,7 @@ class RerunViewer:
         self._map = MapLog(self._stream, world)
         self._keyframes: set[int] = set()
         self._image_ns: int | None = None
+        self._fixes.begin(world)
 
     def open(self, rig: Rig, truth: Trajectory | None) -> None:
         """Send what does not change, and the layout."""
@@ -100,6 +104,7 @@ class RerunViewer:
         brief = self._images == "none"
         self._cameras = CameraViews(self._stream, rig, f"{self._world}/body", brief)
         self._cameras.mount(rig)
+        self._depth = DepthView(self._stream, f"{self._world}/depth", rig)
         self._objects = ObjectViews(self._stream, self._world, *self._cameras.first)
         self._outcome.style(f"{self._world}/path/causal", CAUSAL)
         for name, radius in {"features": -2.4, "map/points": POINT_RADIUS, "window": -3.0}.items():
@@ -148,9 +153,12 @@ class RerunViewer:
         images = frame.packet.frame
         if isinstance(images, CameraFrame) and self._wants_images(estimator, stamp_ns):
             self._cameras.show_images(images)
+            if frame.state is not None and not frame.waits:
+                self._depth.show(images, frame.state.world_T_body)
         self._cameras.show_tracks(features, frame.rejected, estimator.dynamic)
         if frame.objects is not None:
             self._objects.show(frame.objects, features)
+        self._fixes.show(frame, estimator)
         self._steps.add(number, stamp_ns, frame, estimator)
         if frame.state is None:
             return
@@ -181,7 +189,8 @@ class RerunViewer:
         if not self._keyframes:
             self._outcome.show_keyframes(result)
         best = result.smoothed or result.trajectory
-        eye = Eye.on(best.positions, self._map.points, around=RIG_M)
+        ways = np.concatenate([best.positions, self._objects.places])
+        eye = Eye.on(ways, self._map.points, around=RIG_M)
         self._arrange(plots, eye, places_in_map(result, self._known_map), self._series.spans)
 
     def close(self) -> None:

@@ -24,6 +24,8 @@ from slam_graph.visualization.rerun_blueprints import (
     Shown,
     odometry,
 )
+from slam_graph.visualization.rerun_depth import DepthView
+from slam_graph.visualization.rerun_fixes import FixLog
 from slam_graph.visualization.rerun_images import CameraViews
 from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
@@ -51,6 +53,7 @@ class SavedDetails:
         known_map: the map that the run was located in, if it is at hand.
         recording: that was run, if its images or tracks and IMU samples are to be shown.
         images: whether images of the recording are shown.
+        of_fixes: whether the world of the run is that of position fixes.
     """
 
     rig: Rig | None
@@ -61,6 +64,7 @@ class SavedDetails:
     known_map: SlamMap | None = None
     recording: Sequence | None = None
     images: bool = True
+    of_fixes: bool = False
 
 
 def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails) -> None:
@@ -180,18 +184,26 @@ def _show_inputs(
         DataError: if the recording has none of these frames.
     """
     assert details.recording is not None
+    inputs = _Inputs(
+        stream, series, cameras, details.recording.rig, details.images, details.of_fixes
+    )
     known, shown = set(stamps_ns.tolist()), 0
     for packet in details.recording.packets():
         if packet.frame.stamp_ns not in known:
             continue
         shown += 1
         number = int(outcome.frames(np.array([packet.frame.stamp_ns]))[0])
-        _show_packet(stream, series, cameras, number, packet, details.images)
+        inputs.show(number, packet)
     series.flush()
     if not shown:
         name = details.recording.info().name
         raise DataError(f"{name}: has none of the frames of the run; it is another recording")
-    return _IMU_PLOTS
+    return _plots_of(details.recording)
+
+
+def _plots_of(recording: Sequence) -> frozenset[str]:
+    """Entities of the plots of what a recording has beside its frames."""
+    return _IMU_PLOTS if recording.rig.has_imu else frozenset()
 
 
 def _cameras_shown(recording: Sequence, images: bool) -> int:
@@ -199,22 +211,47 @@ def _cameras_shown(recording: Sequence, images: bool) -> int:
     return len(recording.rig.cameras) if images or recording.info().content != "images" else 0
 
 
-def _show_packet(
-    stream: RerunStream,
-    series: SeriesLog,
-    cameras: CameraViews,
-    number: int,
-    packet: Packet,
-    images: bool,
-) -> None:
-    """A frame of a recording, and the IMU samples before it."""
-    none = np.zeros(0, np.int64)
-    stream.at(number, packet.frame.stamp_ns)
-    if isinstance(packet.frame, CameraFrame) and images:
-        cameras.show_images(packet.frame)
-    elif isinstance(packet.frame, FeatureFrame):
-        cameras.show_tracks(packet.frame, none, none)
-    add_imu(series, number, packet)
+class _Inputs:
+    """Logs the frames of a recording, and the IMU samples before each.
+
+    Args:
+        stream: where to.
+        series: of the plots.
+        cameras: of the world.
+        rig: of the recording.
+        images: whether images and depth are sent.
+        of_fixes: whether the world is that of position fixes.
+
+    Attributes:
+        depth: where depth images go.
+    """
+
+    def __init__(
+        self,
+        stream: RerunStream,
+        series: SeriesLog,
+        cameras: CameraViews,
+        rig: Rig,
+        images: bool,
+        of_fixes: bool = False,
+    ) -> None:
+        self._fixes = FixLog(stream, "world") if of_fixes else None
+        self._stream, self._series, self._cameras = stream, series, cameras
+        self.depth, self._images = DepthView(stream, "world/body/depth", rig), images
+
+    def show(self, number: int, packet: Packet) -> None:
+        """Log a frame by its number."""
+        none = np.zeros(0, np.int64)
+        self._stream.at(number, packet.frame.stamp_ns)
+        if isinstance(packet.frame, CameraFrame) and self._images:
+            self._cameras.show_images(packet.frame)
+            self.depth.show(packet.frame)
+        elif isinstance(packet.frame, FeatureFrame):
+            self._cameras.show_tracks(packet.frame, none, none)
+        if packet.aiding is not None and self._fixes is not None:
+            fixes = packet.aiding.fix_positions, packet.aiding.fix_covariances
+            self._fixes.add(*fixes, np.zeros(len(fixes[0]), np.bool_))
+        add_imu(self._series, number, packet)
 
 
 def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True) -> None:
@@ -229,10 +266,11 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
     truth = sequence.groundtruth()
     cameras = CameraViews(stream, sequence.rig, "world/body")
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    inputs = _Inputs(stream, series, cameras, sequence.rig, images)
     stamps_ns: list[int] = []
     for number, packet in enumerate(sequence.packets()):
         stamps_ns.append(packet.frame.stamp_ns)
-        _show_packet(stream, series, cameras, number, packet, images)
+        inputs.show(number, packet)
     series.flush()
     eye, frustum_m = None, _FRUSTUM_M[1]
     outcome = OutcomeLog(stream, "world", series, stamps_ns)
@@ -246,7 +284,8 @@ def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True)
         if len(truth):
             extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
             frustum_m = float(np.clip(_FRUSTUM_PART * extent_m, *_FRUSTUM_M))
-        eye = Eye.on(truth.positions, around=RIG_M)
+        eye = Eye.on(truth.positions, around=max(RIG_M, inputs.depth.far_m))
     cameras.mount(sequence.rig, frustum_m)
-    shown = Shown(cameras=_cameras_shown(sequence, images), plots=_IMU_PLOTS, title="Recording")
+    plots = _plots_of(sequence)
+    shown = Shown(cameras=_cameras_shown(sequence, images), plots=plots, title="Recording")
     stream.arrange(odometry(shown, eye))

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Position fixes in Rerun: those of the recording, in their own world, as good as they say."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun_rows import Row, colour, rows_of
+from scipy.spatial.transform import Rotation
+
+import slam_graph as sg
+from slam_graph.arrays import FloatArray
+from slam_graph.datasets import Sequence
+from slam_graph.geometry import interpolate
+from slam_graph.results import RunResult
+from slam_graph.sensors import AidingData
+from slam_graph.visualization import RerunRecording
+from slam_graph.visualization.rerun_blueprints import GROWING
+from slam_graph.visualization.rerun_fixes import FIX_SIGMA, FIXES, FixLog
+from slam_graph.visualization.rerun_palette import ORANGE, VERMILLION
+from slam_graph.visualization.rerun_stream import RerunStream
+
+
+def drive() -> Sequence:
+    """A car without an IMU, every fifth of whose fixes is off by 10 m."""
+    return sg.simulate(
+        trajectory="car",
+        duration_s=40.0,
+        with_imu=False,
+        seed=1,
+        tracks={"features": 60},
+        gnss={"sigma_m": 1.0, "multipath": 0.2},
+    )
+
+
+def fixes_of(sequence: Sequence) -> AidingData:
+    """All of a recording."""
+    return AidingData.concatenate(p.aiding for p in sequence.packets() if p.aiding is not None)
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Mapping[str, list[Row]]]:
+    path = tmp_path_factory.mktemp("fixes") / "fixes.rrd"
+    viewer = RerunRecording("save", "fixes", path).viewer()
+    result = sg.run(drive(), viewer=viewer, final_ba={"enabled": False})
+    assert not result.warnings["viewer_failed"]
+    return result, rows_of(path)
+
+
+def shown(rows: Mapping[str, list[Row]]) -> tuple[FloatArray, list[tuple[int, int, int]]]:
+    """Places (N, 3) and colours of the fixes that are shown."""
+    (entity,) = (name for name in rows if name.endswith(f"/{FIXES}"))
+    places = np.concatenate([row["positions"] for row in rows[entity]])
+    return places, [colour(packed) for row in rows[entity] for packed in row["colors"]]
+
+
+def test_all_fixes_are_in_the_world_of_the_fixes(
+    watched: tuple[RunResult, Mapping[str, list[Row]]],
+) -> None:
+    _, rows = watched
+    assert f"/world/{FIXES}" not in rows, "the world of the beginning is not that of the fixes"
+    (entity,) = (name for name in rows if name.endswith(f"/{FIXES}"))
+    world = entity.removesuffix(f"/{FIXES}")
+    places, _ = shown(rows)
+    # the first row has those from before the alignment, which began this world
+    begun = len(rows[entity][0]["positions"])
+    assert begun > 3
+    assert f"/world_from_{rows[entity][0]['frame']}" == world
+    np.testing.assert_allclose(places, fixes_of(drive()).fix_positions, rtol=1e-6)
+    path = np.concatenate([row["translation"] for row in rows[f"{world}/body"]])
+    assert np.median(np.linalg.norm(places[begun:, None] - path, axis=2).min(axis=1)) < 2.0
+
+
+def test_fixes_that_the_gate_rejects_are_red(
+    watched: tuple[RunResult, Mapping[str, list[Row]]],
+) -> None:
+    _, rows = watched
+    places, colours = shown(rows)
+    (entity,) = (name for name in rows if name.endswith(f"/{FIXES}"))
+    begun = len(rows[entity][0]["positions"])
+    red = np.array([seen == VERMILLION for seen in colours])
+    assert set(colours) == {ORANGE, VERMILLION}
+    assert not red[:begun].any(), "those that told where the world is went through no gate"
+    truth = drive().groundtruth()
+    assert truth is not None
+    near, valid = interpolate(truth, fixes_of(drive()).fix_stamps_ns, 1.0)
+    # the truth and the fixes are of one world here
+    error = np.linalg.norm(places[valid] - near.positions, axis=1)[begun:]
+    later = red[valid][begun:]
+    assert later.sum() >= 2
+    assert error[later].min() > 5.0 > np.median(error[~later])
+
+
+def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
+    viewer = RerunRecording("save", "unused", tmp_path / "unused.rrd").viewer()
+    off = {"backend.gnss.enabled": False, "final_ba.enabled": False}
+    result = sg.run(drive(), viewer=viewer, overrides=off)
+    assert not result.warnings["viewer_failed"]
+    assert not any(FIXES in name.split("/") for name in rows_of(tmp_path / "unused.rrd"))
+
+
+def test_a_saved_run_shows_the_fixes_of_its_recording(
+    watched: tuple[RunResult, Mapping[str, list[Row]]], tmp_path: Path
+) -> None:
+    result, _ = watched
+    assert result.metrics["world"]["of_fixes"]
+    with RerunRecording("save", "saved", tmp_path / "saved.rrd") as recording:
+        recording.show_run(
+            result, np.zeros((0, 3)), {}, rig=result.causal_rig, recording=drive(), images=False
+        )
+    places, colours = shown(rows_of(tmp_path / "saved.rrd"))
+    estimated = fixes_of(drive()).within(None, int(result.trajectory.stamps_ns[-1]))
+    np.testing.assert_allclose(places, estimated.fix_positions[-len(places) :], rtol=1e-6)
+    assert len(places) > 30
+    assert set(colours) == {ORANGE}, "files do not say which were rejected"
+
+
+def test_ellipsoids_are_the_covariances(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    axes = rng.normal(size=(20, 3, 3))
+    covariances = axes @ axes.transpose(0, 2, 1) + 1e-3 * np.eye(3)
+    places = rng.normal(scale=50.0, size=(20, 3))
+    stream = RerunStream("save", "fixes", tmp_path / "fixes.rrd")
+    log = FixLog(stream, "world")
+    stream.at(0, 0)
+    log.add(places, covariances, np.zeros(20, np.bool_))
+    stream.close()
+    (row,) = rows_of(tmp_path / "fixes.rrd")[f"/world/{FIX_SIGMA}"]
+    np.testing.assert_allclose(row["centers"], places, rtol=1e-6)
+    R = Rotation.from_quat(row["quaternions"]).as_matrix()
+    variances = np.square(row["half_sizes"])
+    again = np.einsum("nij,nj,nkj->nik", R, variances, R)
+    np.testing.assert_allclose(again, covariances, rtol=1e-4, atol=1e-4)
+    assert {FIXES, FIX_SIGMA} <= set(GROWING), "or the viewer shows the last one only"
