@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 from rerun_rows import Row, colour, rows_of
 from scipy.spatial.transform import Rotation
 
@@ -115,6 +116,9 @@ def test_a_saved_run_shows_the_fixes_of_its_recording(
     np.testing.assert_allclose(places, estimated.fix_positions[-len(places) :], rtol=1e-6)
     assert len(places) > 30
     assert set(colours) == {ORANGE}, "files do not say which were rejected"
+    entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "saved.rrd").stream()}
+    assert "/world/gravity" not in entities, "without an IMU nothing tells where it points"
+    assert "/world/path/causal" in entities
 
 
 def test_ellipsoids_are_the_covariances(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
     outcome.show_points(details.points)
     outcome.show_keyframes(run)
     outcome.show_legend()
-    if len(run.trajectory):
+    if len(run.trajectory) and (details.rig is None or details.rig.has_imu):
         outcome.show_gravity(run.trajectory.positions[0])
     plots |= _show_timing(series, stamps_ns, details.timing)
     plots |= _show_frames(series, details.by_frame)
