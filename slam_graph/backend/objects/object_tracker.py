@@ -256,24 +256,15 @@ class ObjectTracker:
         """Tracks that move together begin an object."""
         config = self._config
         for label, group in self._new_groups(test, sigma_px):
-            policies = self._policies_at(sigma_px)
-            item = TrackedObject(self._next, label, group, self._window, ego, policies, config)
+            item = TrackedObject(
+                self._next, label, group, self._window, ego, self._policies, config
+            )
             if not item.begun:
                 continue
             self._recognise(item, ego)
             if item.number == self._next:
                 self._next += 1
             self.objects.append(item)
-
-    def _policies_at(self, sigma_px: float) -> tuple[AlgorithmConfig, BackendConfig]:
-        """Algorithm and settings of the estimator of an object, with this noise of its tracks.
-
-        With less than there is it would follow the noise, with more it would lag behind: the
-        dynamics of an object say little beside those of a platform with an IMU.
-        """
-        algorithm, backend = self._policies
-        noise = backend.noise.model_copy(update={"pixel_sigma": sigma_px})
-        return algorithm, backend.model_copy(update={"noise": noise})
 
     def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
         """Labels and tracks of what begins to move; without masks labels are 0."""
