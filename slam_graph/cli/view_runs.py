@@ -111,8 +111,8 @@ def _compared(
 
     from slam_graph.evaluation import ape
 
-    position = ape(reference, run.trajectory, "trans_part", "yaw")
-    rotation = ape(reference, run.trajectory, "angle_deg", "yaw")
+    position = ape(reference, run.trajectory, "trans_part", run.unmeasured)
+    rotation = ape(reference, run.trajectory, "angle_deg", run.unmeasured)
     moved = position.similarity.apply(run.trajectory)
     return {
         "path": moved.positions,

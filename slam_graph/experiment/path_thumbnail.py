@@ -12,7 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
-from slam_graph.geometry import AlignmentMode, Trajectory
+from slam_graph.geometry import Trajectory
 from slam_graph.results import SavedRun
 
 TRUE, CAUSAL, SMOOTHED = "#7F7F7F", "#0072B2", "#D55E00"
@@ -54,14 +54,13 @@ def thumbnail(run: SavedRun) -> str:
 def _paths(run: SavedRun) -> list[tuple[str, FloatArray]]:
     """Colour and horizontal path of truth and estimates, in the world of the truth."""
     truth = run.groundtruth
-    free: AlignmentMode = run.metrics["extent"].get("unmeasured", "yaw")
     drawn = [] if truth is None else [(TRUE, _thinned(truth))]
     for color, estimate in ((CAUSAL, run.trajectory), (SMOOTHED, run.smoothed)):
         if estimate is None or not len(estimate):
             continue
         if truth is not None:
             try:
-                found = ape(truth, estimate, "trans_part", free)
+                found = ape(truth, estimate, "trans_part", run.unmeasured)
                 estimate = found.similarity.apply(estimate)
             except DataError:  # no common time: the two cannot be shown in one world
                 drawn = [path for path in drawn if path[0] != TRUE]

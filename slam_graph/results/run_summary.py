@@ -193,7 +193,7 @@ class RunSummary(Displayed):
         metrics = self.metrics
         data, extent, timing = metrics["dataset"], metrics["extent"], metrics["timing"]
         loops = metrics["loop_closure"] or {}
-        mode = extent.get("alignment", "yaw")
+        mode = extent.get("unmeasured", "yaw")
         cameras = f"{metrics['cameras']} camera{'' if metrics['cameras'] == 1 else 's'}"
         return {
             "recording": f"{data['name']} ({data['format']}, {data['content']}, {cameras})",
@@ -223,8 +223,7 @@ class RunSummary(Displayed):
 
 
 def _errors(accuracy: dict[str, Any] | None, mode: str) -> str | None:
-    """Root mean square errors after an alignment; in yaw and position if that is none."""
-    mode = "yaw" if mode == "none" else mode
+    """Root mean square errors after an alignment."""
     table = (accuracy or {}).get(mode, {}).get("ate")
     if table is None:
         return None

@@ -16,7 +16,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import read_kalibr
 from slam_graph.errors import DataError
-from slam_graph.geometry import Trajectory
+from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import result_files as names
 from slam_graph.results.frame_table import KEYFRAME, NEES
 from slam_graph.results.map_output import load_map, read_ply
@@ -200,6 +200,13 @@ class SavedRun(RunSummary):
     def start_was_given(self) -> bool:
         """Whether the first state came with the data, in the world of the truth."""
         return bool(self.metrics["extent"].get("start_was_given", False))
+
+    @property
+    def unmeasured(self) -> AlignmentMode:
+        """The alignment that takes away what nothing measured, and no more."""
+        # runs of before recordings without an IMU were known do not say it
+        mode: AlignmentMode = self.metrics["extent"].get("unmeasured", "yaw")
+        return mode
 
     @cached_property
     def by_frame(self) -> dict[str, Any]:
