@@ -29,6 +29,8 @@ from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets.streams.mask_images import MaskFolder
+from slam_graph.datasets.streams.object_truth import read_object_truth
 from slam_graph.errors import SlamGraphError
 from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
@@ -246,6 +248,39 @@ def test_masks(tmp_path: Path) -> None:
     drawn[10:400, 30:500] = 255
     assert cv2.imwrite(str(path), drawn)
     tried(path, lambda: camera_mask(camera, path, 21), 60)
+
+
+@pytest.mark.parametrize("name", ["boxes.csv", "classes.csv", "100.png"])
+def test_masks_of_objects(tmp_path: Path, name: str) -> None:
+    drawn = np.zeros((40, 60), np.uint16)
+    drawn[10:30, 20:40] = 7
+    assert cv2.imwrite(str(tmp_path / "100.png"), drawn)
+    boxes = "#stamp,label,l,t,r,b\n20000000,3,20,10,39,29\n30000000,300,1.5,-10,3,9\n"
+    (tmp_path / "boxes.csv").write_text(boxes)
+    (tmp_path / "classes.csv").write_text("7,car\n3,person on a bike\n")
+
+    def read() -> None:
+        masks = MaskFolder(tmp_path)
+        for stamp_ns in (100, 20_000_000, 30_000_000):
+            masks.image(stamp_ns, (60, 40))
+
+    tried(tmp_path / name, read)
+
+
+def test_true_poses_of_objects(tmp_path: Path) -> None:
+    path = tmp_path / "objects_truth.csv"
+    rows = (f"{k},{1 + k % 2},{k},0.5,-1e-3,0,0,0.6,0.8\n" for k in range(1, 8))
+    path.write_text("#timestamp_ns,object,x_m,y_m,z_m,qx,qy,qz,qw\n" + "".join(rows))
+    tried(path, lambda: read_object_truth(path))
+
+
+@pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv"])
+def test_aiding(tmp_path: Path, name: str) -> None:
+    root = tmp_path / "flight"
+    with_aiding = {"gnss": {"sigma_m": 1.0, "rate_hz": 5.0}, "odometry": {"enabled": True}}
+    simulate(kind="images", duration_s=0.5, rate_hz=4.0, cameras=1, **with_aiding).save(root)
+    file = next(root.rglob(name))
+    tried(file, lambda: read_all(root), 50)
 
 
 def test_maps(tmp_path: Path) -> None:

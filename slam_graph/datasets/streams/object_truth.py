@@ -47,7 +47,8 @@ def read_object_truth(path: Path) -> dict[int, Trajectory]:
     """
     blocks = [rows.parse(_COLUMNS, "true pose of an object") for rows in read_rows(path)]
     table = np.concatenate(blocks) if blocks else np.zeros(0, np.dtype(_COLUMNS))
-    lengths = np.linalg.norm(table["q"], axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # they are judged below
+        lengths = np.linalg.norm(table["q"], axis=1)
     finite = np.isfinite(table["position"]).all() and np.isfinite(lengths).all()
     if not finite or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
         raise DataError(f"{path}: a pose is not finite, or a quaternion is not of unit length")
