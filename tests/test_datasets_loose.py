@@ -272,7 +272,7 @@ def test_colour_and_sixteen_bits_become_grey_and_other_sizes_are_counted(tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["video", "images"])
-def test_without_imu_and_depth_one_camera_says_what_is_missing(tmp_path: Path, kind: str) -> None:
+def test_one_camera_alone_says_what_it_waits_for(tmp_path: Path, kind: str) -> None:
     """The calibration then does not need to say where an IMU is."""
     if kind == "video":
         path = write_video(tmp_path)
@@ -289,7 +289,7 @@ def test_without_imu_and_depth_one_camera_says_what_is_missing(tmp_path: Path, k
     assert all(len(seen) > 0 for seen in features)
     result = run(sequence)
     assert result.status == "not_initialized"
-    assert "a second camera or a depth image gives the depth" in result.message
+    assert "waiting for frames that share 20 features" in result.message
     with pytest.raises(ConfigError, match="has no IMU; use constant_velocity"):
         run(sequence, overrides=["backend.dynamics.model=imu"])
 
