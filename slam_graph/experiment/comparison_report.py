@@ -99,7 +99,7 @@ def _cells(row: Table) -> tuple[str, ...]:
         _number(row["ate_m"][row["alignment"]], 4),
         *(_number(row["ate_m"][mode], 4) for mode in ALIGNMENTS),
         _number(row["orientation_deg"][row["alignment"]], 3),
-        row["alignment"],
+        "-" if row["ate_m"][row["alignment"]] is None else row["alignment"],
         _number(row["nees"]["orientation"], 2),
         _number(row["nees"]["position"], 2),
         _number(row["nees"]["pose"], 2),
