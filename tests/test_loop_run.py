@@ -113,7 +113,9 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
     if saved.nees_series is not None and result.nees_series is not None:
         for true, found in zip(result.nees_series, saved.nees_series, strict=True):
             np.testing.assert_allclose(found, true, rtol=1e-3)
+    assert saved.unmeasured == result.unmeasured
     tested = trajectories | {
+        "unmeasured",
         "loop_ends_ns",
         "keyframes_ns",
         "nees_series",

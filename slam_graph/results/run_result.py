@@ -17,7 +17,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
 from slam_graph.datasets import kalibr_text
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.geometry import StateHistory, Trajectory
+from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
 from slam_graph.results.localization_result import LocalizationLog
@@ -142,6 +142,11 @@ class RunResult(RunSummary):
     def trajectory(self) -> Trajectory:
         """The causal estimate, `world_T_body` of every frame since initialisation."""
         return self.history.trajectory()
+
+    @property
+    def unmeasured(self) -> AlignmentMode:
+        """The alignment that takes away what nothing measured, and no more."""
+        return self.history.free
 
     @property
     def sigmas(self) -> FloatArray:
