@@ -243,6 +243,16 @@ def test_what_was_named_and_cannot_be_read_is_one_line(
     assert str(path) in str(error.value)
 
 
+def test_masks_of_a_bag_are_a_folder_and_no_topic(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", COUNT, extra=write_fixes("/fix"))
+    masks = tmp_path / "labels"
+    masks.mkdir()
+    (masks / "boxes.csv").write_text(f"{STAMPS[0]},1,1,1,5,5\n")
+    sequence = open_dataset(path, sources={"masks": str(masks)})
+    assert sequence.masks == 1
+    assert len(sequence.aiding.fix_stamps_ns) == COUNT
+
+
 # --- odometry in bags -----------------------------------------------------------------------------
 
 

@@ -44,7 +44,7 @@ class BagAiding:
 
     Args:
         bag: the bag.
-        named: topics or files of ``gnss`` and ``odometry``.
+        named: topics or files of ``gnss`` and ``odometry``; others are left as they are.
         body: the topic whose frame is the body.
         diagnostics: counts fixes and samples that are dropped, and fixes on several topics of
             which none was named (`gnss_left_out`).
@@ -68,8 +68,8 @@ class BagAiding:
                 raise DataError(
                     f"{bag.path}: '{topics[sensor]}' is of type {other}; expected {kind}"
                 )
-        for sensor, place in self.in_files.items():
-            if not Path(place).is_file():
+            place = self.in_files.get(sensor)
+            if place is not None and not Path(place).is_file():
                 what = f"no topic and no file '{place}' of '{sensor}'"
                 raise DataError(f"{bag.path}: {what}; the bag has {bag.listed()}")
         found = bag.of_type(NAV_SAT_FIX)

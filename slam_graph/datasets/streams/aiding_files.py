@@ -145,10 +145,12 @@ def fixes_from(
         frame: whether positions are local, and the datum; the first fix if None.
     """
     local, datum = frame
-    good = np.isfinite(positions).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    whole = np.column_stack([positions, covariances.reshape(-1, 9)])
+    good = np.isfinite(whole).all(axis=1)
     good &= (np.diagonal(covariances, axis1=1, axis2=2) > 0).all(axis=1)
     if not local:
         good &= (np.abs(positions) <= _LARGEST).all(axis=1)
+    good = np.asarray(good, np.bool_)
     kept = kept_of(stamps_ns, good, "gnss_dropped", f"{path}: fix", diagnostics)
     stamps_ns, positions, covariances = stamps_ns[kept], positions[kept], covariances[kept]
     if not local and len(positions):
