@@ -107,6 +107,7 @@ def write_oxts(folder: Path, count: int, period_ns: int) -> None:
         numbers[6:11] = [0.0, 10.0, 10.0, 0.0, 1.0]
         numbers[11:14] = [0.5, 0.1, 9.81]
         numbers[17:20] = [0.01, 0.02, 0.1]
+        numbers[23] = 0.05  # accuracy of the position
         (folder / "data" / f"{k:010d}.txt").write_text(" ".join(map(repr, numbers.tolist())))
 
 

@@ -101,6 +101,32 @@ class BagWriter:
         model = (height, width, "plumb_bob")
         return self.make("sensor_msgs/msg/CameraInfo", header, *model, *matrices, 0, 0, region)
 
+    def fix(
+        self,
+        stamp_ns: int,
+        place: Any,
+        covariance: Any = np.eye(3),  # noqa: B008 - read only
+        kind: int = 2,
+        status: int = 0,
+    ) -> Any:
+        """A `NavSatFix`: latitude, longitude, altitude; the type of the covariance is `kind`."""
+        state = self.make("sensor_msgs/msg/NavSatStatus", status, 1)
+        numbers = (*map(float, place), np.array(covariance, np.float64).ravel(), kind)
+        header = self.header(stamp_ns, "antenna")
+        return self.make("sensor_msgs/msg/NavSatFix", header, state, *numbers)
+
+    def odometry(self, stamp_ns: int, t: Any, q: Any, child: str = "base") -> Any:
+        """q is x, y, z, w."""
+        place = self.make("geometry_msgs/msg/Point", *map(float, t))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        pose = self.make("geometry_msgs/msg/Pose", place, turn)
+        twist = self.make("geometry_msgs/msg/Twist", zero, zero)
+        known = self.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
+        moved = self.make("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
+        header = self.header(stamp_ns, "odom")
+        return self.make("nav_msgs/msg/Odometry", header, child, known, moved)
+
     def transform(self, stamp_ns: int, parent: str, child: str, t: Any, q: Any) -> Any:
         """q is x, y, z, w."""
         move = self.make("geometry_msgs/msg/Vector3", *map(float, t))

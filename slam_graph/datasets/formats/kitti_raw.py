@@ -35,7 +35,7 @@ from slam_graph.datasets.formats.kitti_files import (
 )
 from slam_graph.datasets.formats.tum_rgbd import rectifier
 from slam_graph.datasets.sequence import ReaderOptions
-from slam_graph.datasets.streams.aiding_files import fixes_from
+from slam_graph.datasets.streams.aiding_files import covariances_of, fixes_from
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
@@ -106,7 +106,8 @@ class _Oxts:
         """The positions of the unit as fixes, with the accuracy that it says (value 23), m."""
         values = np.array([self._read(k) for k in range(len(self.stamps_ns))])
         sigmas = np.repeat(values[:, _ACCURACY, None], 3, axis=1)
-        return fixes_from(self.stamps_ns, values[:, POSITION], sigmas, self.folder, diagnostics)
+        found = self.stamps_ns, values[:, POSITION], covariances_of(sigmas)
+        return fixes_from(*found, self.folder, diagnostics)
 
     def trajectory(self, diagnostics: Diagnostics) -> Trajectory:
         """Poses of the unit in a frame east, north, up with its origin at the first pose.

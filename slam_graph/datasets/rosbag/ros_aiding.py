@@ -5,15 +5,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import pose_of
 from slam_graph.datasets.rosbag.ros_topics import frame_of, path_between
-from slam_graph.datasets.streams.aiding_files import fixes_from
+from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData
@@ -21,8 +24,14 @@ from slam_graph.sensors import AidingData
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
-_UNKNOWN_SIGMA_M = np.array([5.0, 5.0, 10.0])
-"""Standard deviations where a message has no covariance."""
+_UNKNOWN = np.diag([25.0, 25.0, 100.0])
+"""Covariance where a message has none: sigmas of 5 m, 10 m upwards."""
+_TYPE_UNKNOWN, _TYPE_KNOWN = 0, 3
+"""Constants of `NavSatFix`; between them only the diagonal is known."""
+_SMALLEST_RATIO = 1e-12
+"""Of the eigenvalues of a covariance: matrices beyond that are not positive definite in numbers."""
+_SHORTEST_QUATERNION = 0.5
+"""Quaternions that are shorter were never set."""
 
 Messages = Callable[[list[str]], Iterable[Message]]
 
@@ -35,15 +44,16 @@ class BagAiding:
 
     Args:
         bag: the bag.
-        named: topics or files of ``gnss`` and ``odometry``.
+        named: topics or files of ``gnss`` and ``odometry``; others are left as they are.
         body: the topic whose frame is the body.
-        diagnostics: counts fixes and samples that are dropped.
+        diagnostics: counts fixes and samples that are dropped, and fixes on several topics of
+            which none was named (`gnss_left_out`).
 
     Attributes:
         in_files: what of `named` is not a topic.
 
     Raises:
-        DataError: if a topic is of another type.
+        DataError: if a topic is of another type, or what was named is neither topic nor file.
     """
 
     def __init__(
@@ -54,13 +64,20 @@ class BagAiding:
         self.in_files = {s: place for s, place in named.items() if place not in bag.topics}
         for sensor, kind in (("gnss", NAV_SAT_FIX), ("odometry", ODOMETRY)):
             if sensor in topics and bag.topics[topics[sensor]] != kind:
-                found = bag.topics[topics[sensor]]
+                other = bag.topics[topics[sensor]]
                 raise DataError(
-                    f"{bag.path}: '{topics[sensor]}' is of type {found}; expected {kind}"
+                    f"{bag.path}: '{topics[sensor]}' is of type {other}; expected {kind}"
                 )
-        only = bag.of_type(NAV_SAT_FIX)
-        if "gnss" not in named and len(only) == 1:
-            topics["gnss"] = only[0]
+            place = self.in_files.get(sensor)
+            if place is not None and not Path(place).is_file():
+                what = f"no topic and no file '{place}' of '{sensor}'"
+                raise DataError(f"{bag.path}: {what}; the bag has {bag.listed()}")
+        found = bag.of_type(NAV_SAT_FIX)
+        if "gnss" not in named and len(found) == 1:
+            topics["gnss"] = found[0]
+        elif "gnss" not in named and found:
+            several = f"fixes are on several topics ({', '.join(found)})"
+            diagnostics.warn("gnss_left_out", f"{bag.path}: {several}; choose with --topic gnss=…")
         self._topics = topics
 
     def read(
@@ -81,18 +98,21 @@ class BagAiding:
         return files
 
     def _fixes(self, messages: Iterable[Message], stamp_ns: Callable[[Message], int]) -> AidingData:
-        stamps, places, sigmas = [], [], []
+        stamps: list[int] = []
+        places: list[list[float]] = []
+        covariances: list[FloatArray] = []
         for message in messages:
-            fix = message.decode()
             stamps.append(stamp_ns(message))
-            solved = fix.status.status >= 0
+            fix = _decoded(message)
+            solved = fix is not None and fix.status.status >= 0
             places.append([fix.latitude, fix.longitude, fix.altitude] if solved else [np.nan] * 3)
-            variances = np.asarray(fix.position_covariance).reshape(3, 3).diagonal()
-            known = fix.position_covariance_type > 0 and np.all(variances > 0)
-            sigmas.append(np.sqrt(variances) if known else _UNKNOWN_SIGMA_M)
-        columns = np.array(stamps, np.int64), np.array(places).reshape(-1, 3)
+            covariances.append(_covariance_of(fix) if solved else _UNKNOWN)
         return fixes_from(
-            *columns, np.array(sigmas).reshape(-1, 3), self._bag.path, self._diagnostics
+            np.array(stamps, np.int64),
+            np.array(places).reshape(-1, 3),
+            np.array(covariances).reshape(-1, 3, 3),
+            self._bag.path,
+            self._diagnostics,
         )
 
     def _with_odometry(
@@ -100,29 +120,52 @@ class BagAiding:
     ) -> AidingData:
         """With the poses of the body that the poses of the base mean."""
         stamps: list[int] = []
-        positions, quaternions = [], []
-        base_T_body: gtsam.Pose3 | None = None
+        rows: list[list[float]] = []
+        base: str | None = None
         for message in messages:
-            found, at_ns = message.decode(), stamp_ns(message)
-            x, y, z, *turn = pose_of(found, ODOMETRY)
-            if base_T_body is None:
-                base, body = str(found.child_frame_id), frame_of(self._bag, self._body)
-                base_T_body = path_between(self._bag, base, body) if base else gtsam.Pose3()
-            if not np.isfinite([x, y, z, *turn]).all() or np.linalg.norm(turn) < 0.5:
-                self._diagnostics.warn(
-                    "odometry_dropped", f"{self._bag.path}: a pose is not finite"
-                )
-                continue
-            if stamps and at_ns <= stamps[-1]:
-                self._diagnostics.warn("odometry_dropped", f"{self._bag.path}: not in order")
-                continue
-            rotation = gtsam.Rot3.Quaternion(turn[3], *turn[:3])
-            pose = gtsam.Pose3(rotation, np.array([x, y, z])).compose(base_T_body)
-            stamps.append(at_ns)
-            positions.append(pose.translation())
-            quaternions.append(Rotation.from_matrix(pose.rotation().matrix()).as_quat())
-        return data.with_odometry(
-            np.array(stamps, np.int64),
-            np.array(positions).reshape(-1, 3),
-            np.array(quaternions).reshape(-1, 4),
-        )
+            stamps.append(stamp_ns(message))
+            found = _decoded(message)
+            rows.append([np.nan] * 7 if found is None else pose_of(found, ODOMETRY))
+            if base is None and found is not None:
+                base = str(found.child_frame_id)
+        stamps_ns, poses = np.array(stamps, np.int64), np.array(rows).reshape(-1, 7)
+        lengths = np.linalg.norm(poses[:, 3:], axis=1)
+        good = np.isfinite(poses).all(axis=1) & (lengths >= _SHORTEST_QUATERNION)
+        what = f"{self._bag.path}: odometry"
+        kept = kept_of(stamps_ns, good, "odometry_dropped", what, self._diagnostics)
+        if not len(kept):
+            return data
+        base_T_body = self._mounting(base) if base else gtsam.Pose3()
+        turns = Rotation.from_quat(poses[kept, 3:])  # of length 1 from here on
+        places = poses[kept, :3] + turns.apply(np.array(base_T_body.translation()))
+        turns = turns * Rotation.from_matrix(np.array(base_T_body.rotation().matrix()))
+        return data.with_odometry(stamps_ns[kept], places, turns.as_quat())
+
+    def _mounting(self, base: str) -> gtsam.Pose3:
+        """base_T_body of the frame whose poses the odometry has."""
+        otherwise = "the odometry cannot be used, leave out --topic odometry=…"
+        return path_between(self._bag, base, frame_of(self._bag, self._body), otherwise)
+
+
+def _decoded(message: Message) -> Any:
+    """A message; None where it is damaged."""
+    try:
+        return message.decode()
+    except DataError:
+        return None
+
+
+def _covariance_of(fix: Any) -> FloatArray:
+    """The covariance (3, 3) of a `NavSatFix`, east, north, up, m².
+
+    The correlations are used if the message says that they are known, and the matrix is one.
+    """
+    matrix = np.asarray(fix.position_covariance, np.float64).reshape(3, 3)
+    if fix.position_covariance_type == _TYPE_UNKNOWN or not (matrix.diagonal() > 0).all():
+        return _UNKNOWN
+    if fix.position_covariance_type == _TYPE_KNOWN and np.isfinite(matrix).all():
+        symmetric = 0.5 * matrix + 0.5 * matrix.T
+        values = np.linalg.eigvalsh(symmetric)
+        if values[0] > _SMALLEST_RATIO * values[-1]:
+            return np.asarray(symmetric)
+    return np.diag(matrix.diagonal())

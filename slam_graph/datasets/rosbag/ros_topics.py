@@ -162,13 +162,22 @@ def own_camera(bag: Bag, topic: str) -> Camera:
     return _camera(bag, info, rectified="rect" in topic.rpartition("/")[2])
 
 
-def path_between(bag: Bag, begin: str, end: str) -> gtsam.Pose3:
+_OTHERWISE = "give --calibration"
+
+
+def path_between(bag: Bag, begin: str, end: str, otherwise: str = _OTHERWISE) -> gtsam.Pose3:
     """begin_T_end of two frames, along ``/tf_static``.
+
+    Args:
+        bag: the bag.
+        begin: a frame.
+        end: another one.
+        otherwise: what to do if they are not connected, for the error.
 
     Raises:
         DataError: if it does not connect them.
     """
-    return _path(bag, _static_transforms(bag), begin, end)
+    return _path(bag, _static_transforms(bag), begin, end, otherwise)
 
 
 def _first(bag: Bag, topic: str) -> Any:
@@ -232,7 +241,11 @@ def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:
 
 
 def _path(
-    bag: Bag, transforms: dict[str, dict[str, gtsam.Pose3]], begin: str, end: str
+    bag: Bag,
+    transforms: dict[str, dict[str, gtsam.Pose3]],
+    begin: str,
+    end: str,
+    otherwise: str = _OTHERWISE,
 ) -> gtsam.Pose3:
     """begin_T_end, along the static transforms."""
     begin, end = _plain(begin), _plain(end)
@@ -246,8 +259,8 @@ def _path(
                 queue.append(other)
     if end not in reached:
         raise DataError(
-            f"{bag.path}: {_STATIC_TOPIC} does not connect '{begin}' (IMU or camera) with the "
-            f"camera ('{end}'); give --calibration"
+            f"{bag.path}: {_STATIC_TOPIC} does not connect the frame '{begin}' with '{end}'; "
+            f"{otherwise}"
         )
     return reached[end]
 

@@ -22,9 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import Rows, read_rows
 from slam_graph.datasets.streams.geodesy import Datum, local_positions
+from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData, Packet
@@ -43,6 +44,8 @@ _NMEA_QUALITY_SIGMA_M = {"4": 0.02, "5": 0.3}
 """The same of a carrier-phase solution: integers fixed, or not."""
 _VERTICAL = 2.0
 """Heights are so much less accurate."""
+_LARGEST = np.array([90.0, 360.0, 1e6])
+"""Latitudes and longitudes (degrees) and heights (m) are no larger."""
 
 
 def read_aiding(
@@ -109,14 +112,24 @@ def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
     if not stamps:
         raise DataError(f"{path}: no fixes in this file")
     local = not nmea and "latitude" not in header
-    found = np.concatenate(stamps), np.concatenate(positions), np.concatenate(sigmas)
+    covariances = covariances_of(np.concatenate(sigmas))
+    found = np.concatenate(stamps), np.concatenate(positions), covariances
     return fixes_from(*found, path, diagnostics, (local, datum))
+
+
+def covariances_of(sigmas: FloatArray) -> FloatArray:
+    """Covariances (N, 3, 3) of standard deviations (N, 3); NaN of those that are not positive."""
+    with np.errstate(over="ignore"):  # what is too large is infinite, and dropped
+        variances = np.where(sigmas > 0, sigmas, np.nan) ** 2
+    covariances = np.zeros((len(sigmas), 3, 3))
+    covariances[:, range(3), range(3)] = variances
+    return covariances
 
 
 def fixes_from(
     stamps_ns: IntArray,
     positions: FloatArray,
-    sigmas: FloatArray,
+    covariances: FloatArray,
     path: Path,
     diagnostics: Diagnostics,
     frame: tuple[bool, Datum | None] = (False, None),
@@ -126,29 +139,48 @@ def fixes_from(
     Args:
         stamps_ns: (N,) of the fixes.
         positions: (N, 3) latitude, longitude and height, or local ones.
-        sigmas: (N, 3) east, north, up, m.
+        covariances: (N, 3, 3) east, north, up, m².
         path: of the file, for messages.
         diagnostics: as for `read_fixes`.
         frame: whether positions are local, and the datum; the first fix if None.
     """
-    good = np.isfinite(positions).all(axis=1) & np.isfinite(sigmas).all(axis=1)
-    good &= (sigmas > 0).all(axis=1)
-    kept = np.flatnonzero(good)
-    kept = kept[
-        np.concatenate([[True], stamps_ns[kept][1:] > np.maximum.accumulate(stamps_ns[kept])[:-1]])
-    ]
-    if len(kept) < len(stamps_ns):
-        dropped = (
-            f"{path}: {len(stamps_ns) - len(kept)} fixes dropped (no solution, or not in order)"
-        )
-        diagnostics.warn("gnss_dropped", dropped)
-    stamps_ns, positions, sigmas = stamps_ns[kept], positions[kept], sigmas[kept]
     local, datum = frame
+    whole = np.column_stack([positions, covariances.reshape(-1, 9)])
+    good = np.isfinite(whole).all(axis=1)
+    good &= (np.diagonal(covariances, axis1=1, axis2=2) > 0).all(axis=1)
+    if not local:
+        good &= (np.abs(positions) <= _LARGEST).all(axis=1)
+    good = np.asarray(good, np.bool_)
+    kept = kept_of(stamps_ns, good, "gnss_dropped", f"{path}: fix", diagnostics)
+    stamps_ns, positions, covariances = stamps_ns[kept], positions[kept], covariances[kept]
     if not local and len(positions):
         datum = datum or (float(positions[0, 0]), float(positions[0, 1]), float(positions[0, 2]))
         positions = local_positions(positions, datum)
-    covariances = sigmas[:, :, None] ** 2 * np.eye(3)
     return AidingData.of_fixes(stamps_ns, positions, covariances, datum)
+
+
+def kept_of(
+    stamps_ns: IntArray, good: BoolArray, kind: str, what: str, diagnostics: Diagnostics
+) -> IntArray:
+    """Indices of the measurements that are good and in the order of time.
+
+    Args:
+        stamps_ns: (N,) of the measurements.
+        good: (N,) which can be used, but for their order.
+        kind: under which each of the others is counted.
+        what: they are and where, for messages.
+        diagnostics: counts them.
+    """
+    for stamp_ns in stamps_ns[~good].tolist():
+        diagnostics.warn(kind, f"{what} at {stamp_ns} dropped, it has no values that can be used")
+    whole = np.flatnonzero(good)
+    stamps_ns = stamps_ns[whole]
+
+    def dropped(index: int, _: int) -> None:
+        late = f"{what} at {stamps_ns[index]} dropped, not in the order of time"
+        diagnostics.warn(kind, late)
+
+    return whole[in_order(stamps_ns, dropped)]
 
 
 def _header(path: Path) -> tuple[str, Datum | None]:
@@ -219,11 +251,7 @@ def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, Floa
     table = np.concatenate(tables)
     stamps, lengths = table["stamp"], np.linalg.norm(table["quaternion"], axis=1)
     good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
-    good[1:] &= stamps[1:] > np.maximum.accumulate(stamps)[:-1]
-    if not good.all():
-        dropped = f"{path}: {np.count_nonzero(~good)} samples dropped (not finite, or not in order)"
-        diagnostics.warn("odometry_dropped", dropped)
-    table = table[good]
+    table = table[kept_of(stamps, good, "odometry_dropped", f"{path}: odometry", diagnostics)]
     return table["stamp"], table["position"], table["quaternion"]
 
 
