@@ -19,12 +19,16 @@ from scipy.special import chdtri
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
 from slam_graph.backend.objects.object_regions import region, regions_of_motion
+from slam_graph.backend.objects.object_review import ObjectReview
 from slam_graph.backend.objects.object_state import ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
 from slam_graph.backend.objects.track_labels import TrackLabels
+from slam_graph.backend.objects.track_neighbours import TrackNeighbours
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
@@ -46,6 +50,10 @@ _MOVING_SHARE = 0.3
 """Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
+_REVIEWS = (0, 2, 5, 10)
+"""Frames of an object after which it is reviewed; later each time as many as the last one."""
+_BADLY = 3.0
+"""Squared errors of an object that is reviewed at once, in standard deviations."""
 _BEST = 0.3
 """Share of the tracks of an object that is of it beyond doubt."""
 _SAME_PLACE_M = 0.5
@@ -125,9 +133,12 @@ class ObjectTracker:
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
         test = self._tested(others, ego, sigma_px)
         sigma_px *= self._noise_of(test)
+        self._known = np.union1d(test.of(Verdict.STATIC), own)
         self._join(test, ego, sigma_px)
         self._leave(ego, sigma_px)
         self._begin(test, ego, sigma_px)
+        self._review(ego, sigma_px)
+        self._resolve(sigma_px)
         self._merge(ego)
         return self._described(states, test)
 
@@ -148,9 +159,10 @@ class ObjectTracker:
                 self.objects.remove(item)
                 if item.confirmed:
                     self._hidden.append(item)
-            elif item.confirmed and not item.moving and item.frames == _LEAST_FRAMES:
+            elif item.confirmed and not item.moving and not item.reported:
                 self.objects.remove(item)  # it was found by errors of the platform's motion
                 states.remove(state)
+            item.reported |= item.confirmed
         oldest = now - round(self._config.max_occlusion_s * 1e9)
         self._hidden = [item for item in self._hidden if item.seen_ns >= oldest]
         return states
@@ -170,6 +182,7 @@ class ObjectTracker:
             joins = squares < scale * chdtri(dof, _FITS)
             if not self._labels.given:  # masks tell what is of the object, and not static
                 joins &= alone - squares > scale * _MARGIN
+                joins[joins] = self._near(fit[joins]).connected(fit[joins], item.members)
             item.members = np.union1d(item.members, fit[joins])
             candidates = np.setdiff1d(candidates, fit[joins])
 
@@ -211,10 +224,38 @@ class ObjectTracker:
     def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
         """Leave an object the largest part of its tracks that moves as one; none fits it."""
         groups = self._groups(item.members, sigma_px)
-        if groups:
-            item.begin_again(groups[0], self._window, ego)
-        if not groups or not item.begun:
+        motion = self._motion_of(groups[0], ego) if groups else None
+        if motion is None:
             self.objects.remove(item)
+        else:
+            item.begin_again(groups[0], motion, ego)
+
+    def _review(self, ego: EgoMotion, sigma_px: float) -> None:
+        """Begin objects again, or make two of them, where that explains their tracks better."""
+        review = ObjectReview(self._window, ego, sigma_px, self._policies, self._config)
+        for item in list(self.objects):
+            if not self._due(item, sigma_px):
+                continue
+            parts = sorted(review.of(item), key=lambda part: -len(part.members))
+            if parts:
+                item.begin_again(parts[0].members, parts[0].motion, ego)
+            for part in parts[1:]:
+                self._add(item.label, part.members, part.motion, ego)
+
+    def _resolve(self, sigma_px: float) -> None:
+        """See whether the tracks of new objects tell their motion from its mirror image."""
+        mirror = MirrorMotion(self._window, sigma_px)
+        for item in self.objects:
+            if not item.unique:
+                item.unique = mirror.worse(item.members, item.poses) > _MARGIN
+
+    def _due(self, item: TrackedObject, sigma_px: float) -> bool:
+        """Whether an object is to be reviewed: often at first, and where its tracks fit badly."""
+        if item.frames in _REVIEWS or item.frames % _REVIEWS[-1] == 0:
+            return True
+        _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
+        spread = float(np.sqrt(2.0 * max(dof.sum(), 1)))
+        return float(squares.sum() - dof.sum()) > _BADLY * spread
 
     def _scale(self, item: TrackedObject, sigma_px: float) -> float:
         """Squared errors of the tracks of an object over what is expected, by its poses as known.
@@ -254,17 +295,21 @@ class ObjectTracker:
 
     def _begin(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that move together begin an object."""
-        config = self._config
         for label, group in self._new_groups(test, sigma_px):
-            item = TrackedObject(
-                self._next, label, group, self._window, ego, self._policies, config
-            )
-            if not item.begun:
-                continue
-            self._recognise(item, ego)
-            if item.number == self._next:
-                self._next += 1
-            self.objects.append(item)
+            motion = self._motion_of(group, ego)
+            if motion is not None:
+                self._add(label, group, motion, ego)
+
+    def _motion_of(self, members: IntArray, ego: EgoMotion) -> RelativeMotion | None:
+        return motion_over(members, self._window, ego, self._policies, self._config)
+
+    def _add(self, label: int, members: IntArray, motion: RelativeMotion, ego: EgoMotion) -> None:
+        """Add an object, with its old number if it was seen before."""
+        item = TrackedObject(self._next, label, members, motion, ego, self._config)
+        self._recognise(item, ego)
+        if item.number == self._next:
+            self._next += 1
+        self.objects.append(item)
 
     def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
         """Labels and tracks of what begins to move; without masks labels are 0."""
@@ -286,7 +331,13 @@ class ObjectTracker:
         if len(ids) < config.min_points or len(self._window.frames) < _LEAST_FRAMES:
             return []
         frames = list(self._window.frames)
-        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px)
+        near = self._near(ids)
+        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px, near)
+
+    def _near(self, ids: IntArray) -> TrackNeighbours:
+        """Neighbours among some tracks, those that are static, and those of objects."""
+        seen = self._window.frames[-1].cameras[0]
+        return TrackNeighbours(seen, np.union1d(ids, self._known))
 
     def _recognise(self, item: TrackedObject, ego: EgoMotion) -> None:
         """Give an object its old number if one that was hidden is expected there."""

@@ -26,6 +26,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -145,6 +146,34 @@ class RelativeMotion:
     def covariance(self, now_ns: int) -> FloatArray:
         """(6, 6) of the tangent of the pose in the last frame."""
         return self._estimator.covariance_of([X(self._frames[now_ns])])
+
+
+def motion_over(
+    members: IntArray,
+    window: TrackWindow,
+    ego: EgoMotion,
+    policies: tuple[AlgorithmConfig, BackendConfig],
+    config: ObjectsConfig,
+) -> RelativeMotion | None:
+    """An estimator that has taken some tracks in the frames of a window.
+
+    Args:
+        members: (N,) ids of the tracks, ascending.
+        window: the frames.
+        ego: the motion of the platform over them.
+        policies: algorithm and settings.
+        config: of objects.
+
+    Returns:
+        None if the equations cannot be solved, or there is no pose in the last frame.
+    """
+    motion = RelativeMotion(window.rig, *policies, config, config.window_s)
+    try:
+        for frame in window.frames:
+            motion.add(frame.only(members), ego)
+    except EstimationError:
+        return None
+    return motion if ego.stamps_ns[-1] in motion.poses else None
 
 
 def _policies(algorithm: AlgorithmConfig) -> AlgorithmConfig:
