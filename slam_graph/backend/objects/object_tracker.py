@@ -168,23 +168,61 @@ class ObjectTracker:
         return states
 
     def _join(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks that fit the motion of an object, and are not static, join it."""
-        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
-        candidates = test.ids[test.verdicts != Verdict.STATIC]
-        for item in self.objects:
-            allowed = self._labels.allowed(candidates, item.label)
-            fit, squares, dof = self._window.misfit(allowed, item.poses, sigma_px)
-            same, alone, _ = self._window.misfit(
-                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
-            )
-            alone = _for(fit, same, alone)
-            scale = self._scale(item, sigma_px)
-            joins = squares < scale * chdtri(dof, _FITS)
+        """Tracks go to the object whose motion they fit, if they fit no other one, nor the world.
+
+        Those of one object go over to another if they fit that clearly better.
+        """
+        if not self.objects:
+            return
+        free = np.setdiff1d(test.ids[test.verdicts != Verdict.STATIC], _members(self.objects))
+        ids = np.union1d(free, _members(self.objects))
+        squares, scales = self._squares(ids, sigma_px)
+        best = np.argmin(squares, axis=0)
+        rows = np.arange(len(ids))
+        least = squares[best, rows]
+        others = squares.copy()
+        others[best, rows] = np.inf
+        alone = self._alone(ids, ego, sigma_px)
+        for k, item in enumerate(self.objects):
+            mine = np.isfinite(least) & (best == k) & (others.min(axis=0) - least > _MARGIN)
+            new = mine & np.isin(ids, free)
             if not self._labels.given:  # masks tell what is of the object, and not static
-                joins &= alone - squares > scale * _MARGIN
-                joins[joins] = self._near(fit[joins]).connected(fit[joins], item.members)
-            item.members = np.union1d(item.members, fit[joins])
-            candidates = np.setdiff1d(candidates, fit[joins])
+                new &= alone - least > scales[k] * _MARGIN
+                new[new] = self._near(ids[new]).connected(ids[new], item.members)
+            over = mine & ~np.isin(ids, free) & ~np.isin(ids, item.members)
+            taken = ids[over & (self._own(ids, squares) - least > _MARGIN)]
+            for other in self.objects:
+                other.members = np.setdiff1d(other.members, taken)
+            item.members = np.union1d(item.members, np.union1d(ids[new], taken))
+
+    def _squares(self, ids: IntArray, sigma_px: float) -> tuple[FloatArray, list[float]]:
+        """Squared errors (K, N) of tracks under the motions of the objects, and a scale of each.
+
+        They are infinite where a track does not fit, or is not of the mask.
+        """
+        squares, scales = np.full((len(self.objects), len(ids)), np.inf), []
+        for row, item in zip(squares, self.objects, strict=True):
+            allowed = self._labels.allowed(ids, item.label)
+            fit, errors, dof = self._window.misfit(allowed, item.poses, sigma_px)
+            scales.append(self._scale(item, sigma_px))
+            row[np.isin(ids, fit)] = np.where(
+                errors < scales[-1] * chdtri(dof, _FITS), errors, np.inf
+            )
+        return squares, scales
+
+    def _own(self, ids: IntArray, squares: FloatArray) -> FloatArray:
+        """Squared errors (N,) of tracks under the motion of the object that they are of."""
+        own = np.full(len(ids), np.inf)
+        for row, item in zip(squares, self.objects, strict=True):
+            mine = np.isin(ids, item.members)
+            own[mine] = row[mine]
+        return own
+
+    def _alone(self, ids: IntArray, ego: EgoMotion, sigma_px: float) -> FloatArray:
+        """Squared errors (N,) of tracks as static points."""
+        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+        fit, errors, _ = self._window.misfit(ids, static, sigma_px)
+        return _for(ids, fit, errors)
 
     def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that do not fit an object leave it, and static ones if the object moves."""
