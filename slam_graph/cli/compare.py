@@ -154,19 +154,24 @@ _SHOWN = {
 }
 """Columns of the table that are printed, and their titles there; the report has all."""
 
-_MEANING = (
-    "ATE, rot.: root mean square errors, aligned in what nothing measured. NEES of the pose (ideal "
-    "6). NIS over its expected value (ideal 1). The report has all columns."
-)
+_MEANINGS = {
+    "ATE [m]": "ATE, rot.: root mean square errors, aligned in what nothing measured.",
+    "NEES": "NEES of the pose (ideal 6).",
+    "NIS": "NIS over its expected value (ideal 1).",
+}
+"""What is said of printed columns, by their titles."""
 
 
 def _echo(table: list[tuple[str, ...]]) -> None:
     """Print a table for each data set, of rows under a row of titles."""
     titles, *rows = table
     names = list(dict.fromkeys(row[0] for row in rows))
-    for name in names:
-        shown = _informative([titles, *(row for row in rows if row[0] == name)])
-        echo_rich_table(shown[0], shown[1:], name, caption=_MEANING if name == names[-1] else "")
+    tables = [_informative([titles, *(row for row in rows if row[0] == name)]) for name in names]
+    printed = {title for shown in tables for title in shown[0]}
+    meanings = [text for title, text in _MEANINGS.items() if title in printed]
+    caption = " ".join([*meanings, "The report has all columns."])
+    for name, shown in zip(names, tables, strict=True):
+        echo_rich_table(shown[0], shown[1:], name, caption=caption if name == names[-1] else "")
 
 
 def _informative(table: list[tuple[str, ...]]) -> list[tuple[str, ...]]:

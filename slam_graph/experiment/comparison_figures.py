@@ -61,8 +61,9 @@ def draw(comparison: Comparison, data: str) -> Iterator[Figure]:
     over = f"; a dot for each of {seeds} seeds, the number is their median" if seeds > 1 else ""
     folder = ResultFolder(comparison.folder / "figures")
     yield from _draw_panels(folder, f"{data}_paths.png", f"{data}: causal paths", _paths(runs))
-    title = f"{data}: errors (root mean square of a run) and cost{over}"
-    yield from _draw_panels(folder, f"{data}_summary.png", title, _summary_panels(tasks))
+    panels = _summary_panels(tasks)
+    shown = "errors (root mean square of a run) and cost" if len(panels) > 1 else "cost"
+    yield from _draw_panels(folder, f"{data}_summary.png", f"{data}: {shown}{over}", panels)
     panels = [Panel(_TIME, label, _curves(runs, "time_s", part)) for part, label in _ERRORS]
     title = f"{data}: errors over time, aligned in what nothing measured{mean}"
     yield from _draw_panels(folder, f"{data}_errors.png", title, panels)
