@@ -77,7 +77,7 @@ class RelativeMotion:
         length_s: float,
     ) -> None:
         self._estimator = Estimator(
-            rig.without_imu(), _policies(algorithm), _settings(backend, config), Diagnostics()
+            rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
@@ -148,6 +148,7 @@ class RelativeMotion:
         return self._estimator.covariance_of([X(self._frames[now_ns])])
 
 
+<<<<<<< HEAD
 def motion_over(
     members: IntArray,
     window: TrackWindow,
@@ -186,6 +187,8 @@ def _policies(algorithm: AlgorithmConfig) -> AlgorithmConfig:
     return algorithm.model_copy(update={"marginalization": marginalization})
 
 
+=======
+>>>>>>> objwin
 def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
     """Settings of the estimator of an object."""
     dynamics = {
