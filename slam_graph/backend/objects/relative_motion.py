@@ -148,7 +148,6 @@ class RelativeMotion:
         return self._estimator.covariance_of([X(self._frames[now_ns])])
 
 
-<<<<<<< HEAD
 def motion_over(
     members: IntArray,
     window: TrackWindow,
@@ -177,18 +176,6 @@ def motion_over(
     return motion if ego.stamps_ns[-1] in motion.poses else None
 
 
-def _policies(algorithm: AlgorithmConfig) -> AlgorithmConfig:
-    """The policies without first-estimates Jacobians.
-
-    The depths of a single frame are off by a third of the size of an object. Jacobians at such
-    points let an object turn the wrong way, with a covariance that does not know of it.
-    """
-    marginalization = algorithm.marginalization.model_copy(update={"first_estimates": False})
-    return algorithm.model_copy(update={"marginalization": marginalization})
-
-
-=======
->>>>>>> objwin
 def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
     """Settings of the estimator of an object."""
     dynamics = {
