@@ -78,20 +78,32 @@ class ObjectReview:
         stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
         if len(stamps) < _LEAST_FRAMES:
             return []
-        halves: list[Part] = []
-        if item.label == 0 and len(item.members) >= 2 * least:  # masks tell objects apart
-            halves = self._halves(item.members, least)
         current = self._total(item.members, item, stamps)
-        others = [
-            (self._total(item.members, part.motion, stamps), part) for part in [anew, *halves]
-        ]
-        best, part = min(others, key=lambda other: other[0])
+        best, part = self._total(item.members, anew.motion, stamps), anew
         limit = float(chdtri(6 * (len(stamps) - 1), self._config.false_alarm))
+        halves: list[Part] = []
+        if (
+            item.label == 0  # masks tell objects apart
+            and len(item.members) >= 2 * least
+            and min(current, best) > self._expected(item.members, stamps)
+        ):
+            halves = self._halves(item.members, least)
+        for half in halves:
+            squares = self._total(item.members, half.motion, stamps)
+            if squares < best:
+                best, part = squares, half
         if halves:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
             if min(current, best) - apart > limit:
                 return halves
         return [Part(item.members, part.motion)] if current - best > limit else []
+
+    def _expected(self, members: IntArray, stamps: list[int]) -> float:
+        """Sum of the squared errors of one body; larger ones are found in one of six frames."""
+        length = np.isin(self._window.stamps_ns, stamps)
+        obs = self._window.observations(members, 3, stamps)
+        dof = float(np.sum(2 * obs.counts - 3)) - 6 * (np.count_nonzero(length) - 1)
+        return dof + float(np.sqrt(2.0 * max(dof, 1.0)))
 
     def _halves(self, members: IntArray, least: int) -> list[Part]:
         """Two parts of some tracks, each with a motion of its own; none if one is too small."""

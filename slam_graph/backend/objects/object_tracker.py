@@ -50,8 +50,10 @@ _MOVING_SHARE = 0.3
 """Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
-_REVIEWS = (0, 2, 5, 10)
+_REVIEWS = (2, 5, 10)
 """Frames of an object after which it is reviewed; later each time as many as the last one."""
+_PAUSE = 5
+"""Least frames between two reviews of an object."""
 _BADLY = 3.0
 """Squared errors of an object that is reviewed at once, in standard deviations."""
 _BEST = 0.3
@@ -274,6 +276,7 @@ class ObjectTracker:
         for item in list(self.objects):
             if not self._due(item, sigma_px):
                 continue
+            item.reviewed = item.frames
             parts = sorted(review.of(item), key=lambda part: -len(part.members))
             if parts:
                 item.begin_again(parts[0].members, parts[0].motion, ego)
@@ -290,10 +293,12 @@ class ObjectTracker:
     def _due(self, item: TrackedObject, sigma_px: float) -> bool:
         """Whether an object is to be reviewed: often at first, and where its tracks fit badly."""
         if item.frames in _REVIEWS or item.frames % _REVIEWS[-1] == 0:
-            return True
+            return item.frames > 0
+        if item.frames - item.reviewed < _PAUSE:
+            return False
         _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
         spread = float(np.sqrt(2.0 * max(dof.sum(), 1)))
-        return float(squares.sum() - dof.sum()) > _BADLY * spread
+        return bool(squares.sum() - dof.sum() > _BADLY * spread)
 
     def _scale(self, item: TrackedObject, sigma_px: float) -> float:
         """Squared errors of the tracks of an object over what is expected, by its poses as known.

@@ -47,6 +47,7 @@ class TrackedObject:
     Attributes:
         members: as above, now.
         frames: number of frames with a state.
+        reviewed: how many of them it had when it was reviewed last.
         seen_ns: time of the last frame with a state.
         moving: whether it is known to move.
         reported: whether it has been reported.
@@ -63,7 +64,7 @@ class TrackedObject:
         config: ObjectsConfig,
     ) -> None:
         self.number, self.label, self.members = number, label, members
-        self.frames, self.moving = 0, False
+        self.frames, self.reviewed, self.moving = 0, 0, False
         self.reported, self.unique = False, False
         self.seen_ns = ego.stamps_ns[-1]
         self._config = config
