@@ -28,8 +28,10 @@ from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
 
-_LEAST_FRAMES = 4
+_LEAST_FRAMES = 6
 """Frames of a window that tell anything."""
+_LABEL = 2.0 * float(np.log(2.0))
+"""What it costs that a track may be of either half: both are as likely."""
 _ROUNDS = 2
 """Times that tracks go to the half that they fit better."""
 
@@ -94,7 +96,7 @@ class ObjectReview:
                 best, part = squares, half
         if halves:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
-            if min(current, best) - apart > limit:
+            if min(current, best) - apart > limit + _LABEL * len(item.members):
                 return halves
         return [Part(item.members, part.motion)] if current - best > limit else []
 

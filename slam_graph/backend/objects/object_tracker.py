@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.mirror_motion import MirrorMotion
@@ -50,7 +50,7 @@ _MOVING_SHARE = 0.3
 """Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
-_REVIEWS = (2, 5, 10)
+_REVIEWS = (3, 6, 10)
 """Frames of an object after which it is reviewed; later each time as many as the last one."""
 _PAUSE = 5
 """Least frames between two reviews of an object."""
@@ -186,13 +186,13 @@ class ObjectTracker:
         others[best, rows] = np.inf
         alone = self._alone(ids, ego, sigma_px)
         for k, item in enumerate(self.objects):
-            mine = np.isfinite(least) & (best == k) & (others.min(axis=0) - least > _MARGIN)
+            mine = (best == k) & _clearly(least, others.min(axis=0))
             new = mine & np.isin(ids, free)
             if not self._labels.given:  # masks tell what is of the object, and not static
-                new &= alone - least > scales[k] * _MARGIN
+                new &= _clearly(least, alone, scales[k])
                 new[new] = self._near(ids[new]).connected(ids[new], item.members)
             over = mine & ~np.isin(ids, free) & ~np.isin(ids, item.members)
-            taken = ids[over & (self._own(ids, squares) - least > _MARGIN)]
+            taken = ids[over & _clearly(least, self._own(ids, squares))]
             for other in self.objects:
                 other.members = np.setdiff1d(other.members, taken)
             item.members = np.union1d(item.members, np.union1d(ids[new], taken))
@@ -429,6 +429,13 @@ class ObjectTracker:
             {item.number: item.world_points() for item in self.objects if item.confirmed},
             self._hulls(by_itself),
         )
+
+
+def _clearly(squares: FloatArray, others: FloatArray, scale: float = 1.0) -> BoolArray:
+    """Whether squared errors (N,) are known, and clearly less than others (N,)."""
+    return np.isfinite(squares) & (
+        others > np.where(np.isfinite(squares), squares, 0) + scale * _MARGIN
+    )
 
 
 def _scale(squares: FloatArray, dof: IntArray) -> float:
