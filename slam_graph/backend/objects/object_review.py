@@ -30,6 +30,8 @@ from slam_graph.backend.policies import AlgorithmConfig
 
 _LEAST_FRAMES = 6
 """Frames of a window that tell anything."""
+_AGAIN = 0.01
+"""Probability with which an object begins again without need; what it loses is its past."""
 _LABEL = 2.0 * float(np.log(2.0))
 """What it costs that a track may be of either half: both are as likely."""
 _ROUNDS = 2
@@ -98,7 +100,8 @@ class ObjectReview:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
             if min(current, best) - apart > limit + _LABEL * len(item.members):
                 return halves
-        return [Part(item.members, part.motion)] if current - best > limit else []
+        again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
+        return [Part(item.members, part.motion)] if current - best > again else []
 
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""

@@ -52,6 +52,8 @@ _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
 _REVIEWS = (3, 6, 10)
 """Frames of an object after which it is reviewed; later each time as many as the last one."""
+_MIRRORED = 2
+"""Frames between two comparisons with the mirror image, once it was ruled out."""
 _PAUSE = 5
 """Least frames between two reviews of an object."""
 _BADLY = 3.0
@@ -140,7 +142,7 @@ class ObjectTracker:
         self._leave(ego, sigma_px)
         self._begin(test, ego, sigma_px)
         self._review(ego, sigma_px)
-        self._resolve(sigma_px)
+        self._resolve(ego, sigma_px)
         self._merge(ego)
         return self._described(states, test)
 
@@ -155,7 +157,7 @@ class ObjectTracker:
             except EstimationError:
                 self.objects.remove(item)
                 continue
-            if state is not None and item.confirmed:
+            if state is not None and item.confirmed and state.points >= self._config.min_points:
                 states.append(state)
             if state is None:
                 self.objects.remove(item)
@@ -163,7 +165,7 @@ class ObjectTracker:
                     self._hidden.append(item)
             elif item.confirmed and not item.moving and not item.reported:
                 self.objects.remove(item)  # it was found by errors of the platform's motion
-                states.remove(state)
+                states = [other for other in states if other is not state]
             item.reported |= item.confirmed
         oldest = now - round(self._config.max_occlusion_s * 1e9)
         self._hidden = [item for item in self._hidden if item.seen_ns >= oldest]
@@ -283,12 +285,20 @@ class ObjectTracker:
             for part in parts[1:]:
                 self._add(item.label, part.members, part.motion, ego)
 
-    def _resolve(self, sigma_px: float) -> None:
-        """See whether the tracks of new objects tell their motion from its mirror image."""
+    def _resolve(self, ego: EgoMotion, sigma_px: float) -> None:
+        """See whether tracks tell the motion of their object from its mirror image."""
         mirror = MirrorMotion(self._window, sigma_px)
         for item in self.objects:
-            if not item.unique:
-                item.unique = mirror.worse(item.members, item.poses) > _MARGIN
+            if item.unique and item.frames % _MIRRORED:
+                continue
+            worse = mirror.worse(item.members, item.poses)
+            if abs(worse) > _MARGIN:
+                item.unique = worse > 0
+            if worse < -_MARGIN:  # one that begins now finds either of the two
+                motion = self._motion_of(item.members, ego)
+                if motion is not None and mirror.worse(item.members, motion.poses) > _MARGIN:
+                    item.begin_again(item.members, motion, ego)
+                    item.unique = True
 
     def _due(self, item: TrackedObject, sigma_px: float) -> bool:
         """Whether an object is to be reviewed: often at first, and where its tracks fit badly."""
