@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.objects.moving_objects import MovingObjects
-    from slam_graph.backend.objects.object_tracker import ObjectFrame
+    from slam_graph.backend.objects.object_frame import ObjectFrame
     from slam_graph.backend.objects.objects_config import ObjectsConfig
     from slam_graph.backend.policies import AlgorithmConfig
     from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_worlds
@@ -79,7 +79,7 @@ else:
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),
             "objects.moving_objects": ("MovingObjects",),
-            "objects.object_tracker": ("ObjectFrame",),
+            "objects.object_frame": ("ObjectFrame",),
             "objects.objects_config": ("ObjectsConfig",),
             "policies": ("AlgorithmConfig",),
             "smoothing.final_adjustment": (

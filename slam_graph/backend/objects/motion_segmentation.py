@@ -20,7 +20,6 @@ from scipy.spatial.distance import cdist
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.triangulation import triangulate_frames
-from slam_graph.backend.objects.track_neighbours import TrackNeighbours
 from slam_graph.sensors import FeatureFrame, Rig
 
 _SAMPLE = 7
@@ -92,17 +91,9 @@ class _Tracks:
 
 
 def rigid_groups(
-    ids: IntArray,
-    frames: Sequence[FeatureFrame],
-    rig: Rig,
-    min_points: int,
-    sigma_px: float,
-    neighbours: TrackNeighbours,
+    ids: IntArray, frames: Sequence[FeatureFrame], rig: Rig, min_points: int, sigma_px: float
 ) -> list[IntArray]:
-    """Groups of neighbouring tracks that move rigidly, the largest first.
-
-    Parts of two objects may fit one motion: if one comes nearer while the other goes away, one
-    body that turns. The tracks of what lies between them keep them apart.
+    """Groups of tracks that move rigidly, the largest first.
 
     Args:
         ids: (N,) of the tracks, ascending.
@@ -110,7 +101,6 @@ def rigid_groups(
         rig: its first camera is looked through.
         min_points: fewest tracks of a group.
         sigma_px: standard deviation of the observations.
-        neighbours: in the last frame.
 
     Returns:
         Their ids, ascending.
@@ -120,7 +110,7 @@ def rigid_groups(
     for frame in list(frames)[:-1]:
         tracks = _tracks(rest, frame, frames[-1], rig, sigma_px)
         while len(tracks.ids) >= min_points and len(groups) < _MAX_GROUPS:
-            fits = _largest(tracks, min_points, neighbours)
+            fits = _largest(tracks, min_points)
             if fits is None:
                 break
             groups.append(np.sort(tracks.ids[fits]))
@@ -129,34 +119,19 @@ def rigid_groups(
     return groups
 
 
-def _largest(tracks: _Tracks, min_points: int, neighbours: TrackNeighbours) -> BoolArray | None:
-    """The largest set of neighbouring tracks (N,) that fits one pose; None if none is large enough.
-
-    Args:
-        tracks: with their depths.
-        min_points: fewest of a set.
-        neighbours: in the last frame.
-    """
+def _largest(tracks: _Tracks, min_points: int) -> BoolArray | None:
+    """The largest set of tracks (N,) that fits one pose; None if none is large enough."""
     count = len(tracks.ids)
     nearest = np.argsort(cdist(tracks.rays, tracks.rays), axis=1)[:, : min(_SAMPLE, count)]
     best: BoolArray | None = None
-
-    def fitting(rows: IntArray | BoolArray) -> BoolArray:
-        """Tracks (N,) that fit the pose of some, and are connected with those of them that do."""
-        fits = tracks.fitting(tracks.pose_of(rows))
-        fits[fits] = neighbours.connected(
-            tracks.ids[fits], np.intersect1d(tracks.ids[rows], tracks.ids[fits])
-        )
-        return fits
-
     for sample in np.unique(np.sort(nearest, axis=1), axis=0):
-        fits = fitting(sample)
+        fits = tracks.fitting(tracks.pose_of(sample))
         if np.count_nonzero(fits) >= min_points and (best is None or fits.sum() > best.sum()):
             best = fits
     if best is None:
         return None
     for _ in range(_REFINEMENTS):
-        refined = fitting(best)
+        refined = tracks.fitting(tracks.pose_of(best))
         if np.count_nonzero(refined) <= np.count_nonzero(best):
             break
         best = refined

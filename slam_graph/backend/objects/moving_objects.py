@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoWindow
+from slam_graph.backend.objects.object_frame import ObjectFrame
 from slam_graph.backend.objects.object_history import ObjectHistory
-from slam_graph.backend.objects.object_tracker import ObjectFrame, ObjectTracker
+from slam_graph.backend.objects.object_tracker import ObjectTracker
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.geometry import NavState

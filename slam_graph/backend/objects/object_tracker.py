@@ -9,26 +9,27 @@ together begin a new one (`motion_segmentation.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
+from slam_graph.backend.objects.object_frame import ObjectFrame
 from slam_graph.backend.objects.object_regions import region, regions_of_motion
 from slam_graph.backend.objects.object_review import ObjectReview
 from slam_graph.backend.objects.object_state import ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
+from slam_graph.backend.objects.track_assignment import (
+    MARGIN,
+    TrackAssignment,
+    members_of,
+)
 from slam_graph.backend.objects.track_labels import TrackLabels
-from slam_graph.backend.objects.track_neighbours import TrackNeighbours
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
@@ -37,13 +38,6 @@ from slam_graph.sensors import FeatureFrame, Rig
 
 _LEAST_FRAMES = 3
 """Frames of a track before it is tested."""
-_MARGIN = 12.0
-"""Twice the logarithm of the ratio of likelihoods from which a track is of one world and not of
-another: 1 in 400."""
-_FITS = 1e-4
-"""Probability of the errors of a track that fits."""
-_CLEARLY = 2.0
-"""Factor on that limit for tracks that are of an object already."""
 _ENOUGH, _NEWS, _LEAST_NOISE = 20, 0.1, 0.3
 """Tracks that tell the noise, weight of one frame of them, and its least ratio to the setting."""
 _MOVING_SHARE = 0.3
@@ -58,43 +52,9 @@ _PAUSE = 5
 """Least frames between two reviews of an object."""
 _BADLY = 3.0
 """Squared errors of an object that is reviewed at once, in standard deviations."""
-_BEST = 0.3
-"""Share of the tracks of an object that is of it beyond doubt."""
 _SAME_PLACE_M = 0.5
 """An object that appears again is no farther than this from where it is expected, or its own
 size."""
-
-
-def _no_ids() -> IntArray:
-    return np.zeros(0, np.int64)
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectFrame:
-    """What became of the tracks of one frame.
-
-    Attributes:
-        states: of the objects that are seen.
-        moving: ids (N,) of the features that must not count as static, ascending.
-        static: ids (N,) of the features that are known to be static, ascending.
-        wrong: ids (N,) of features that are neither.
-        probabilities: ids (J,) and the probability (J,) that each moves by itself.
-        members: number of the object by feature.
-        clouds: (K, 3) points of each object in the world, by its number.
-        hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
-            camera; with the number 0 around tracks that move and are of no object yet.
-    """
-
-    states: list[ObjectState] = field(default_factory=list)
-    moving: IntArray = field(default_factory=_no_ids)
-    static: IntArray = field(default_factory=_no_ids)
-    wrong: IntArray = field(default_factory=_no_ids)
-    probabilities: tuple[IntArray, FloatArray] = field(
-        default_factory=lambda: (_no_ids(), np.zeros(0))
-    )
-    members: dict[int, int] = field(default_factory=dict)
-    clouds: dict[int, FloatArray] = field(default_factory=dict)
-    hulls: list[tuple[int, FloatArray]] = field(default_factory=list)
 
 
 class ObjectTracker:
@@ -133,13 +93,13 @@ class ObjectTracker:
         self._window.add(frame, ego.stamps_ns[0])
         self._labels = TrackLabels(frame)
         states = self._follow(ego)
-        own = _members(self.objects)
+        own = members_of(self.objects)
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
         test = self._tested(others, ego, sigma_px)
         sigma_px *= self._noise_of(test)
-        self._known = np.union1d(test.of(Verdict.STATIC), own)
-        self._join(test, ego, sigma_px)
-        self._leave(ego, sigma_px)
+        assignment = TrackAssignment(self._window, self._labels, ego, sigma_px)
+        assignment.join(self.objects, test)
+        self._leave(assignment, ego, sigma_px)
         self._begin(test, ego, sigma_px)
         self._review(ego, sigma_px)
         self._resolve(ego, sigma_px)
@@ -171,92 +131,21 @@ class ObjectTracker:
         self._hidden = [item for item in self._hidden if item.seen_ns >= oldest]
         return states
 
-    def _join(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks go to the object whose motion they fit, if they fit no other one, nor the world.
-
-        Those of one object go over to another if they fit that clearly better.
-        """
-        if not self.objects:
-            return
-        free = np.setdiff1d(test.ids[test.verdicts != Verdict.STATIC], _members(self.objects))
-        ids = np.union1d(free, _members(self.objects))
-        squares, scales = self._squares(ids, sigma_px)
-        best = np.argmin(squares, axis=0)
-        rows = np.arange(len(ids))
-        least = squares[best, rows]
-        others = squares.copy()
-        others[best, rows] = np.inf
-        alone = self._alone(ids, ego, sigma_px)
-        for k, item in enumerate(self.objects):
-            mine = (best == k) & _clearly(least, others.min(axis=0))
-            new = mine & np.isin(ids, free)
-            if not self._labels.given:  # masks tell what is of the object, and not static
-                new &= _clearly(least, alone, scales[k])
-                new[new] = self._near(ids[new]).connected(ids[new], item.members)
-            over = mine & ~np.isin(ids, free) & ~np.isin(ids, item.members)
-            taken = ids[over & _clearly(least, self._own(ids, squares))]
-            for other in self.objects:
-                other.members = np.setdiff1d(other.members, taken)
-            item.members = np.union1d(item.members, np.union1d(ids[new], taken))
-
-    def _squares(self, ids: IntArray, sigma_px: float) -> tuple[FloatArray, list[float]]:
-        """Squared errors (K, N) of tracks under the motions of the objects, and a scale of each.
-
-        They are infinite where a track does not fit, or is not of the mask.
-        """
-        squares, scales = np.full((len(self.objects), len(ids)), np.inf), []
-        for row, item in zip(squares, self.objects, strict=True):
-            allowed = self._labels.allowed(ids, item.label)
-            fit, errors, dof = self._window.misfit(allowed, item.poses, sigma_px)
-            scales.append(self._scale(item, sigma_px))
-            row[np.isin(ids, fit)] = np.where(
-                errors < scales[-1] * chdtri(dof, _FITS), errors, np.inf
-            )
-        return squares, scales
-
-    def _own(self, ids: IntArray, squares: FloatArray) -> FloatArray:
-        """Squared errors (N,) of tracks under the motion of the object that they are of."""
-        own = np.full(len(ids), np.inf)
-        for row, item in zip(squares, self.objects, strict=True):
-            mine = np.isin(ids, item.members)
-            own[mine] = row[mine]
-        return own
-
-    def _alone(self, ids: IntArray, ego: EgoMotion, sigma_px: float) -> FloatArray:
-        """Squared errors (N,) of tracks as static points."""
-        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
-        fit, errors, _ = self._window.misfit(ids, static, sigma_px)
-        return _for(ids, fit, errors)
-
-    def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks that do not fit an object leave it, and static ones if the object moves."""
-        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+    def _leave(self, assignment: TrackAssignment, ego: EgoMotion, sigma_px: float) -> None:
+        """Tracks leave the objects that they do not fit; what moves within one is another."""
         for item in list(self.objects):
-            fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-            unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
+            leaving = assignment.leaving(item)
             apart = self._moving_within(item, ego, sigma_px)
-            item.members = np.setdiff1d(
-                item.members, self._labels.contradicted(item.members, item.label)
-            )
             if item.confirmed and len(apart) > _TWO_MOTIONS * len(item.members):
                 self._separate(item, ego, sigma_px)
-                continue
-            item.members = np.setdiff1d(item.members, np.union1d(fit[unfit], apart))
-            if not item.moving:
-                continue
-            fit, squares = fit[~unfit], squares[~unfit]
-            same, alone, dof = self._window.misfit(
-                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
-            )
-            alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
-            leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(freedom, _FITS))]
-            item.members = np.setdiff1d(item.members, leaves)
+            else:
+                item.members = np.setdiff1d(item.members, np.union1d(leaving, apart))
 
     def _moving_within(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> IntArray:
         """Ids (N,) of the tracks of an object that move in its frame: an object is a world."""
         world = item.as_ego_motion(ego)
         if world is None:
-            return _no_ids()
+            return np.zeros(0, np.int64)
         stamps = list(world.stamps_ns)
         obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
         rig, backend = self._window.projection, self._policies[1]
@@ -292,11 +181,11 @@ class ObjectTracker:
             if item.unique and item.frames % _MIRRORED:
                 continue
             worse = mirror.worse(item.members, item.poses)
-            if abs(worse) > _MARGIN:
+            if abs(worse) > MARGIN:
                 item.unique = worse > 0
-            if worse < -_MARGIN:  # one that begins now finds either of the two
+            if worse < -MARGIN:  # one that begins now finds either of the two
                 motion = self._motion_of(item.members, ego)
-                if motion is not None and mirror.worse(item.members, motion.poses) > _MARGIN:
+                if motion is not None and mirror.worse(item.members, motion.poses) > MARGIN:
                     item.begin_again(item.members, motion, ego)
                     item.unique = True
 
@@ -309,14 +198,6 @@ class ObjectTracker:
         _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
         spread = float(np.sqrt(2.0 * max(dof.sum(), 1)))
         return bool(squares.sum() - dof.sum() > _BADLY * spread)
-
-    def _scale(self, item: TrackedObject, sigma_px: float) -> float:
-        """Squared errors of the tracks of an object over what is expected, by its poses as known.
-
-        At first the poses are known badly, and no track fits them as well as it will.
-        """
-        _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-        return _scale(squares, dof)
 
     def _merge(self, ego: EgoMotion) -> None:
         """Objects that move as one rigid body become one: the older stays."""
@@ -366,7 +247,7 @@ class ObjectTracker:
 
     def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
         """Labels and tracks of what begins to move; without masks labels are 0."""
-        free = ~np.isin(test.ids, _members(self.objects))
+        free = ~np.isin(test.ids, members_of(self.objects))
         moves = free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))
         if not self._labels.given:
             return [(0, group) for group in self._groups(test.ids[moves], sigma_px)]
@@ -384,13 +265,7 @@ class ObjectTracker:
         if len(ids) < config.min_points or len(self._window.frames) < _LEAST_FRAMES:
             return []
         frames = list(self._window.frames)
-        near = self._near(ids)
-        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px, near)
-
-    def _near(self, ids: IntArray) -> TrackNeighbours:
-        """Neighbours among some tracks, those that are static, and those of objects."""
-        seen = self._window.frames[-1].cameras[0]
-        return TrackNeighbours(seen, np.union1d(ids, self._known))
+        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px)
 
     def _recognise(self, item: TrackedObject, ego: EgoMotion) -> None:
         """Give an object its old number if one that was hidden is expected there."""
@@ -418,13 +293,13 @@ class ObjectTracker:
     def _described(self, states: list[ObjectState], test: MotionTest) -> ObjectFrame:
         moving = [item for item in self.objects if item.moving or not item.confirmed]
         members = {int(i): item.number for item in self.objects for i in item.members}
-        own = _members(self.objects)
+        own = members_of(self.objects)
         free = ~np.isin(test.ids, own)
         ids = np.concatenate([test.ids[free], own])
         known = np.concatenate(
             [
                 test.probabilities[free],
-                np.isin(own, _members(moving)).astype(np.float64),
+                np.isin(own, members_of(moving)).astype(np.float64),
             ]
         )
         order = np.argsort(ids)
@@ -439,29 +314,3 @@ class ObjectTracker:
             {item.number: item.world_points() for item in self.objects if item.confirmed},
             self._hulls(by_itself),
         )
-
-
-def _clearly(squares: FloatArray, others: FloatArray, scale: float = 1.0) -> BoolArray:
-    """Whether squared errors (N,) are known, and clearly less than others (N,)."""
-    return np.isfinite(squares) & (
-        others > np.where(np.isfinite(squares), squares, 0) + scale * _MARGIN
-    )
-
-
-def _scale(squares: FloatArray, dof: IntArray) -> float:
-    """Squared errors of the tracks that fit best, over what is expected; at least 1."""
-    if len(dof) == 0:
-        return 1.0
-    return max(1.0, float(np.quantile(squares / dof, _BEST)))
-
-
-def _members(objects: Sequence[TrackedObject]) -> IntArray:
-    """Ids (N,) of the tracks of objects, ascending."""
-    return np.unique(np.concatenate([_no_ids(), *(item.members for item in objects)]))
-
-
-def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> FloatArray:
-    """Values (N,) for ids (N,) where some were found (both ascending); infinite for the others."""
-    result = np.full(len(ids), np.inf)
-    result[np.isin(ids, found)] = values
-    return result
