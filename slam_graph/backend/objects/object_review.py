@@ -28,7 +28,7 @@ from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
 
-_LEAST_FRAMES = 6
+_LEAST_FRAMES = 3
 """Frames of a window that tell anything."""
 _AGAIN = 0.01
 """Probability with which an object begins again without need; what it loses is its past."""
@@ -80,7 +80,7 @@ class ObjectReview:
         if anew is None:
             return []
         stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
-        if len(stamps) < _LEAST_FRAMES:
+        if not self._fill_the_window(stamps):
             return []
         current = self._total(item.members, item, stamps)
         best, part = self._total(item.members, anew.motion, stamps), anew
@@ -102,6 +102,13 @@ class ObjectReview:
                 return halves
         again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
         return [Part(item.members, part.motion)] if current - best > again else []
+
+    def _fill_the_window(self, stamps: list[int]) -> bool:
+        """Whether a motion is known over the whole window; earlier too many motions fit."""
+        if len(stamps) < _LEAST_FRAMES:
+            return False
+        period = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
+        return len(stamps) * period > self._config.window_s * 1e9
 
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""
