@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -17,6 +20,8 @@ from slam_graph.frontend import Feedback
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame
+
+_NOT_SMOOTHED = "no smoothed objects"
 
 
 class Objects(NoObjects):
@@ -51,7 +56,18 @@ class Objects(NoObjects):
             config.objects,
             {} if masks is None else masks.mask_classes,
         )
+        self._recording = ExitStack()
         self.found = ObjectFrame()
+
+    def begin(self, resources: ExitStack) -> None:
+        """Make a temporary folder for the tracks of objects, if they are to be smoothed."""
+        if not self._result.config.final_ba.enabled:
+            return
+        with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
+            folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
+            resources.enter_context(self._recording)  # released before the folder is removed
+            rig = self._result.input.rig
+            self._recording.enter_context(self._objects.recorded(rig, Path(folder)))
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what moves and where objects want more features."""
@@ -85,7 +101,16 @@ class Objects(NoObjects):
         return replace(frame, objects=self.found)
 
     def finish(self) -> None:
-        """Say so if no mask belongs to any frame."""
+        """Smooth the objects, and say so if no mask belongs to any frame."""
+        result = self._result
+        if result.final_ba is not None:
+            with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
+                self._recording.close()
+                calibrated = result.logs.calibration.latest
+                rig = result.causal_rig if calibrated is None else calibrated.rig
+                platform = result.final_ba.history
+                for failure in self._objects.smooth(rig, platform, result.config.final_ba):
+                    self._diagnostics.warn("objects_failed", failure)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(
                 "masks_unused",

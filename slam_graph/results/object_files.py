@@ -16,12 +16,13 @@ from slam_graph.results.run_input import RunInput
 
 if TYPE_CHECKING:
     from slam_graph.backend import MovingObjects
+    from slam_graph.backend.objects.object_history import ObjectHistory
 
-OBJECTS = "objects.csv"
+OBJECTS, SMOOTHED = "objects.csv", "objects_smoothed.csv"
 
 
 def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
-    """Write `objects.csv`, and for each object its trajectory and its points."""
+    """Write `objects.csv`, each trajectory and points; the same smoothed, if objects were."""
     files.text(OBJECTS, objects.csv_lines())
     if len(objects):
         Files.make_folder(files.folder / "objects")
@@ -29,9 +30,14 @@ def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
         files.text(f"objects/{number}.tum", objects.trajectory(number).tum_lines())
         if len(objects.points.get(number, ())):
             write_ply(files.path(f"objects/{number}.ply"), objects.points[number])
+    if objects.smoothed is not None:
+        files.text(SMOOTHED, objects.smoothed.csv_lines())
+        for number in objects.smoothed.numbers:
+            path = objects.smoothed.trajectory(number)
+            files.text(f"objects/{number}_smoothed.tum", path.tum_lines())
 
 
-def _accuracy(objects: MovingObjects, asked: RunInput) -> dict[str, float | int] | None:
+def _accuracy(objects: ObjectHistory, asked: RunInput) -> dict[str, float | int] | None:
     """Errors of motions and poses; None without true poses."""
     if asked.truth is None or not asked.object_truth:
         return None
@@ -50,6 +56,7 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
     if objects is None:
         return None
     table: dict[str, Any] = {}
+    smoothed = objects.smoothed
     for number in objects.numbers:
         states = objects.states(number)
         speeds = [float(np.linalg.norm(state.velocity)) for state in states if state.moving]
@@ -66,5 +73,6 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
     return {
         "objects": table,
         "accuracy": _accuracy(objects, asked),
+        "smoothed": None if smoothed is None else _accuracy(smoothed, asked),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }

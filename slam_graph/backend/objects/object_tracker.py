@@ -65,19 +65,25 @@ class ObjectTracker:
         algorithm: the policies, the same for objects as for the platform.
         backend: settings of the estimator.
         config: of objects.
+        first: number of the first one.
 
     Attributes:
         objects: those that are seen, or were a short time ago.
     """
 
     def __init__(
-        self, rig: Rig, algorithm: AlgorithmConfig, backend: BackendConfig, config: ObjectsConfig
+        self,
+        rig: Rig,
+        algorithm: AlgorithmConfig,
+        backend: BackendConfig,
+        config: ObjectsConfig,
+        first: int = 1,
     ) -> None:
         self._policies = (algorithm, backend)
         self._config = config
         self._window = TrackWindow(rig, backend)
         self._rig = rig
-        self._next = 1
+        self._next = first
         self._noise = 1.0
         self.objects: list[TrackedObject] = []
         self._hidden: list[TrackedObject] = []

@@ -77,7 +77,7 @@ class RelativeMotion:
         length_s: float,
     ) -> None:
         self._estimator = Estimator(
-            rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
+            rig.without_imu(), algorithm, object_settings(backend, config), Diagnostics()
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
@@ -176,7 +176,7 @@ def motion_over(
     return motion if ego.stamps_ns[-1] in motion.poses else None
 
 
-def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
+def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
     """Settings of the estimator of an object."""
     dynamics = {
         "model": "constant_velocity",

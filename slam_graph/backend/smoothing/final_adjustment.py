@@ -187,7 +187,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         segment, absolute = replace(segment, aiding=aiding), len(aiding.fixes) > 0
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
-            task, start = replace(task, causal=causal), with_angular_rates(start)
+            task = replace(task, causal=causal)
+            start = with_angular_rates(start, segment.imu)
         # without an IMU errors are judged by the first pose, so that it defines the world
         anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
         begin, link = 0, None
