@@ -30,6 +30,14 @@ from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
+_ROUNDS = 4
+"""The noise of the dynamics is estimated this many times at most."""
+_SAME_FACTOR = 1.2
+"""Noise densities whose ratio is below this are the same."""
+_LEAST_NOISE = 0.01
+"""Smallest factor on the densities of the settings in one round."""
+_DENSITIES = ("accel_density", "angular_accel_density")
+
 
 @dataclass(frozen=True, eq=False)
 class ObjectSmoothing:
@@ -68,12 +76,30 @@ class ObjectSmoothing:
         with TemporaryDirectory(prefix="slam_graph_") as folder:
             rig = self.rig.without_imu()
             with FrameLog.recording(rig, self.config, Path(folder), motion_known=True) as log:
-                self._record(log, frames)
-            backend = object_settings(self.backend, self.objects)
-            found = adjust_recording(
-                log, self._initial(states), rig, backend, self.config, lambda *_: None
-            )
+                self._record(log, (f for f in frames if f.stamp_ns >= states[0].stamp_ns))
+            found = self._adjusted(log, self._initial(states), rig)
         return [] if found is None else self._states(found, states)
+
+    def _adjusted(self, log: FrameLog, initial: Trajectory, rig: Rig) -> FinalBa | None:
+        """The minimum under the noise of the object's acceleration that it shows itself."""
+        found, objects = None, self.objects
+        # tracks of points at another time of the way may be of the other side of the object
+        config = self.config.model_copy(update={"fuse_features": False})
+        for _ in range(_ROUNDS):
+            backend = object_settings(self.backend, objects)
+            found = adjust_recording(
+                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE
+            )
+            if found is None:
+                return None
+            factors = np.array([found.noise.accel, found.noise.gyro_walk])
+            if np.all(np.abs(np.log(factors)) < np.log(_SAME_FACTOR)):
+                break
+            densities = factors * [objects.accel_density, objects.angular_accel_density]
+            objects = objects.model_copy(
+                update=dict(zip(_DENSITIES, densities.tolist(), strict=True))
+            )
+        return found
 
     @property
     def _offset_ns(self) -> int:
