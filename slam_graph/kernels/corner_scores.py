@@ -46,7 +46,7 @@ def _reflected(place: int, length: int) -> int:
 def _gradients(
     above: _Image, here: _Image, below: _Image, smooth: _Line, rising: _Line, dx: _Line, dy: _Line
 ) -> None:
-    """Sobel's derivatives of a row; `smooth` and `rising` are room for it and one more each side."""
+    """Sobel's derivatives of a row; `smooth` and `rising` are room for it and two more."""
     width = len(here)
     for u in range(width):
         a, b, c = np.int16(above[_at(u)]), np.int16(here[_at(u)]), np.int16(below[_at(u)])

@@ -39,7 +39,7 @@ def _copy(image: _Image, u: int, v: int, radius: int, out: _Patch) -> None:
 
 
 @compiled()
-def _correlation(patch: _Patch, other: _Patch, sum_r: int, sum_rr: int) -> float:
+def _correlation(patch: _Patch, other: _Patch, sum_r: np.int64, sum_rr: np.int64) -> float:
     """Normalised cross-correlation of patches, the sums of the first one and its squares given."""
     o_sum = o_squares = products = np.int32(0)
     count = len(patch)

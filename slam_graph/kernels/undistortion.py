@@ -20,7 +20,8 @@ def approach_radtan(
 ) -> FloatArray:
     """Normalised points of distorted ones, roughly; the other form is `cv2.undistortPointsIter`.
 
-    Each step divides by the radial factor, and subtracts the tangential part, of the point so far.
+    Each step subtracts the tangential part, and divides by the radial factor, of the point so far.
+    A step that would make the error larger is not made, and all that follow are half as long.
 
     Args:
         q: (N, 2) points of the image plane.
@@ -35,20 +36,26 @@ def approach_radtan(
     m = q.copy()
     for n in range(len(q)):
         x, y = q[n]
+        error, share = np.inf, 1.0
         for _ in range(steps):
             r2 = x * x + y * y
             inverse = 1.0 / (1.0 + r2 * (k1 + k2 * r2))
             if inverse < 0.0:
                 x, y = q[n]
                 break
-            tangential_x = 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-            tangential_y = p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-            x, y = (q[n, 0] - tangential_x) * inverse, (q[n, 1] - tangential_y) * inverse
-            r2 = x * x + y * y
+            to_x = (q[n, 0] - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) * inverse
+            to_y = (q[n, 1] - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) * inverse
+            to_x, to_y = (1.0 - share) * x + share * to_x, (1.0 - share) * y + share * to_y
+            r2 = to_x * to_x + to_y * to_y
             radial = 1.0 + r2 * (k1 + k2 * r2)
-            error_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - q[n, 0]
-            error_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - q[n, 1]
-            if math.sqrt(error_x * error_x + error_y * error_y) < tolerance:
+            dx = to_x * radial + 2.0 * p1 * to_x * to_y + p2 * (r2 + 2.0 * to_x * to_x) - q[n, 0]
+            dy = to_y * radial + p1 * (r2 + 2.0 * to_y * to_y) + 2.0 * p2 * to_x * to_y - q[n, 1]
+            remaining = math.sqrt(dx * dx + dy * dy)
+            if remaining < error:
+                x, y, error = to_x, to_y, remaining
+            else:
+                share *= 0.5
+            if error < tolerance:
                 break
         m[n, 0], m[n, 1] = x, y
     return m
