@@ -11,7 +11,6 @@ from slam_graph.kernels.corner_scores import smallest_eigenvalues, smallest_eige
 from slam_graph.kernels.epipolar import ray_depths, ray_depths_numpy
 from slam_graph.kernels.near_pairs import nearest, nearest_numpy
 from slam_graph.kernels.undistortion import approach_radtan
-from slam_graph.sensors.lens_models import RadialTangential
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 
@@ -65,14 +64,16 @@ def test_nearest(points: int, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("coefficients", "reach"),
-    [(EUROC, 1.5), ((0.0, 0.0, 0.0, 0.0), 1.0), ((-3.0, 0.0, 0.01, -0.02), 0.2)],
+    [(EUROC, 0.9), ((0.0, 0.0, 0.0, 0.0), 1.0), ((-3.0, 0.0, 0.01, -0.02), 0.8)],
 )
 def test_approach_is_that_of_opencv(coefficients: tuple[float, ...], reach: float) -> None:
-    # beyond the fold of the polynomial there is nothing to find, and roundings decide
-    m = np.random.default_rng(5).uniform(-reach, reach, (300, 2))
-    q = RadialTangential().points(m, coefficients)
+    q = np.random.default_rng(5).uniform(-reach, reach, (300, 2))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
     own, eye = np.array(coefficients), np.eye(3)
     expected = cv2.undistortPointsIter(q[:, None], eye, own, eye, eye, criteria)[:, 0]
     found = approach_radtan(q, own, 20, 1e-9)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    good = np.isfinite(found[:, 0])
+    np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-12)
+    # it gives up only where the polynomial folds back, or nearly
+    assert good.all() == (coefficients[0] > -1.0)
+    assert good[np.linalg.norm(q, axis=1) < 0.1].all()

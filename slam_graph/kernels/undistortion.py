@@ -21,7 +21,7 @@ def approach_radtan(
     """Normalised points of distorted ones, roughly; the other form is `cv2.undistortPointsIter`.
 
     Each step subtracts the tangential part, and divides by the radial factor, of the point so far.
-    A step that would make the error larger is not made, and all that follow are half as long.
+    Where a step makes the error larger OpenCV goes other ways, and this gives up.
 
     Args:
         q: (N, 2) points of the image plane.
@@ -30,33 +30,30 @@ def approach_radtan(
         tolerance: a point whose distortion is nearer than this to what was asked is the result.
 
     Returns:
-        (N, 2); the point itself where the radial factor becomes negative.
+        (N, 2); NaN where it gave up.
     """
     k1, k2, p1, p2 = coefficients
     m = q.copy()
     for n in range(len(q)):
         x, y = q[n]
-        error, share = np.inf, 1.0
+        last = np.inf
         for _ in range(steps):
             r2 = x * x + y * y
             inverse = 1.0 / (1.0 + r2 * (k1 + k2 * r2))
-            if inverse < 0.0:
-                x, y = q[n]
-                break
-            to_x = (q[n, 0] - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) * inverse
-            to_y = (q[n, 1] - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) * inverse
-            to_x, to_y = (1.0 - share) * x + share * to_x, (1.0 - share) * y + share * to_y
-            r2 = to_x * to_x + to_y * to_y
+            tangential_x = 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+            tangential_y = p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+            x, y = (q[n, 0] - tangential_x) * inverse, (q[n, 1] - tangential_y) * inverse
+            r2 = x * x + y * y
             radial = 1.0 + r2 * (k1 + k2 * r2)
-            dx = to_x * radial + 2.0 * p1 * to_x * to_y + p2 * (r2 + 2.0 * to_x * to_x) - q[n, 0]
-            dy = to_y * radial + p1 * (r2 + 2.0 * to_y * to_y) + 2.0 * p2 * to_x * to_y - q[n, 1]
-            remaining = math.sqrt(dx * dx + dy * dy)
-            if remaining < error:
-                x, y, error = to_x, to_y, remaining
-            else:
-                share *= 0.5
+            dx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - q[n, 0]
+            dy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - q[n, 1]
+            error = math.sqrt(dx * dx + dy * dy)
+            if not (inverse >= 0.0 and error < last):
+                x = y = np.nan
+                break
             if error < tolerance:
                 break
+            last = error
         m[n, 0], m[n, 1] = x, y
     return m
 
