@@ -15,7 +15,7 @@ from slam_graph.kernels.undistortion import approach_radtan
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 
 
-@pytest.mark.parametrize("shape", [(120, 102), (2, 3), (5, 64), (33, 2)])
+@pytest.mark.parametrize("shape", [(120, 102), (2, 3), (5, 64), (33, 2), (1, 9), (4, 1)])
 def test_corner_scores(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, shape, dtype=np.uint8)

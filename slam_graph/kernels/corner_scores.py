@@ -37,6 +37,8 @@ _LARGEST = 4 * 255
 @compiled()
 def _reflected(place: int, length: int) -> int:
     """Where a line is continued beyond its ends, as by OpenCV's BORDER_REFLECT_101."""
+    if length == 1:
+        return 0
     while not 0 <= place < length:
         place = -place if place < 0 else 2 * length - 2 - place
     return place
@@ -102,7 +104,7 @@ def smallest_eigenvalues(image: _Image) -> _Scores:
     """The smaller eigenvalue of the covariance of the gradient in a window around each pixel.
 
     Args:
-        image: (height, width), at least two pixels each way, reflected at its edges.
+        image: (height, width), reflected at its edges.
 
     Returns:
         (height, width), in the unit of `cv2.cornerMinEigenVal`.
