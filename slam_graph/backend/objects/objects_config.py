@@ -24,9 +24,9 @@ class ObjectsConfig(Settings):
     """Fewest tracks that make an object."""
     features: int = expert(40, ge=0)
     """How many features the front end finds on each object, where it has so many corners."""
-    algorithm: str = expert("okvis")
-    """Policies of the estimators of objects: the name of an algorithm, or a YAML file of one. They
-    have few features that are near one another, for which a window of poses is best."""
+    algorithm: str = expert("")
+    """Policies of the estimators of objects: the name of an algorithm, or a YAML file of one; empty
+    for `configs/objects.yaml`, a window of the last frames."""
     accel_density: float = expert(1.5, gt=0)
     """White noise of the acceleration of an object, m/s²/√Hz. Raise it for objects that swerve."""
     angular_accel_density: float = expert(0.3, gt=0)

@@ -76,7 +76,7 @@ class RelativeMotion:
         length_s: float,
     ) -> None:
         self._estimator = Estimator(
-            rig.without_imu(), _policies(algorithm), _settings(backend, config), Diagnostics()
+            rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
@@ -145,16 +145,6 @@ class RelativeMotion:
     def covariance(self, now_ns: int) -> FloatArray:
         """(6, 6) of the tangent of the pose in the last frame."""
         return self._estimator.covariance_of([X(self._frames[now_ns])])
-
-
-def _policies(algorithm: AlgorithmConfig) -> AlgorithmConfig:
-    """The policies without first-estimates Jacobians.
-
-    The depths of a single frame are off by a third of the size of an object. Jacobians at such
-    points let an object turn the wrong way, with a covariance that does not know of it.
-    """
-    marginalization = algorithm.marginalization.model_copy(update={"first_estimates": False})
-    return algorithm.model_copy(update={"marginalization": marginalization})
 
 
 def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
