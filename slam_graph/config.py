@@ -140,6 +140,15 @@ class RunConfig(Settings):
     limits: LimitsConfig = LimitsConfig()
     """When an estimate is lost, and whether the run then starts again."""
 
+    @property
+    def object_policies(self) -> AlgorithmConfig:
+        """Policies of the estimators of moving objects.
+
+        Raises:
+            ConfigError: if `objects.algorithm` is none.
+        """
+        return load_config(self.objects.algorithm or config_folder() / "objects.yaml").algorithm
+
     def _facts(self) -> dict[str, object]:
         """The policies of the algorithm, and what differs from the defaults."""
         table = self.algorithm.model_dump(mode="json")

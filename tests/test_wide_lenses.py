@@ -301,7 +301,7 @@ def test_what_is_beyond_the_fold_is_not_seen_by_the_other_camera() -> None:
 
 def test_the_epipolar_search_leaves_out_what_the_other_camera_does_not_see() -> None:
     search = _EpipolarSearch(FOLDING, gtsam.Pose3(), 0.5)
-    ends = search.project(np.concatenate([CORNER, [[1.0, 1.0]]]), np.zeros(2))
+    ends = search.project(np.concatenate([CORNER, [[1.0, 1.0]]]), np.zeros(1))[:, 0]
     assert np.all(ends[0] < 0)
     np.testing.assert_allclose(ends[1], FOLDING.distort(np.array([[1.0, 1.0]]))[0][0])
 

@@ -89,7 +89,7 @@ class CameraTracker:
         with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(found.points[keep].astype(np.float64))
             after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
-            moves = np.isin(after.ids, self._moving.ids)
+            moves = self._moving.among(after.ids)
             tested = np.flatnonzero(~moves)
             places = self._unrolled(before)[keep][tested], self._unrolled(after)[tested]
             motions = [tested[rows] for rows in self._rigid_motions(*places)]
@@ -120,7 +120,7 @@ class CameraTracker:
             next_id: id of the first new feature.
         """
         here, there = after.common(before)
-        rest = ~np.isin(after.ids[here], self._moving.ids)  # others would spoil the motion of these
+        rest = ~self._moving.among(after.ids[here])  # others would spoil the motion of these
         here, there = here[rest], there[rest]
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):

@@ -18,12 +18,10 @@ from slam_graph.arrays import IntArray
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
+from slam_graph.kernels.corner_scores import WINDOW_PX, smallest_eigenvalues
 from slam_graph.kernels.corners import strongest_maxima
 
 _INSTALL = "pip install 'slam-graph[descriptors]'"
-
-_CORNER_WINDOW_PX = 7
-"""Side of the window over which gradients are summed for the scores of Shi-Tomasi and Harris."""
 
 _SOBEL_PX = 3
 """Side of the filter that takes the gradients."""
@@ -103,14 +101,14 @@ class _GradientCorners:
     def detect(self, image: Image, allowed: Image, count: int, distance_px: float) -> Keypoints:
         """The strongest corners."""
         if self._harris:
-            all_scores = cv2.cornerHarris(image, _CORNER_WINDOW_PX, _SOBEL_PX, _HARRIS_K)
+            harris = cv2.cornerHarris(image, WINDOW_PX, _SOBEL_PX, _HARRIS_K)
+            scores = np.ascontiguousarray(harris, np.float32)
         else:
-            all_scores = cv2.cornerMinEigenVal(image, _CORNER_WINDOW_PX, None, _SOBEL_PX)
-        scores = np.ascontiguousarray(all_scores, np.float32)
+            scores = smallest_eigenvalues(np.ascontiguousarray(image))
         # the share is one of eigenvalues, of which Harris' score is the square
         share = _RELATIVE_SCORE ** (2 if self._harris else 1)
         found = strongest_maxima(scores, allowed, count, share, self._smallest, distance_px)
-        return Keypoints.of(found[:, :2], found[:, 2], float(_CORNER_WINDOW_PX))
+        return Keypoints.of(found[:, :2], found[:, 2], float(WINDOW_PX))
 
 
 @DETECTORS.register("shi_tomasi")

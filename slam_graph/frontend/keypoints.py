@@ -158,13 +158,15 @@ class Tracks:
 
     def select(self, keep: BoolArray | IntArray) -> Tracks:
         """Those where a mask `keep` (N,) is true, or those with given indices."""
+        # `take` needs a third of the time of an index that is a mask
+        rows = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
         return Tracks(
             self.image,
             self.stamp_ns,
-            self.ids[keep],
-            self.pixels[keep],
-            self.normalized[keep],
-            self.residual_flow[keep],
+            self.ids.take(rows),
+            self.pixels.take(rows, axis=0),
+            self.normalized.take(rows, axis=0),
+            self.residual_flow.take(rows, axis=0),
         )
 
     def joined(self, other: Tracks) -> Tracks:

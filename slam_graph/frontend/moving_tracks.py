@@ -12,7 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.keypoints import Image, Pixels
 from slam_graph.sensors import FeatureObservations
 
@@ -41,6 +41,12 @@ class MovingTracks:
 
     def __contains__(self, feature: int) -> bool:
         return bool(np.isin(feature, self.ids))
+
+    def among(self, ids: IntArray) -> BoolArray:
+        """Which features (N,) move."""
+        if len(self.ids) == 0:
+            return np.zeros(len(ids), np.bool_)
+        return np.isin(ids, self.ids)
 
     def add(self, ids: IntArray) -> None:
         """Features that moved between two images, or that the back end found to move."""

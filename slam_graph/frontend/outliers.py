@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.kernels.epipolar import constraint_moments, sampson_distances
+from slam_graph.kernels.epipolar import constraint_moments, ray_depths, sampson_distances
 
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
@@ -288,24 +288,8 @@ def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) ->
 
     They are infinite where the rays are parallel, and negative where they meet behind a camera.
     """
-    a = _rays(m_a) @ b_T_a.rotation().matrix().T
-    b = _rays(m_b)
-    t = b_T_a.translation()
-    # z_a a + t = z_b b in the least squares sense
-    aa, bb, ab = np.sum(a * a, 1), np.sum(b * b, 1), np.sum(a * b, 1)
-    at, bt = a @ t, b @ t
-    determinant = aa * bb - ab * ab
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depths = np.column_stack([ab * bt - bb * at, aa * bt - ab * at]) / determinant[:, None]
-    result: FloatArray = np.where(determinant[:, None] < 1e-12, np.inf, depths)
-    return result
-
-
-def _rays(m: FloatArray) -> FloatArray:
-    """Rays (N, 3) through points (N, 2) of the plane z = 1."""
-    rays = np.ones((len(m), 3))
-    rays[:, :2] = m
-    return rays
+    R, t = b_T_a.rotation().matrix(), np.array(b_T_a.translation())  # not read-only
+    return ray_depths(_contiguous(R), t, _contiguous(m_a), _contiguous(m_b))
 
 
 def _contiguous(values: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -16,6 +15,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.geometry import NavState
+from slam_graph.kernels.near_pairs import nearest
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, RigCamera
 
 _HISTORY_NS = 2_000_000_000
@@ -288,6 +288,6 @@ def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
     """
     if len(start) < _NEIGHBOURS:
         return np.zeros_like(at)
-    _, nearest = cKDTree(start).query(at, k=_NEIGHBOURS)
-    ascending = np.sort((end - start)[nearest], axis=1)
+    neighbours = nearest(np.ascontiguousarray(start), np.ascontiguousarray(at), _NEIGHBOURS)
+    ascending = np.sort((end - start)[neighbours], axis=1)
     return np.asarray(ascending[:, _NEIGHBOURS // 2], np.float32)

@@ -133,19 +133,18 @@ class _EpipolarSearch:
         """Pixels in the other camera of points of the reference camera at given depths.
 
         Args:
-            normalized: (..., 2) in the reference camera.
-            inverse_depth_per_m: (...) 1 / z in the reference camera, 1 / distance if this camera's
+            normalized: (N, 2) in the reference camera.
+            inverse_depth_per_m: (C,) 1 / z in the reference camera, 1 / distance if this camera's
                 lens is wide; 0 for points at infinity.
 
         Returns:
-            (..., 2); far off the image for points that are not in front of the other camera.
+            (N, C, 2); far off the image for points that are not in front of the other camera.
         """
-        rays = np.concatenate([normalized, np.ones((*normalized.shape[:-1], 1))], axis=-1)
+        rays = np.column_stack([normalized, np.ones(len(normalized))])
         if self._camera.model.sees_sideways:
-            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        points = rays @ self._R.T + self._t * inverse_depth_per_m[..., None]
-        m = points[..., :2] / np.maximum(points[..., 2:], 1e-3)
-        m = m.reshape(-1, 2)
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        points = (rays @ self._R.T)[:, None] + np.outer(inverse_depth_per_m, self._t)
+        m = (points[..., :2] / np.maximum(points[..., 2:], 1e-3)).reshape(-1, 2)
         pixels = self._camera.pixels(m)
         if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
             pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
@@ -166,11 +165,8 @@ class _EpipolarSearch:
             guess: (N, 2) full-size pixels in the other image.
             score: (N,) normalised cross-correlation there, in [-1, 1].
         """
-        n, candidates = len(pixels), len(self._inverse_depths)
-        targets = self.project(
-            np.broadcast_to(normalized[:, None], (n, candidates, 2)),
-            np.broadcast_to(self._inverse_depths, (n, candidates)),
-        )
+        n = len(pixels)
+        targets = self.project(normalized, self._inverse_depths)
         scores = np.empty(n)
         points = pixels.astype(np.float64)
         best = most_similar(reference, other, points, targets, 2**_HALVINGS, _PATCH_RADIUS, scores)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The epipolar constraint of matches: distances from it, and its moments."""
+"""The epipolar constraint of matches: distances from it, its moments, and depths."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from slam_graph.kernels.compilation import compiled
 __all__ = [
     "constraint_moments",
     "constraint_moments_numpy",
+    "ray_depths",
+    "ray_depths_numpy",
     "sampson_distances",
     "sampson_distances_numpy",
 ]
 
 _TINY = 1e-12
 """Keeps divisions finite."""
+
+_PARALLEL = 1e-12
+"""Smallest determinant of two rays that meet."""
 
 
 @compiled("f8[::1](f8[:, ::1], f8[:, ::1], f8[:, ::1])")
@@ -83,3 +88,48 @@ def constraint_moments_numpy(m_a: FloatArray, m_b: FloatArray) -> FloatArray:
     rows = (b[:, :, None] * a[:, None, :]).reshape(-1, 9)
     moments: FloatArray = rows.T @ rows
     return moments
+
+
+@compiled("f8[:, ::1](f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+def ray_depths(R: FloatArray, t: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
+    """Depths (N, 2) in a and in b of the closest points of two rays: z_a R a + t = z_b b.
+
+    Args:
+        R: (3, 3) b_R_a.
+        t: (3,) of a in b, in metres.
+        m_a: (N, 2) normalised points of one image.
+        m_b: (N, 2) the same points in the other one.
+
+    Returns:
+        Metres; infinite where rays are parallel, negative where they meet behind a camera.
+    """
+    depths = np.empty((len(m_a), 2))
+    for n in range(len(m_a)):
+        aa = bb = ab = at = bt = 0.0
+        for i in range(3):
+            a = m_a[n, 0] * R[i, 0] + m_a[n, 1] * R[i, 1] + R[i, 2]
+            b = m_b[n, i] if i < 2 else 1.0
+            aa += a * a
+            bb += b * b
+            ab += a * b
+            at += a * t[i]
+            bt += b * t[i]
+        determinant = aa * bb - ab * ab
+        parallel = determinant < _PARALLEL
+        depths[n, 0] = np.inf if parallel else (ab * bt - bb * at) / determinant
+        depths[n, 1] = np.inf if parallel else (aa * bt - ab * at) / determinant
+    return depths
+
+
+def ray_depths_numpy(R: FloatArray, t: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
+    """`ray_depths` in NumPy."""
+    a = np.column_stack([m_a, np.ones(len(m_a))]) @ R.T
+    b = np.column_stack([m_b, np.ones(len(m_b))])
+    # z_a a + t = z_b b in the least squares sense
+    aa, bb, ab = np.sum(a * a, 1), np.sum(b * b, 1), np.sum(a * b, 1)
+    at, bt = a @ t, b @ t
+    determinant = aa * bb - ab * ab
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depths = np.column_stack([ab * bt - bb * at, aa * bt - ab * at]) / determinant[:, None]
+    result: FloatArray = np.where(determinant[:, None] < _PARALLEL, np.inf, depths)
+    return result

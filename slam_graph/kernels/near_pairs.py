@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of points of two sets that are near each other."""
+"""Points of two sets that are near each other."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["near_pairs", "near_pairs_numpy"]
+__all__ = ["near_pairs", "near_pairs_numpy", "nearest", "nearest_numpy"]
+
+_Pixels = NDArray[np.float32]
 
 
 @compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], f8)")
@@ -40,3 +44,39 @@ def near_pairs_numpy(first: FloatArray, second: FloatArray, distance: float) -> 
     """`near_pairs` in NumPy."""
     squares = np.sum((second - first[:, None]) ** 2, axis=2)
     return np.argwhere(squares <= distance * distance)
+
+
+@compiled("i8[:, ::1](f4[:, ::1], f4[:, ::1], i8)")
+def nearest(points: _Pixels, places: _Pixels, count: int) -> IntArray:
+    """The points that are nearest to each place, by comparing all with all.
+
+    Args:
+        points: (N, 2), at least `count`.
+        places: (M, 2).
+        count: how many are wanted for each place.
+
+    Returns:
+        (M, count) rows of the points, the nearest first.
+    """
+    chosen = np.empty((len(places), count), np.int64)
+    squares = np.empty(count)
+    for m in range(len(places)):
+        x, y = float(places[m, 0]), float(places[m, 1])
+        squares[:] = np.inf
+        for n in range(len(points)):
+            dx, dy = float(points[n, 0]) - x, float(points[n, 1]) - y
+            square = dx * dx + dy * dy
+            if square >= squares[count - 1] and n >= count:
+                continue
+            k = min(n, count - 1)
+            while k > 0 and squares[k - 1] > square:
+                squares[k], chosen[m, k] = squares[k - 1], chosen[m, k - 1]
+                k -= 1
+            squares[k], chosen[m, k] = square, n
+    return chosen
+
+
+def nearest_numpy(points: _Pixels, places: _Pixels, count: int) -> IntArray:
+    """`nearest` in SciPy."""
+    rows: IntArray = cKDTree(points).query(places, k=count)[1]
+    return rows.reshape(len(places), count)

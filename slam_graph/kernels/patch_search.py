@@ -15,6 +15,10 @@ from slam_graph.kernels.compilation import compiled
 __all__ = ["most_similar", "most_similar_numpy"]
 
 _Image = NDArray[np.uint8]
+_Patch = NDArray[np.int16]
+
+_at = np.uintp
+"""An index without a sign. Numba would test others for negative ones, and not use vectors."""
 
 
 @compiled()
@@ -26,24 +30,29 @@ def _centre(place: float, scale: int, length: int, radius: int) -> int:
 
 
 @compiled()
-def _correlation(
-    reference: _Image, other: _Image, u: int, v: int, a: int, b: int, radius: int
-) -> float:
-    """Normalised cross-correlation of patches around pixels (u, v) and (a, b)."""
-    sum_r = sum_o = sum_rr = sum_oo = sum_ro = 0
-    for i in range(-radius, radius + 1):
-        for j in range(-radius, radius + 1):
-            r, o = int(np.int64(reference[v + i, u + j])), int(np.int64(other[b + i, a + j]))
-            sum_r += r
-            sum_o += o
-            sum_rr += r * r
-            sum_oo += o * o
-            sum_ro += r * o
-    count = (2 * radius + 1) ** 2
+def _copy(image: _Image, u: int, v: int, radius: int, out: _Patch) -> None:
+    """The patch around a pixel (u, v)."""
+    side = 2 * radius + 1
+    for i in range(side):
+        for j in range(side):
+            out[_at(i * side + j)] = image[_at(v - radius + i), _at(u - radius + j)]
+
+
+@compiled()
+def _correlation(patch: _Patch, other: _Patch, sum_r: np.int64, sum_rr: np.int64) -> float:
+    """Normalised cross-correlation of patches, the sums of the first one and its squares given."""
+    o_sum = o_squares = products = np.int32(0)
+    count = len(patch)
+    for k in range(count):
+        o = np.int32(other[_at(k)])
+        o_sum = np.int32(o_sum + o)
+        o_squares = np.int32(o_squares + np.int32(o * o))
+        products = np.int32(products + np.int32(o * np.int32(patch[_at(k)])))
+    sum_o, sum_oo, sum_ro = np.int64(o_sum), np.int64(o_squares), np.int64(products)
     variances = (count * sum_rr - sum_r * sum_r) * (count * sum_oo - sum_o * sum_o)
     if variances == 0:
         return 0.0
-    return (count * sum_ro - sum_r * sum_o) / math.sqrt(float(variances))
+    return float(count * sum_ro - sum_r * sum_o) / math.sqrt(float(variances))
 
 
 @compiled("i8[::1](u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1])")
@@ -72,9 +81,17 @@ def most_similar(
     """
     height, width = other.shape
     best = np.zeros(len(points), np.int64)
+    pixels = (2 * radius + 1) ** 2
+    patch, candidate = np.empty(pixels, np.int16), np.empty(pixels, np.int16)
     for n in range(len(points)):
         u = _centre(points[n, 0], scale, width, radius)
         v = _centre(points[n, 1], scale, height, radius)
+        _copy(reference, u, v, radius, patch)
+        sum_r, sum_rr = np.int64(0), np.int64(0)
+        for k in range(len(patch)):
+            r = np.int64(patch[k])
+            sum_r += r
+            sum_rr += r * r
         scores[n], score = -1.0, -1.0
         last_a, last_b = -1, -1
         for c in range(candidates.shape[1]):
@@ -83,7 +100,8 @@ def most_similar(
                 continue
             a, b = _centre(x, scale, width, radius), _centre(y, scale, height, radius)
             if a != last_a or b != last_b:
-                score = _correlation(reference, other, u, v, a, b, radius)
+                _copy(other, a, b, radius, candidate)
+                score = _correlation(patch, candidate, sum_r, sum_rr)
                 last_a, last_b = a, b
             if score > scores[n]:
                 scores[n], best[n] = score, c

@@ -31,8 +31,7 @@ def clear_disks(mask: _Mask, points: _Pixels, half_widths: IntArray) -> None:
         u, v = int(np.rint(points[n, 0])), int(np.rint(points[n, 1]))
         for row in range(max(0, v - radius), min(height, v + radius + 1)):
             half = half_widths[row - v + radius]
-            for column in range(max(0, u - half), min(width, u + half + 1)):
-                mask[row, column] = 0
+            mask[row, max(0, u - half) : max(0, min(width, u + half + 1))] = 0
 
 
 def clear_disks_numpy(mask: _Mask, points: _Pixels, half_widths: IntArray) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend import Estimator, MovingObjects, ObjectFrame
-from slam_graph.config import config_folder, load_config
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
@@ -51,7 +50,7 @@ class Objects(NoObjects):
         self._wanted = config.objects.features
         self._objects = result.objects = MovingObjects(
             result.causal_rig,
-            load_config(config.objects.algorithm or config_folder() / "objects.yaml").algorithm,
+            config.object_policies,
             config.backend,
             config.objects,
             {} if masks is None else masks.mask_classes,

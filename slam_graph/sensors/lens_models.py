@@ -24,8 +24,8 @@ from slam_graph.sensors.camera_model import (
     register_camera_model,
 )
 
-_OPENCV_ITERATIONS = 20
-_OPENCV_EPSILON = 1e-9
+_ROUGH_ITERATIONS = 20
+_ROUGH_EPSILON = 1e-9
 _STEPS_FROM_OPENCV = 3
 """OpenCV's solution is accurate to some 1e-5; Newton's method doubles the digits in a step."""
 
@@ -57,34 +57,34 @@ class Pinhole(CameraModel):
         return gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
 
 
-class _SolvedByOpenCv(CameraModel):
-    """A model that OpenCV inverts roughly; Newton's method does the rest."""
+class _SolvedInTwoSteps(CameraModel):
+    """A model that is inverted as OpenCV does it, roughly; Newton's method does the rest."""
 
     _steps: ClassVar[int] = _STEPS_FROM_OPENCV
 
     def undistort(
         self, q: FloatArray, coefficients: Coefficients, near: FloatArray | None = None
     ) -> FloatArray:
-        """Newton's method from a guess, or from OpenCV's solution."""
+        """Newton's method from a guess, or from the solution of a slower method."""
         if near is None:
-            start = self._opencv(np.ascontiguousarray(q[:, None, :]), np.array(coefficients))
-            near = np.asarray(start, dtype=np.float64)[:, 0, :]
+            own = np.array(coefficients, np.float64)
+            near = self._approached(np.ascontiguousarray(q, np.float64), own)
         return self._newton(q, coefficients, near, self._steps)
 
     @abstractmethod
-    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
-        """OpenCV's solution (N, 1, 2) for points (N, 1, 2)."""
+    def _approached(self, q: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """OpenCV's solution (N, 2) for points (N, 2)."""
 
 
 _CRITERIA = (
     cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
-    _OPENCV_ITERATIONS,
-    _OPENCV_EPSILON,
+    _ROUGH_ITERATIONS,
+    _ROUGH_EPSILON,
 )
 
 
 @register_camera_model
-class RadialTangential(_SolvedByOpenCv):
+class RadialTangential(_SolvedInTwoSteps):
     """Brown's model, as OpenCV has it with four coefficients.
 
     Brown, "Decentering Distortion of Lenses", Photogrammetric Engineering 1966.
@@ -136,9 +136,17 @@ class RadialTangential(_SolvedByOpenCv):
         fx, fy, cx, cy = intrinsics
         return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, *coefficients)
 
-    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
-        eye = np.eye(3)
-        return cv2.undistortPointsIter(q, eye, coefficients, eye, eye, _CRITERIA)
+    def _approached(self, q: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """What `cv2.undistortPointsIter` finds; it is asked for where a kernel gives up."""
+        from slam_graph.kernels.undistortion import approach_radtan  # which imports Numba
+
+        m = approach_radtan(q, coefficients, _ROUGH_ITERATIONS, _ROUGH_EPSILON)
+        left, eye = np.isnan(m[:, 0]), np.eye(3)
+        if left.any():
+            points = q[left][:, None, :]
+            found = cv2.undistortPointsIter(points, eye, coefficients, eye, eye, _CRITERIA)
+            m[left] = np.asarray(found, np.float64)[:, 0, :]
+        return m
 
     def _newton(
         self, q: FloatArray, coefficients: Coefficients, m: FloatArray, steps: int
@@ -152,7 +160,7 @@ class RadialTangential(_SolvedByOpenCv):
 
 
 @register_camera_model
-class Equidistant(_SolvedByOpenCv):
+class Equidistant(_SolvedInTwoSteps):
     """Kannala and Brandt's model of a fisheye lens, as OpenCV has it.
 
     A ray at the angle θ to the axis meets the image plane at the radius
@@ -197,8 +205,11 @@ class Equidistant(_SolvedByOpenCv):
         fx, fy, cx, cy = intrinsics
         return gtsam.Cal3Fisheye(fx, fy, 0.0, cx, cy, *coefficients)
 
-    def _opencv(self, q: FloatArray, coefficients: FloatArray) -> Any:
-        return cv2.fisheye.undistortPoints(q, np.eye(3), coefficients, criteria=_CRITERIA)
+    def _approached(self, q: FloatArray, coefficients: FloatArray) -> FloatArray:
+        rough = cv2.fisheye.undistortPoints(
+            q[:, None, :], np.eye(3), coefficients, criteria=_CRITERIA
+        )
+        return np.asarray(rough, np.float64)[:, 0, :]
 
 
 _RADTAN = RadialTangential()
