@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which tracks are of which object: mirror images, two bodies taken for one, tracks that go over."""
+"""Which tracks are of which object: mirror images, two bodies in one, tracks that go over."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

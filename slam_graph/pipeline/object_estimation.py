@@ -109,7 +109,7 @@ class Objects(NoObjects):
                 rig = result.causal_rig if calibrated is None else calibrated.rig
                 platform = result.final_ba.history
                 for failure in self._objects.smooth(rig, platform, result.config.final_ba):
-                    self._diagnostics.warn("objects_failed", failure)
+                    self._diagnostics.warn("object_not_smoothed", failure)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(
                 "masks_unused",

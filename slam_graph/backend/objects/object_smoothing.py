@@ -27,6 +27,7 @@ from slam_graph.backend.objects.relative_motion import object_settings
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
@@ -36,6 +37,8 @@ _SAME_FACTOR = 1.2
 """Noise densities whose ratio is below this are the same."""
 _LEAST_NOISE = 0.01
 """Smallest factor on the densities of the settings in one round."""
+_LEAST_SHARE = 0.5
+"""Share of the observations of an object that a minimum fits which is right."""
 _DENSITIES = ("accel_density", "angular_accel_density")
 
 
@@ -81,7 +84,11 @@ class ObjectSmoothing:
         return [] if found is None else self._states(found, states)
 
     def _adjusted(self, log: FrameLog, initial: Trajectory, rig: Rig) -> FinalBa | None:
-        """The minimum under the noise of the object's acceleration that it shows itself."""
+        """The minimum under the noise of the object's acceleration that it shows itself.
+
+        Raises:
+            EstimationError: if the minimum fits less than half of the observations.
+        """
         found, objects = None, self.objects
         # tracks of points at another time of the way may be of the other side of the object
         config = self.config.model_copy(update={"fuse_features": False})
@@ -92,13 +99,14 @@ class ObjectSmoothing:
             )
             if found is None:
                 return None
+            if found.summary.observations < _LEAST_SHARE * log.observations:
+                raise EstimationError("it fits less than half of the observations")
             factors = np.array([found.noise.accel, found.noise.gyro_walk])
             if np.all(np.abs(np.log(factors)) < np.log(_SAME_FACTOR)):
                 break
             densities = factors * [objects.accel_density, objects.angular_accel_density]
-            objects = objects.model_copy(
-                update=dict(zip(_DENSITIES, densities.tolist(), strict=True))
-            )
+            changed = dict(zip(_DENSITIES, densities.tolist(), strict=True))
+            objects, initial = objects.model_copy(update=changed), found.trajectory
         return found
 
     @property

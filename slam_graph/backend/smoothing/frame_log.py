@@ -57,6 +57,7 @@ class FrameLog:
 
     Attributes:
         rig: the calibration with which the frames were undistorted.
+        observations: number of all of them.
         georeferenced: whether the causal estimate is in the world of the position fixes.
     """
 
@@ -78,6 +79,7 @@ class FrameLog:
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
+        self.observations = 0
         self.georeferenced = False
 
     @classmethod
@@ -130,6 +132,7 @@ class FrameLog:
         frame = FeatureFrame(frame.stamp_ns, cameras)
         self._recorder.write(ImuData.concatenate(self._imu), frame)
         self._imu = []
+        self.observations += sum(map(len, cameras))
         if self._is_keyframe(frame):
             self._keyframes.append(len(self._frames))
             self._last_ids = cameras[0].ids
