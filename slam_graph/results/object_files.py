@@ -4,19 +4,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam_graph.files import Files
+from slam_graph.geometry import Trajectory
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_input import RunInput
 
 if TYPE_CHECKING:
     from slam_graph.backend import MovingObjects
-    from slam_graph.backend.objects.object_history import ObjectHistory
+
+_Errors = Callable[[Mapping[int, Trajectory], Trajectory], Any]
+"""Errors of objects, given their true poses and those of the platform."""
 
 OBJECTS, SMOOTHED = "objects.csv", "objects_smoothed.csv"
 
@@ -37,13 +41,14 @@ def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
             files.text(f"objects/{number}_smoothed.tum", path.tum_lines())
 
 
-def _accuracy(objects: ObjectHistory, asked: RunInput) -> dict[str, float | int] | None:
+def _accuracy(errors: _Errors, asked: RunInput) -> dict[str, float | int] | None:
     """Errors of motions and poses; None without true poses."""
     if asked.truth is None or not asked.object_truth:
         return None
     offset_ns = round(asked.rig.pose_offset_s * 1e9)
     true_body = replace(asked.truth, stamps_ns=asked.truth.stamps_ns - offset_ns)
-    return objects.errors(asked.object_truth, true_body).table()
+    table: dict[str, float | int] = errors(asked.object_truth, true_body).table()
+    return table
 
 
 def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, Any] | None:
@@ -72,7 +77,7 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
         }
     return {
         "objects": table,
-        "accuracy": _accuracy(objects, asked),
-        "smoothed": None if smoothed is None else _accuracy(smoothed, asked),
+        "accuracy": _accuracy(objects.errors, asked),
+        "smoothed": None if smoothed is None else _accuracy(smoothed.errors, asked),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }

@@ -21,8 +21,6 @@ from slam_graph.backend.objects.track_labels import TrackLabels
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 
-__all__ = ["MARGIN", "TrackAssignment", "members_of"]
-
 MARGIN = 12.0
 """Twice the logarithm of the ratio of likelihoods from which a track is of one world and not of
 another: 1 in 400."""
