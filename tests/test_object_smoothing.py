@@ -107,3 +107,15 @@ def test_files_of_smoothed_objects(two: RunResult, tmp_path: Path) -> None:
     assert len(lines) == 1 + len(two.objects.smoothed.all_states())
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["moving_objects"]["smoothed"]["nees"] is None, "motions have no covariances"
+
+
+def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:
+    truth = two.input.truth
+    assert two.objects is not None
+    assert truth is not None
+    known = truth.stamps_ns - round(two.input.rig.pose_offset_s * 1e9)
+    whole, half = (
+        two.objects.errors(two.input.object_truth, replace(part, stamps_ns=known[: len(part)]))
+        for part in (truth, truth[: len(truth) // 2])
+    )
+    assert 0 < len(half.truth) < 0.7 * len(whole.truth)
