@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from slam_graph.backend.objects.ego_motion import motion_samples
-from slam_graph.backend.objects.object_log import ObjectLog
 from slam_graph.backend.smoothing.keyframe_states import with_angular_rates
+from slam_graph.backend.smoothing.object_log import ObjectLog
 from slam_graph.geometry import NavState
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult

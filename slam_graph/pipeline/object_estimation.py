@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import Estimator, MovingObjects, ObjectFrame
+from slam_graph.backend import Estimator, MovingObjects, ObjectFrame, ObjectSmoother
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
@@ -55,6 +55,7 @@ class Objects(NoObjects):
             config.objects,
             {} if masks is None else masks.mask_classes,
         )
+        self._smoother = ObjectSmoother(config.backend, config.objects)
         self._recording = ExitStack()
         self.found = ObjectFrame()
 
@@ -66,7 +67,7 @@ class Objects(NoObjects):
             folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
             resources.enter_context(self._recording)  # released before the folder is removed
             rig = self._result.input.rig
-            self._recording.enter_context(self._objects.recorded(rig, Path(folder)))
+            self._recording.enter_context(self._smoother.recorded(rig, Path(folder)))
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what moves and where objects want more features."""
@@ -96,6 +97,7 @@ class Objects(NoObjects):
                 self._diagnostics, "objects_failed", "a frame without moving objects"
             ):
                 self.found = self._objects.take(features, frame.state, self._estimator)
+                self._smoother.add(features, self.found.members)
         self.moved = np.union1d(self.moved, self.found.moving)
         return replace(frame, objects=self.found)
 
@@ -108,7 +110,8 @@ class Objects(NoObjects):
                 calibrated = result.logs.calibration.latest
                 rig = result.causal_rig if calibrated is None else calibrated.rig
                 platform = result.final_ba.history
-                for failure in self._objects.smooth(rig, platform, result.config.final_ba):
+                task = self._objects, rig, platform, result.config.final_ba
+                for failure in self._smoother.smooth(*task):
                     self._diagnostics.warn("object_not_smoothed", failure)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(

@@ -81,53 +81,53 @@ class FinalBa:
         """Poses of all frames, with velocities and biases."""
         return self.history.trajectory()
 
+    @staticmethod
+    def of_worlds(
+        log: FrameLog,
+        causal: Trajectory,
+        worlds: Sequence[tuple[int, int | None]],
+        rig: Rig,
+        backend: BackendConfig,
+        config: FinalBaConfig,
+        report: Report,
+    ) -> FinalBa | None:
+        """Solve each part of a recording as a whole whose poses are in one world.
 
-def adjust_worlds(
-    log: FrameLog,
-    causal: Trajectory,
-    worlds: Sequence[tuple[int, int | None]],
-    rig: Rig,
-    backend: BackendConfig,
-    config: FinalBaConfig,
-    report: Report,
-) -> FinalBa | None:
-    """Solve each part of a recording as a whole whose poses are in one world.
-
-    Args:
-        log: all frames.
-        causal: as for `adjust_recording`.
-        worlds: times of the first and the last state of each part, in the order of time; None for
-            the end of the recording. Frames before the first part belong to it.
-        rig: as for `adjust_recording`.
-        backend: noise and triangulation.
-        config: settings.
-        report: is given the progress after each step.
-    """
-    parts: list[FinalBa] = []
-    for number, (begin_ns, end_ns) in enumerate(worlds):
-        inside = causal.stamps_ns >= begin_ns
-        if end_ns is not None:
-            inside &= causal.stamps_ns <= end_ns
-        offset_ns = round(rig.pose_offset_s * 1e9)
-        part = log.part(
-            None if number == 0 else begin_ns - offset_ns,
-            None if end_ns is None else end_ns - offset_ns,
-        )
-        try:
-            found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
-        except EstimationError as error:
-            if len(worlds) == 1:
-                raise
-            logger.warning("part %d of the recording is not smoothed: %s", number, error)
-            continue
-        if found is not None:
-            parts.append(found)
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    history = parts[0].history.like()
-    for found in parts:
-        history.extend(found.history)
-    return FinalBa(history, total_of([found.summary for found in parts]), None)
+        Args:
+            log: all frames.
+            causal: as for `adjust_recording`.
+            worlds: times of the first and the last state of each part, in the order of time; None
+                for the end of the recording. Frames before the first part belong to it.
+            rig: as for `adjust_recording`.
+            backend: noise and triangulation.
+            config: settings.
+            report: is given the progress after each step.
+        """
+        parts: list[FinalBa] = []
+        for number, (begin_ns, end_ns) in enumerate(worlds):
+            inside = causal.stamps_ns >= begin_ns
+            if end_ns is not None:
+                inside &= causal.stamps_ns <= end_ns
+            offset_ns = round(rig.pose_offset_s * 1e9)
+            part = log.part(
+                None if number == 0 else begin_ns - offset_ns,
+                None if end_ns is None else end_ns - offset_ns,
+            )
+            try:
+                found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+            except EstimationError as error:
+                if len(worlds) == 1:
+                    raise
+                logger.warning("part %d of the recording is not smoothed: %s", number, error)
+                continue
+            if found is not None:
+                parts.append(found)
+        if len(parts) < 2:
+            return parts[0] if parts else None
+        history = parts[0].history.like()
+        for found in parts:
+            history.extend(found.history)
+        return FinalBa(history, total_of([found.summary for found in parts]), None)
 
 
 def adjust_recording(

@@ -10,7 +10,8 @@ platform is given.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +22,14 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import motion_samples
+from slam_graph.backend.objects.moving_objects import MovingObjects
+from slam_graph.backend.objects.object_history import ObjectHistory
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import object_settings
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.object_log import ObjectLog
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
@@ -42,9 +46,66 @@ _LEAST_SHARE = 0.5
 _DENSITIES = ("accel_density", "angular_accel_density")
 
 
+class ObjectSmoother:
+    """Keeps the tracks of the objects of a run, and adjusts every object as a whole at its end.
+
+    Args:
+        backend: settings of the estimator of the platform.
+        objects: settings of objects.
+    """
+
+    def __init__(self, backend: BackendConfig, objects: ObjectsConfig) -> None:
+        self._settings = backend, objects
+        self._log: ObjectLog | None = None
+
+    @contextmanager
+    def recorded(self, rig: Rig, folder: Path) -> Iterator[None]:
+        """Keep what is added inside of the block, so that `smooth` can be called after it.
+
+        Args:
+            rig: the cameras.
+            folder: for files.
+        """
+        with ObjectLog.recording(rig, self._settings[1].window_s, folder) as log:
+            self._log = log
+            yield
+
+    def add(self, frame: FeatureFrame, members: Mapping[int, int]) -> None:
+        """Take a frame, as `ObjectLog.add` does."""
+        if self._log is not None:
+            self._log.add(frame, members)
+
+    def smooth(
+        self, objects: MovingObjects, rig: Rig, platform: StateHistory, config: FinalBaConfig
+    ) -> list[str]:
+        """Adjust every object as a whole.
+
+        Args:
+            objects: as they were estimated on the way; they are given the smoothed ones.
+            rig: the best calibration available.
+            platform: its smoothed states.
+            config: settings of the adjustment.
+
+        Returns:
+            What went wrong, for each object that is not smoothed for a reason.
+        """
+        if self._log is None:
+            return []
+        task = _ObjectAdjustment(rig, platform, *self._settings, config)
+        tracks, failures = self._log.tracks(), []
+        objects.smoothed = ObjectHistory(objects.classes)
+        for number in objects.numbers:
+            frames = self._log.frames(tracks.get(number, np.zeros(0, np.int64)))
+            try:
+                objects.smoothed.note(task.smoothed(objects.states(number), frames), ())
+            except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
+                failures.append(f"object {number} is not smoothed: {error}")
+        return failures
+
+
 @dataclass(frozen=True, eq=False)
-class ObjectSmoothing:
-    """Adjusts objects as wholes.
+class _ObjectAdjustment:
+    """Adjusts an object as a whole.
 
     Attributes:
         rig: the best calibration available.
