@@ -10,6 +10,7 @@ from __future__ import annotations
 from benchmarks import (
     bal,
     car,
+    composite,
     consistency_real,
     cost_over_time,
     elimination,
@@ -56,6 +57,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **moving_object.BENCHMARKS,
     **objects.BENCHMARKS,
     **moving_static.BENCHMARKS,
+    **composite.BENCHMARKS,
     **real_imu.BENCHMARKS,
     **mono_real_imu.BENCHMARKS,
     **consistency_real.BENCHMARKS,

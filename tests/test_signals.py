@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_graph.backend import adjust_worlds
+from slam_graph.backend import FinalBa
 from slam_graph.config import load_config
 from slam_graph.experiment.comparison_results import read_result
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
@@ -116,11 +116,13 @@ def test_snapshots_change_nothing(flight: Path, tmp_path: Path) -> None:
 def test_an_interrupt_in_the_final_adjustment_keeps_the_causal_result(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    adjusted = FinalBa.of_worlds
+
     def interrupted(*arguments: object) -> None:
-        adjust_worlds(*arguments)  # type: ignore[arg-type]
+        adjusted(*arguments)  # type: ignore[arg-type]
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("slam_graph.backend.adjust_worlds", interrupted)
+    monkeypatch.setattr(FinalBa, "of_worlds", interrupted)
     result = run(flight, duration_s=2.0)
     assert result.status == "interrupted"
     assert result.final_ba is None

@@ -21,13 +21,13 @@ __all__ = [
     "Innovations",
     "MovingObjects",
     "ObjectFrame",
+    "ObjectSmoother",
     "ObjectsConfig",
     "PoseSelection",
     "RigProjection",
     "RobustLoss",
     "TenfoldDamping",
     "WindowGraph",
-    "adjust_worlds",
     "levenberg_marquardt",
     "triangulate_frames",
     "visual_rotation",
@@ -48,11 +48,12 @@ if TYPE_CHECKING:
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.objects.moving_objects import MovingObjects
-    from slam_graph.backend.objects.object_tracker import ObjectFrame
+    from slam_graph.backend.objects.object_frame import ObjectFrame
     from slam_graph.backend.objects.objects_config import ObjectsConfig
     from slam_graph.backend.policies import AlgorithmConfig
-    from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_worlds
+    from slam_graph.backend.smoothing.final_adjustment import FinalBa
     from slam_graph.backend.smoothing.frame_log import FrameLog
+    from slam_graph.backend.smoothing.object_smoothing import ObjectSmoother
     from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
     from slam_graph.backend.solve.damped_steps import (
         Attempt,
@@ -79,14 +80,12 @@ else:
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),
             "objects.moving_objects": ("MovingObjects",),
-            "objects.object_tracker": ("ObjectFrame",),
+            "objects.object_frame": ("ObjectFrame",),
             "objects.objects_config": ("ObjectsConfig",),
             "policies": ("AlgorithmConfig",),
-            "smoothing.final_adjustment": (
-                "FinalBa",
-                "adjust_worlds",
-            ),
+            "smoothing.final_adjustment": ("FinalBa",),
             "smoothing.frame_log": ("FrameLog",),
+            "smoothing.object_smoothing": ("ObjectSmoother",),
             "smoothing.smoothing_config": ("FinalBaConfig",),
             "solve.damped_steps": (
                 "Attempt",

@@ -157,6 +157,13 @@ def _objects(table: _Table) -> Iterator[tuple[str, str]]:
             f"{errors['median_motion_translation_m']:.4f} m a frame, NEES {errors['nees']:.2f} "
             "where 1 is ideal",
         )
+    smoothed = table["smoothed"]
+    if smoothed and smoothed["steps"]:
+        yield (
+            "smoothed",
+            f"median error of their motion {smoothed['median_motion_rotation_deg']:.2f}°, "
+            f"{smoothed['median_motion_translation_m']:.4f} m a frame",
+        )
 
 
 def _final_ba(table: _Table) -> str:

@@ -4,18 +4,23 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import Estimator, MovingObjects, ObjectFrame
+from slam_graph.backend import Estimator, MovingObjects, ObjectFrame, ObjectSmoother
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame
+
+_NOT_SMOOTHED = "no smoothed objects"
 
 
 class Objects(NoObjects):
@@ -50,7 +55,19 @@ class Objects(NoObjects):
             config.objects,
             {} if masks is None else masks.mask_classes,
         )
+        self._smoother = ObjectSmoother(config.backend, config.objects)
+        self._recording = ExitStack()
         self.found = ObjectFrame()
+
+    def begin(self, resources: ExitStack) -> None:
+        """Make a temporary folder for the tracks of objects, if they are to be smoothed."""
+        if not self._result.config.final_ba.enabled:
+            return
+        with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
+            folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
+            resources.enter_context(self._recording)  # released before the folder is removed
+            rig = self._result.input.rig
+            self._recording.enter_context(self._smoother.recorded(rig, Path(folder)))
 
     def feedback(self, feedback: Feedback) -> Feedback:
         """What the front end is told, with what moves and where objects want more features."""
@@ -80,11 +97,22 @@ class Objects(NoObjects):
                 self._diagnostics, "objects_failed", "a frame without moving objects"
             ):
                 self.found = self._objects.take(features, frame.state, self._estimator)
+                self._smoother.add(features, self.found.members)
         self.moved = np.union1d(self.moved, self.found.moving)
         return replace(frame, objects=self.found)
 
     def finish(self) -> None:
-        """Say so if no mask belongs to any frame."""
+        """Smooth the objects, and say so if no mask belongs to any frame."""
+        result = self._result
+        if result.final_ba is not None:
+            with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
+                self._recording.close()
+                calibrated = result.logs.calibration.latest
+                rig = result.causal_rig if calibrated is None else calibrated.rig
+                platform = result.final_ba.history
+                task = self._objects, rig, platform, result.config.final_ba
+                for failure in self._smoother.smooth(*task):
+                    self._diagnostics.warn("object_not_smoothed", failure)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(
                 "masks_unused",

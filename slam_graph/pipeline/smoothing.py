@@ -83,7 +83,7 @@ class Smoothing(Stage):
         ]
         if segments.goes_on:  # the last one has the rest of the recording
             parts[-1] = parts[-1][0], None
-        result.final_ba = backend.adjust_worlds(
+        result.final_ba = backend.FinalBa.of_worlds(
             log,
             result.trajectory,
             parts,

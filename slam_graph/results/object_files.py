@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam_graph.files import Files
+from slam_graph.geometry import Trajectory
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_input import RunInput
@@ -17,11 +19,14 @@ from slam_graph.results.run_input import RunInput
 if TYPE_CHECKING:
     from slam_graph.backend import MovingObjects
 
-OBJECTS = "objects.csv"
+_Errors = Callable[[Mapping[int, Trajectory], Trajectory], Any]
+"""Errors of objects, given their true poses and those of the platform."""
+
+OBJECTS, SMOOTHED = "objects.csv", "objects_smoothed.csv"
 
 
 def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
-    """Write `objects.csv`, and for each object its trajectory and its points."""
+    """Write `objects.csv`, each trajectory and points; the same smoothed, if objects were."""
     files.text(OBJECTS, objects.csv_lines())
     if len(objects):
         Files.make_folder(files.folder / "objects")
@@ -29,15 +34,21 @@ def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
         files.text(f"objects/{number}.tum", objects.trajectory(number).tum_lines())
         if len(objects.points.get(number, ())):
             write_ply(files.path(f"objects/{number}.ply"), objects.points[number])
+    if objects.smoothed is not None:
+        files.text(SMOOTHED, objects.smoothed.csv_lines())
+        for number in objects.smoothed.numbers:
+            path = objects.smoothed.trajectory(number)
+            files.text(f"objects/{number}_smoothed.tum", path.tum_lines())
 
 
-def _accuracy(objects: MovingObjects, asked: RunInput) -> dict[str, float | int] | None:
+def _accuracy(errors: _Errors, asked: RunInput) -> dict[str, float | int] | None:
     """Errors of motions and poses; None without true poses."""
     if asked.truth is None or not asked.object_truth:
         return None
     offset_ns = round(asked.rig.pose_offset_s * 1e9)
     true_body = replace(asked.truth, stamps_ns=asked.truth.stamps_ns - offset_ns)
-    return objects.errors(asked.object_truth, true_body).table()
+    table: dict[str, float | int] = errors(asked.object_truth, true_body).table()
+    return table
 
 
 def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, Any] | None:
@@ -50,6 +61,7 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
     if objects is None:
         return None
     table: dict[str, Any] = {}
+    smoothed = objects.smoothed
     for number in objects.numbers:
         states = objects.states(number)
         speeds = [float(np.linalg.norm(state.velocity)) for state in states if state.moving]
@@ -65,6 +77,7 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
         }
     return {
         "objects": table,
-        "accuracy": _accuracy(objects, asked),
+        "accuracy": _accuracy(objects.errors, asked),
+        "smoothed": None if smoothed is None else _accuracy(smoothed.errors, asked),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }

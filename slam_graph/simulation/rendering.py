@@ -104,11 +104,11 @@ class Renderer:
         since_ns = exposure_ns - motion.start_ns
         return self._depth.measure((exact * lens.rays[:, 2]).reshape(shape), since_ns)
 
-    def labels(self, motion: Motion, exposure_ns: int) -> NDArray[np.uint16]:
-        """The label image (height, width) of the first camera: numbers of objects, 0 elsewhere."""
-        lens, world = self._cameras[0], self._world_at(exposure_ns)
-        parts = self._rows(0, exposure_ns, motion)
-        panels = np.concatenate([self._hit(0, world, *part).panel for part in parts])
+    def labels(self, motion: Motion, exposure_ns: int, camera: int = 0) -> NDArray[np.uint16]:
+        """The label image (height, width) of a camera: numbers of objects, 0 elsewhere."""
+        lens, world = self._cameras[camera], self._world_at(exposure_ns)
+        parts = self._rows(camera, exposure_ns, motion)
+        panels = np.concatenate([self._hit(camera, world, *part).panel for part in parts])
         numbers = np.zeros(len(world.panels), np.uint16)
         first = len(self._world.panels)
         for body in self.bodies:

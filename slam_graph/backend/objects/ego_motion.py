@@ -68,20 +68,39 @@ class EgoMotion:
         row = self.stamps_ns.index(now_ns)
         if row == 0:
             return ImuData.empty()
-        before_ns, seconds = self.stamps_ns[row - 1], self.seconds[row] - self.seconds[row - 1]
-        turn = self.poses[row - 1].rotation().between(self.poses[row].rotation())
-        rate = gtsam.Rot3.Logmap(turn) / seconds
-        acceleration = (self.velocities[row] - self.velocities[row - 1]) / seconds
-        parts = np.linspace(0.0, 1.0, _SAMPLES)
-        stamps = before_ns + offset_ns + (parts * (now_ns - before_ns)).astype(np.int64)
-        stamps[0] += 1  # the last one of the motion before stays
-        turned = Rotation.from_rotvec(parts[:, None] * rate * seconds)
-        start = self.poses[row - 1].rotation().unrotate(acceleration)
-        return ImuData(stamps, np.tile(rate, (_SAMPLES, 1)), turned.inv().apply(start))
+        before, now = (
+            NavState(
+                self.stamps_ns[k] + offset_ns,
+                self.poses[k],
+                self.velocities[k],
+                accel_bias=np.zeros(3),
+                gyro_bias=np.zeros(3),
+            )
+            for k in (row - 1, row)
+        )
+        return motion_samples(before, now)
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body."""
         return pose_arrays(self.poses)
+
+
+def motion_samples(before: NavState, now: NavState) -> ImuData:
+    """What an ideal IMU without gravity would have measured between two states.
+
+    Rate and acceleration, the latter in the world, are constant.
+    """
+    period_ns = now.stamp_ns - before.stamp_ns
+    seconds = period_ns * 1e-9
+    R = before.world_T_body.rotation()
+    rate = gtsam.Rot3.Logmap(R.between(now.world_T_body.rotation())) / seconds
+    acceleration = (now.velocity - before.velocity) / seconds
+    parts = np.linspace(0.0, 1.0, _SAMPLES)
+    stamps = before.stamp_ns + (parts * period_ns).astype(np.int64)
+    stamps[0] += 1  # the last one of the motion before stays
+    turned = Rotation.from_rotvec(parts[:, None] * rate * seconds)
+    start = R.unrotate(acceleration)
+    return ImuData(stamps, np.tile(rate, (_SAMPLES, 1)), turned.inv().apply(start))
 
 
 def pose_arrays(poses: tuple[gtsam.Pose3, ...]) -> tuple[FloatArray, FloatArray]:

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoWindow
+from slam_graph.backend.objects.object_frame import ObjectFrame
 from slam_graph.backend.objects.object_history import ObjectHistory
-from slam_graph.backend.objects.object_tracker import ObjectFrame, ObjectTracker
+from slam_graph.backend.objects.object_tracker import ObjectTracker
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.geometry import NavState
@@ -27,6 +28,9 @@ class MovingObjects(ObjectHistory):
         backend: settings of the estimator of the platform.
         config: of objects.
         classes: name of the class by label, where masks have labels.
+
+    Attributes:
+        smoothed: the objects by all of their observations, where they were smoothed.
     """
 
     def __init__(
@@ -40,13 +44,14 @@ class MovingObjects(ObjectHistory):
         super().__init__(classes)
         self._settings = policies, backend, config
         self._sigma_px = backend.noise.pixel_sigma
+        self.smoothed: ObjectHistory | None = None
         self.begin(rig)
 
     def begin(self, rig: Rig) -> None:
         """Begin without objects: the world is another one from now on; states so far stay."""
         config = self._settings[2]
         self._window = EgoWindow(config.window_s)
-        self._tracker = ObjectTracker(rig, *self._settings)
+        self._tracker = ObjectTracker(rig, *self._settings, first=max([0, *self.numbers]) + 1)
 
     def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
         """Take a frame, and leave what moves out of the estimate of the platform.

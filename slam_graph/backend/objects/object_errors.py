@@ -20,7 +20,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
-from slam_graph.geometry import Trajectory
+from slam_graph.geometry import Trajectory, interpolate
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +84,20 @@ def object_errors(
     Args:
         states: of all objects, in the order of time.
         truth: poses of the true objects by their numbers, at the stamps of the frames.
-        true_body: true poses of the platform.
+        true_body: true poses of the platform; states beyond them do not count.
         max_distance_m: farthest middle of the true object that an estimated one belongs to.
     """
     rows: list[tuple[int, FloatArray, float]] = []
     poses: list[tuple[float, float]] = []
     seen: list[tuple[int, int, int]] = []
     offsets: dict[tuple[int, int], gtsam.Pose3] = {}
+    stamps = np.unique([state.stamp_ns for state in states])
+    known, valid = interpolate(true_body, stamps.astype(np.int64))
+    bodies = dict(zip(stamps[valid].tolist(), known, strict=True))
     placed = [
-        (state, true_body.at(state.stamp_ns).compose(state.world_T_body.inverse()))
+        (state, bodies[state.stamp_ns].compose(state.world_T_body.inverse()))
         for state in states
+        if state.stamp_ns in bodies
     ]
     belongs = _matched(placed, truth, max_distance_m)
     for state, aligned in placed:

@@ -9,21 +9,26 @@ together begin a new one (`motion_segmentation.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
+from slam_graph.backend.objects.object_frame import ObjectFrame
 from slam_graph.backend.objects.object_regions import region, regions_of_motion
+from slam_graph.backend.objects.object_review import ObjectReview
 from slam_graph.backend.objects.object_state import ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
+from slam_graph.backend.objects.track_assignment import (
+    MARGIN,
+    TrackAssignment,
+    members_of,
+)
 from slam_graph.backend.objects.track_labels import TrackLabels
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
@@ -33,56 +38,23 @@ from slam_graph.sensors import FeatureFrame, Rig
 
 _LEAST_FRAMES = 3
 """Frames of a track before it is tested."""
-_MARGIN = 12.0
-"""Twice the logarithm of the ratio of likelihoods from which a track is of one world and not of
-another: 1 in 400."""
-_FITS = 1e-4
-"""Probability of the errors of a track that fits."""
-_CLEARLY = 2.0
-"""Factor on that limit for tracks that are of an object already."""
 _ENOUGH, _NEWS, _LEAST_NOISE = 20, 0.1, 0.3
 """Tracks that tell the noise, weight of one frame of them, and its least ratio to the setting."""
 _MOVING_SHARE = 0.3
 """Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
-_BEST = 0.3
-"""Share of the tracks of an object that is of it beyond doubt."""
+_REVIEWS = (3, 6, 10)
+"""Frames of an object after which it is reviewed; later each time as many as the last one."""
+_MIRRORED = 2
+"""Frames between two comparisons with the mirror image, once it was ruled out."""
+_PAUSE = 5
+"""Least frames between two reviews of an object."""
+_BADLY = 3.0
+"""Squared errors of an object that is reviewed at once, in standard deviations."""
 _SAME_PLACE_M = 0.5
 """An object that appears again is no farther than this from where it is expected, or its own
 size."""
-
-
-def _no_ids() -> IntArray:
-    return np.zeros(0, np.int64)
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectFrame:
-    """What became of the tracks of one frame.
-
-    Attributes:
-        states: of the objects that are seen.
-        moving: ids (N,) of the features that must not count as static, ascending.
-        static: ids (N,) of the features that are known to be static, ascending.
-        wrong: ids (N,) of features that are neither.
-        probabilities: ids (J,) and the probability (J,) that each moves by itself.
-        members: number of the object by feature.
-        clouds: (K, 3) points of each object in the world, by its number.
-        hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
-            camera; with the number 0 around tracks that move and are of no object yet.
-    """
-
-    states: list[ObjectState] = field(default_factory=list)
-    moving: IntArray = field(default_factory=_no_ids)
-    static: IntArray = field(default_factory=_no_ids)
-    wrong: IntArray = field(default_factory=_no_ids)
-    probabilities: tuple[IntArray, FloatArray] = field(
-        default_factory=lambda: (_no_ids(), np.zeros(0))
-    )
-    members: dict[int, int] = field(default_factory=dict)
-    clouds: dict[int, FloatArray] = field(default_factory=dict)
-    hulls: list[tuple[int, FloatArray]] = field(default_factory=list)
 
 
 class ObjectTracker:
@@ -93,19 +65,25 @@ class ObjectTracker:
         algorithm: the policies, the same for objects as for the platform.
         backend: settings of the estimator.
         config: of objects.
+        first: number of the first one.
 
     Attributes:
         objects: those that are seen, or were a short time ago.
     """
 
     def __init__(
-        self, rig: Rig, algorithm: AlgorithmConfig, backend: BackendConfig, config: ObjectsConfig
+        self,
+        rig: Rig,
+        algorithm: AlgorithmConfig,
+        backend: BackendConfig,
+        config: ObjectsConfig,
+        first: int = 1,
     ) -> None:
         self._policies = (algorithm, backend)
         self._config = config
         self._window = TrackWindow(rig, backend)
         self._rig = rig
-        self._next = 1
+        self._next = first
         self._noise = 1.0
         self.objects: list[TrackedObject] = []
         self._hidden: list[TrackedObject] = []
@@ -121,13 +99,16 @@ class ObjectTracker:
         self._window.add(frame, ego.stamps_ns[0])
         self._labels = TrackLabels(frame)
         states = self._follow(ego)
-        own = _members(self.objects)
+        own = members_of(self.objects)
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
         test = self._tested(others, ego, sigma_px)
         sigma_px *= self._noise_of(test)
-        self._join(test, ego, sigma_px)
-        self._leave(ego, sigma_px)
+        assignment = TrackAssignment(self._window, self._labels, ego, sigma_px)
+        assignment.join(self.objects, test)
+        self._leave(assignment, ego, sigma_px)
         self._begin(test, ego, sigma_px)
+        self._review(ego, sigma_px)
+        self._resolve(ego, sigma_px)
         self._merge(ego)
         return self._described(states, test)
 
@@ -142,66 +123,35 @@ class ObjectTracker:
             except EstimationError:
                 self.objects.remove(item)
                 continue
-            if state is not None and item.confirmed:
+            if state is not None and item.confirmed and state.points >= self._config.min_points:
                 states.append(state)
             if state is None:
                 self.objects.remove(item)
                 if item.confirmed:
                     self._hidden.append(item)
-            elif item.confirmed and not item.moving and item.frames == _LEAST_FRAMES:
+            elif item.confirmed and not item.moving and not item.reported:
                 self.objects.remove(item)  # it was found by errors of the platform's motion
-                states.remove(state)
+                states = [other for other in states if other is not state]
+            item.reported |= item.confirmed
         oldest = now - round(self._config.max_occlusion_s * 1e9)
         self._hidden = [item for item in self._hidden if item.seen_ns >= oldest]
         return states
 
-    def _join(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks that fit the motion of an object, and are not static, join it."""
-        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
-        candidates = test.ids[test.verdicts != Verdict.STATIC]
-        for item in self.objects:
-            allowed = self._labels.allowed(candidates, item.label)
-            fit, squares, dof = self._window.misfit(allowed, item.poses, sigma_px)
-            same, alone, _ = self._window.misfit(
-                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
-            )
-            alone = _for(fit, same, alone)
-            scale = self._scale(item, sigma_px)
-            joins = squares < scale * chdtri(dof, _FITS)
-            if not self._labels.given:  # masks tell what is of the object, and not static
-                joins &= alone - squares > scale * _MARGIN
-            item.members = np.union1d(item.members, fit[joins])
-            candidates = np.setdiff1d(candidates, fit[joins])
-
-    def _leave(self, ego: EgoMotion, sigma_px: float) -> None:
-        """Tracks that do not fit an object leave it, and static ones if the object moves."""
-        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+    def _leave(self, assignment: TrackAssignment, ego: EgoMotion, sigma_px: float) -> None:
+        """Tracks leave the objects that they do not fit; what moves within one is another."""
         for item in list(self.objects):
-            fit, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-            unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
+            leaving = assignment.leaving(item)
             apart = self._moving_within(item, ego, sigma_px)
-            item.members = np.setdiff1d(
-                item.members, self._labels.contradicted(item.members, item.label)
-            )
             if item.confirmed and len(apart) > _TWO_MOTIONS * len(item.members):
                 self._separate(item, ego, sigma_px)
-                continue
-            item.members = np.setdiff1d(item.members, np.union1d(fit[unfit], apart))
-            if not item.moving:
-                continue
-            fit, squares = fit[~unfit], squares[~unfit]
-            same, alone, dof = self._window.misfit(
-                fit, {s: p for s, p in static.items() if s in item.poses}, sigma_px
-            )
-            alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
-            leaves = fit[(squares - alone > _MARGIN) & (alone < chdtri(freedom, _FITS))]
-            item.members = np.setdiff1d(item.members, leaves)
+            else:
+                item.members = np.setdiff1d(item.members, np.union1d(leaving, apart))
 
     def _moving_within(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> IntArray:
         """Ids (N,) of the tracks of an object that move in its frame: an object is a world."""
         world = item.as_ego_motion(ego)
         if world is None:
-            return _no_ids()
+            return np.zeros(0, np.int64)
         stamps = list(world.stamps_ns)
         obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
         rig, backend = self._window.projection, self._policies[1]
@@ -211,18 +161,49 @@ class ObjectTracker:
     def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
         """Leave an object the largest part of its tracks that moves as one; none fits it."""
         groups = self._groups(item.members, sigma_px)
-        if groups:
-            item.begin_again(groups[0], self._window, ego)
-        if not groups or not item.begun:
+        motion = self._motion_of(groups[0], ego) if groups else None
+        if motion is None:
             self.objects.remove(item)
+        else:
+            item.begin_again(groups[0], motion, ego)
 
-    def _scale(self, item: TrackedObject, sigma_px: float) -> float:
-        """Squared errors of the tracks of an object over what is expected, by its poses as known.
+    def _review(self, ego: EgoMotion, sigma_px: float) -> None:
+        """Begin objects again, or make two of them, where that explains their tracks better."""
+        review = ObjectReview(self._window, ego, sigma_px, self._policies, self._config)
+        for item in list(self.objects):
+            if not self._due(item, sigma_px):
+                continue
+            item.reviewed = item.frames
+            parts = sorted(review.of(item), key=lambda part: -len(part.members))
+            if parts:
+                item.begin_again(parts[0].members, parts[0].motion, ego)
+            for part in parts[1:]:
+                self._add(item.label, part.members, part.motion, ego)
 
-        At first the poses are known badly, and no track fits them as well as it will.
-        """
+    def _resolve(self, ego: EgoMotion, sigma_px: float) -> None:
+        """See whether tracks tell the motion of their object from its mirror image."""
+        mirror = MirrorMotion(self._window, sigma_px)
+        for item in self.objects:
+            if item.unique and item.frames % _MIRRORED:
+                continue
+            worse = mirror.worse(item.members, item.poses)
+            if abs(worse) > MARGIN:
+                item.unique = worse > 0
+            if worse < -MARGIN:  # one that begins now finds either of the two
+                motion = self._motion_of(item.members, ego)
+                if motion is not None and mirror.worse(item.members, motion.poses) > MARGIN:
+                    item.begin_again(item.members, motion, ego)
+                    item.unique = True
+
+    def _due(self, item: TrackedObject, sigma_px: float) -> bool:
+        """Whether an object is to be reviewed: often at first, and where its tracks fit badly."""
+        if item.frames in _REVIEWS or item.frames % _REVIEWS[-1] == 0:
+            return item.frames > 0
+        if item.frames - item.reviewed < _PAUSE:
+            return False
         _, squares, dof = self._window.misfit(item.members, item.poses, sigma_px)
-        return _scale(squares, dof)
+        spread = float(np.sqrt(2.0 * max(dof.sum(), 1)))
+        return bool(squares.sum() - dof.sum() > _BADLY * spread)
 
     def _merge(self, ego: EgoMotion) -> None:
         """Objects that move as one rigid body become one: the older stays."""
@@ -254,21 +235,25 @@ class ObjectTracker:
 
     def _begin(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that move together begin an object."""
-        config = self._config
         for label, group in self._new_groups(test, sigma_px):
-            item = TrackedObject(
-                self._next, label, group, self._window, ego, self._policies, config
-            )
-            if not item.begun:
-                continue
-            self._recognise(item, ego)
-            if item.number == self._next:
-                self._next += 1
-            self.objects.append(item)
+            motion = self._motion_of(group, ego)
+            if motion is not None:
+                self._add(label, group, motion, ego)
+
+    def _motion_of(self, members: IntArray, ego: EgoMotion) -> RelativeMotion | None:
+        return motion_over(members, self._window, ego, self._policies, self._config)
+
+    def _add(self, label: int, members: IntArray, motion: RelativeMotion, ego: EgoMotion) -> None:
+        """Add an object, with its old number if it was seen before."""
+        item = TrackedObject(self._next, label, members, motion, ego, self._config)
+        self._recognise(item, ego)
+        if item.number == self._next:
+            self._next += 1
+        self.objects.append(item)
 
     def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
         """Labels and tracks of what begins to move; without masks labels are 0."""
-        free = ~np.isin(test.ids, _members(self.objects))
+        free = ~np.isin(test.ids, members_of(self.objects))
         moves = free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))
         if not self._labels.given:
             return [(0, group) for group in self._groups(test.ids[moves], sigma_px)]
@@ -314,13 +299,13 @@ class ObjectTracker:
     def _described(self, states: list[ObjectState], test: MotionTest) -> ObjectFrame:
         moving = [item for item in self.objects if item.moving or not item.confirmed]
         members = {int(i): item.number for item in self.objects for i in item.members}
-        own = _members(self.objects)
+        own = members_of(self.objects)
         free = ~np.isin(test.ids, own)
         ids = np.concatenate([test.ids[free], own])
         known = np.concatenate(
             [
                 test.probabilities[free],
-                np.isin(own, _members(moving)).astype(np.float64),
+                np.isin(own, members_of(moving)).astype(np.float64),
             ]
         )
         order = np.argsort(ids)
@@ -335,22 +320,3 @@ class ObjectTracker:
             {item.number: item.world_points() for item in self.objects if item.confirmed},
             self._hulls(by_itself),
         )
-
-
-def _scale(squares: FloatArray, dof: IntArray) -> float:
-    """Squared errors of the tracks that fit best, over what is expected; at least 1."""
-    if len(dof) == 0:
-        return 1.0
-    return max(1.0, float(np.quantile(squares / dof, _BEST)))
-
-
-def _members(objects: Sequence[TrackedObject]) -> IntArray:
-    """Ids (N,) of the tracks of objects, ascending."""
-    return np.unique(np.concatenate([_no_ids(), *(item.members for item in objects)]))
-
-
-def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> FloatArray:
-    """Values (N,) for ids (N,) where some were found (both ascending); infinite for the others."""
-    result = np.full(len(ids), np.inf)
-    result[np.isin(ids, found)] = values
-    return result

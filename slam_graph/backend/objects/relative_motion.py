@@ -26,6 +26,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -76,7 +77,7 @@ class RelativeMotion:
         length_s: float,
     ) -> None:
         self._estimator = Estimator(
-            rig.without_imu(), algorithm, _settings(backend, config), Diagnostics()
+            rig.without_imu(), algorithm, object_settings(backend, config), Diagnostics()
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
@@ -147,7 +148,35 @@ class RelativeMotion:
         return self._estimator.covariance_of([X(self._frames[now_ns])])
 
 
-def _settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
+def motion_over(
+    members: IntArray,
+    window: TrackWindow,
+    ego: EgoMotion,
+    policies: tuple[AlgorithmConfig, BackendConfig],
+    config: ObjectsConfig,
+) -> RelativeMotion | None:
+    """An estimator that has taken some tracks in the frames of a window.
+
+    Args:
+        members: (N,) ids of the tracks, ascending.
+        window: the frames.
+        ego: the motion of the platform over them.
+        policies: algorithm and settings.
+        config: of objects.
+
+    Returns:
+        None if the equations cannot be solved, or there is no pose in the last frame.
+    """
+    motion = RelativeMotion(window.rig, *policies, config, config.window_s)
+    try:
+        for frame in window.frames:
+            motion.add(frame.only(members), ego)
+    except EstimationError:
+        return None
+    return motion if ego.stamps_ns[-1] in motion.poses else None
+
+
+def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
     """Settings of the estimator of an object."""
     dynamics = {
         "model": "constant_velocity",

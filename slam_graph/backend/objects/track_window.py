@@ -13,7 +13,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.objects.ego_motion import pose_arrays
 from slam_graph.sensors import FeatureFrame, Rig
 
@@ -56,6 +56,12 @@ class TrackWindow:
             self._numbers.popleft()
         self._tracks.keep_frames(list(self._numbers))
 
+    def pixels(self, ids: IntArray) -> FloatArray:
+        """(N, 2) where the first camera sees features (ascending ids) of the last frame."""
+        seen = self.frames[-1].cameras[0]
+        order = np.argsort(seen.ids)
+        return np.asarray(seen.pixels[order][np.searchsorted(seen.ids[order], ids)])
+
     def observations(self, ids: IntArray, least: int, stamps_ns: list[int]) -> Observations:
         """Observations in some frames of the features (ascending ids) that enough of them saw.
 
@@ -92,12 +98,31 @@ class TrackWindow:
             Ids (J,) of those that were seen often enough, their squared errors (J,) over σ², and
             degrees of freedom (J,).
         """
-        stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
-        obs = self.observations(ids, least, stamps)
-        if len(obs) == 0:
-            return obs.ids, np.zeros(0), np.zeros(0, np.int64)
-        rotations, positions = pose_arrays(tuple(poses[stamps[row]] for row in obs.frames))
-        found = triangulate(obs, self.projection, rotations, positions, self._backend.triangulation)
+        obs, found = self._triangulated(ids, poses, least)
         squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
         squares = np.where(np.isfinite(squares), squares, np.inf)
         return obs.ids, squares, 2 * obs.counts - 3
+
+    def points(
+        self, ids: IntArray, poses: dict[int, gtsam.Pose3], least: int = 3
+    ) -> tuple[IntArray, FloatArray]:
+        """Where features are if they are static in that world; arguments as for `misfit`.
+
+        Returns:
+            Ids (J,) of those that were seen often enough, and positions (J, 3).
+        """
+        obs, found = self._triangulated(ids, poses, least)
+        finite = np.isfinite(found.points).all(axis=1)
+        return obs.ids[finite], found.points[finite]
+
+    def _triangulated(
+        self, ids: IntArray, poses: dict[int, gtsam.Pose3], least: int
+    ) -> tuple[Observations, Triangulation]:
+        stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
+        obs = self.observations(ids, least, stamps)
+        rotations, positions = pose_arrays(tuple(poses[stamps[row]] for row in obs.frames))
+        if len(obs) == 0:
+            none = np.zeros(0)
+            return obs, Triangulation(none.reshape(0, 3), none.astype(np.bool_), none, none)
+        config = self._backend.triangulation
+        return obs, triangulate(obs, self.projection, rotations, positions, config)

@@ -12,13 +12,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion
 from slam_graph.backend.objects.track_window import TrackWindow
-from slam_graph.backend.policies import AlgorithmConfig
 
 _MAX_REJECTIONS = 2
 """A track that the gate rejects so often within the frames of the window is not of the object."""
@@ -26,6 +24,9 @@ _CONFIRMED = 3
 """An object is reported when it has so many frames."""
 _SAME_MOTION = 0.01
 """Probability with which two parts of one object are taken for two in a frame."""
+_POWER = 0.5
+"""Two objects become one if a difference of the least speed would have been seen: it is two
+standard deviations."""
 _NEAR = 1.5
 """Parts of one object are no farther apart than the sum of their sizes times this."""
 _MOTION_S = 0.3
@@ -39,16 +40,18 @@ class TrackedObject:
         number: of the object.
         label: of its mask; 0 without one.
         members: (N,) ids of its tracks, ascending.
-        window: the last frames, from which it begins.
-        ego: the motion of the platform over them.
-        policies: algorithm and settings of the estimator.
+        motion: their estimator, with a pose in the last frame.
+        ego: the motion of the platform.
         config: of objects.
 
     Attributes:
         members: as above, now.
         frames: number of frames with a state.
+        reviewed: how many of them it had when it was reviewed last.
         seen_ns: time of the last frame with a state.
         moving: whether it is known to move.
+        reported: whether it has been reported.
+        unique: whether its motion is known from the mirror image of it; it is not reported before.
     """
 
     def __init__(
@@ -56,37 +59,33 @@ class TrackedObject:
         number: int,
         label: int,
         members: IntArray,
-        window: TrackWindow,
+        motion: RelativeMotion,
         ego: EgoMotion,
-        policies: tuple[AlgorithmConfig, BackendConfig],
         config: ObjectsConfig,
     ) -> None:
         self.number, self.label, self.members = number, label, members
-        self.frames, self.moving = 0, False
+        self.frames, self.reviewed, self.moving = 0, 0, False
+        self.reported, self.unique = False, False
         self.seen_ns = ego.stamps_ns[-1]
         self._config = config
-        self._policies = policies
         self._object_T_start = gtsam.Pose3()
         self.state: ObjectState | None = None
-        self._motion = self._begun(window, ego)
+        self._motion = motion
+        self._rejections: deque[IntArray] = deque()
         self._place(ego)
 
-    def _begun(self, window: TrackWindow, ego: EgoMotion) -> RelativeMotion:
-        """A new estimator, which has taken the frames of the window."""
-        self._rejections: deque[IntArray] = deque()
-        config = self._config
-        motion = RelativeMotion(window.rig, *self._policies, config, config.window_s)
-        for frame in window.frames:
-            motion.add(frame.only(self.members), ego)
-        return motion
+    def begin_again(self, members: IntArray, motion: RelativeMotion, ego: EgoMotion) -> None:
+        """Go on with some of the tracks only, or with another motion; the pose goes on, too.
 
-    def begin_again(self, members: IntArray, window: TrackWindow, ego: EgoMotion) -> None:
-        """Estimate the motion anew, with some of the tracks only: the others moved otherwise."""
+        Args:
+            members: (N,) ids of the tracks, ascending.
+            motion: their estimator, with a pose in the last frame.
+            ego: the motion of the platform.
+        """
         before = self.state
-        self.members = members
-        self._motion = self._begun(window, ego)
-        if not self.begun:
-            return
+        self.members, self._motion = members, motion
+        self._rejections = deque()
+        self.unique = False
         if before is not None and before.stamp_ns == ego.stamps_ns[-1]:
             self.continue_from(before.world_T_object, ego)
         else:
@@ -94,13 +93,8 @@ class TrackedObject:
 
     @property
     def confirmed(self) -> bool:
-        """Whether it has been seen often enough to be reported."""
-        return self.frames >= _CONFIRMED
-
-    @property
-    def begun(self) -> bool:
-        """Whether its estimator has a state."""
-        return bool(self._motion.poses)
+        """Whether it has been seen often enough to be reported, and has one motion."""
+        return self.unique and self.frames >= _CONFIRMED
 
     @property
     def poses(self) -> dict[int, gtsam.Pose3]:
@@ -122,8 +116,6 @@ class TrackedObject:
     def _place(self, ego: EgoMotion) -> None:
         """Choose the frame of the object: axes of the world, origin in the middle of its points."""
         now = ego.stamps_ns[-1]
-        if now not in self._motion.poses:
-            return
         world_T_start = ego.poses[-1].compose(self._motion.poses[now].inverse())
         _, points = self._motion.points()
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
@@ -251,11 +243,12 @@ class TrackedObject:
         )
 
     def moves_with(self, other: TrackedObject, ego: EgoMotion) -> bool:
-        """Whether another object is near and cannot be told from a part of this one.
+        """Whether another object is near and moves as a part of this one.
 
-        The platform has the same motion relative to all parts of a rigid body.
+        The platform has the same motion relative to all parts of a rigid body. As long as it is
+        known too badly to tell two bodies apart, they stay two.
         """
-        if min(self.frames, other.frames) < _CONFIRMED:
+        if not (self.confirmed and other.confirmed):
             return False
         apart = float(np.linalg.norm(self.middle(ego) - other.middle(ego)))
         if apart > _NEAR * (self.size() + other.size()):
@@ -269,7 +262,15 @@ class TrackedObject:
         (mine, P), (theirs, Q) = (step.body_motion() for step in steps if step is not None)
         difference = gtsam.Pose3.Logmap(mine.between(theirs))
         distance = float(difference @ np.linalg.solve(P + Q, difference))
-        return bool(distance < chdtri(6, _SAME_MOTION))
+        if distance > chdtri(6, _SAME_MOTION):
+            return False
+        seconds = -ego.seconds[-1 - back]
+        here = ego.poses[-1].inverse().transformFrom
+        return all(
+            _speed_sigma(P + Q, np.asarray(here(item.middle(ego))), seconds)
+            < _POWER * self._config.min_speed
+            for item in (self, other)
+        )
 
     def middle(self, ego: EgoMotion) -> FloatArray:
         """(3,) middle of its points now, in the world."""
@@ -297,3 +298,16 @@ class TrackedObject:
         seconds = (stamp_ns - state.stamp_ns) * 1e-9
         here = state.world_T_object
         return gtsam.Pose3(here.rotation(), here.translation() + state.velocity * seconds)
+
+
+def _speed_sigma(covariance: FloatArray, point: FloatArray, seconds: float) -> float:
+    """Largest standard deviation, m/s, of the velocity of a point of the body.
+
+    Args:
+        covariance: (6, 6) of a motion of the body, in its tangent.
+        point: (3,) in the body.
+        seconds: time of the motion.
+    """
+    x, y, z = point
+    J = np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
+    return float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1])) / seconds

@@ -13,7 +13,7 @@ import logging
 import time
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
 from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
 from slam_graph.backend.smoothing.recording_problem import (
@@ -66,64 +67,67 @@ class FinalBa:
         aligned: (N, 6, 6) pose covariances of what is left after an alignment in position and yaw
             over all frames, in the body frame, rotation before position; None where positions
             determine no yaw, and of a recording in several segments.
+        noise: factors on the noise of the IMU that the covariances were computed with; of the last
+            segment.
     """
 
     history: StateHistory
     summary: FinalBaSummary
     aligned: FloatArray | None
+    noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
 
     @property
     def trajectory(self) -> Trajectory:
         """Poses of all frames, with velocities and biases."""
         return self.history.trajectory()
 
+    @staticmethod
+    def of_worlds(
+        log: FrameLog,
+        causal: Trajectory,
+        worlds: Sequence[tuple[int, int | None]],
+        rig: Rig,
+        backend: BackendConfig,
+        config: FinalBaConfig,
+        report: Report,
+    ) -> FinalBa | None:
+        """Solve each part of a recording as a whole whose poses are in one world.
 
-def adjust_worlds(
-    log: FrameLog,
-    causal: Trajectory,
-    worlds: Sequence[tuple[int, int | None]],
-    rig: Rig,
-    backend: BackendConfig,
-    config: FinalBaConfig,
-    report: Report,
-) -> FinalBa | None:
-    """Solve each part of a recording as a whole whose poses are in one world.
-
-    Args:
-        log: all frames.
-        causal: as for `adjust_recording`.
-        worlds: times of the first and the last state of each part, in the order of time; None for
-            the end of the recording. Frames before the first part belong to it.
-        rig: as for `adjust_recording`.
-        backend: noise and triangulation.
-        config: settings.
-        report: is given the progress after each step.
-    """
-    parts: list[FinalBa] = []
-    for number, (begin_ns, end_ns) in enumerate(worlds):
-        inside = causal.stamps_ns >= begin_ns
-        if end_ns is not None:
-            inside &= causal.stamps_ns <= end_ns
-        offset_ns = round(rig.pose_offset_s * 1e9)
-        part = log.part(
-            None if number == 0 else begin_ns - offset_ns,
-            None if end_ns is None else end_ns - offset_ns,
-        )
-        try:
-            found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
-        except EstimationError as error:
-            if len(worlds) == 1:
-                raise
-            logger.warning("part %d of the recording is not smoothed: %s", number, error)
-            continue
-        if found is not None:
-            parts.append(found)
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    history = parts[0].history.like()
-    for found in parts:
-        history.extend(found.history)
-    return FinalBa(history, total_of([found.summary for found in parts]), None)
+        Args:
+            log: all frames.
+            causal: as for `adjust_recording`.
+            worlds: times of the first and the last state of each part, in the order of time; None
+                for the end of the recording. Frames before the first part belong to it.
+            rig: as for `adjust_recording`.
+            backend: noise and triangulation.
+            config: settings.
+            report: is given the progress after each step.
+        """
+        parts: list[FinalBa] = []
+        for number, (begin_ns, end_ns) in enumerate(worlds):
+            inside = causal.stamps_ns >= begin_ns
+            if end_ns is not None:
+                inside &= causal.stamps_ns <= end_ns
+            offset_ns = round(rig.pose_offset_s * 1e9)
+            part = log.part(
+                None if number == 0 else begin_ns - offset_ns,
+                None if end_ns is None else end_ns - offset_ns,
+            )
+            try:
+                found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+            except EstimationError as error:
+                if len(worlds) == 1:
+                    raise
+                logger.warning("part %d of the recording is not smoothed: %s", number, error)
+                continue
+            if found is not None:
+                parts.append(found)
+        if len(parts) < 2:
+            return parts[0] if parts else None
+        history = parts[0].history.like()
+        for found in parts:
+            history.extend(found.history)
+        return FinalBa(history, total_of([found.summary for found in parts]), None)
 
 
 def adjust_recording(
@@ -133,6 +137,7 @@ def adjust_recording(
     backend: BackendConfig,
     config: FinalBaConfig,
     report: Report,
+    least_noise: float = 1.0,
 ) -> FinalBa | None:
     """Solve a recording as a whole.
 
@@ -145,6 +150,8 @@ def adjust_recording(
         backend: noise and triangulation.
         config: settings.
         report: is given the progress after each step.
+        least_noise: smallest factor on the noise of the IMU that is learned for covariances; one if
+            the noise was calibrated.
 
     Returns:
         The smoothed trajectory; None if there are too few observations to improve on the causal
@@ -154,7 +161,8 @@ def adjust_recording(
         EstimationError: if the minimum does not fit the observations.
     """
     try:
-        return _smoothed(log, causal, SmoothingTask.of(rig, backend, config), report)
+        task = SmoothingTask.of(rig, backend, config, least_noise)
+        return _smoothed(log, causal, task, report)
     except _UndeterminedError as reason:
         logger.info("no final bundle adjustment: %s", reason)
         return None
@@ -187,7 +195,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         segment, absolute = replace(segment, aiding=aiding), len(aiding.fixes) > 0
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
-            task, start = replace(task, causal=causal), with_angular_rates(start)
+            task = replace(task, causal=causal)
+            start = with_angular_rates(start, segment.imu)
         # without an IMU errors are judged by the first pose, so that it defines the world
         anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
         begin, link = 0, None
@@ -218,7 +227,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         history.append(state)
     figures = [part.figures for part in solved]
     aligned = solved[0].aligned if len(solved) == 1 else None
-    return FinalBa(history, summary_of(figures, len(history), began), aligned)
+    summary = summary_of(figures, len(history), began)
+    return FinalBa(history, summary, aligned, solved[-1].noise)
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:

@@ -57,10 +57,14 @@ class FrameLog:
 
     Attributes:
         rig: the calibration with which the frames were undistorted.
+        observations: number of all of them.
         georeferenced: whether the causal estimate is in the world of the position fixes.
     """
 
-    def __init__(self, rig: Rig, config: FinalBaConfig, folder: Path) -> None:
+    def __init__(
+        self, rig: Rig, config: FinalBaConfig, folder: Path, motion_known: bool = False
+    ) -> None:
+        self._motion_known = rig.has_imu or motion_known
         self._real_rig, self.rig = rig, with_depth_camera(rig)
         # the depth sensor is a camera in it, and the samples of the dynamics are those of an IMU
         recorded = replace(self.rig, depth=None, has_imu=True)
@@ -75,19 +79,24 @@ class FrameLog:
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
+        self.observations = 0
         self.georeferenced = False
 
     @classmethod
     @contextmanager
-    def recording(cls, rig: Rig, config: FinalBaConfig, folder: Path) -> Iterator[FrameLog]:
+    def recording(
+        cls, rig: Rig, config: FinalBaConfig, folder: Path, motion_known: bool = False
+    ) -> Iterator[FrameLog]:
         """A log that takes frames inside of the block and can be read after it.
 
         Args:
             rig: the cameras that frames have observations of.
             config: which frames are keyframes.
             folder: for the files.
+            motion_known: whether samples are given although there is no IMU: of the known part of
+                the motion, as `Estimator.add_motion` takes them.
         """
-        log = cls(rig, config, folder)
+        log = cls(rig, config, folder, motion_known)
         with log._recorder:
             yield log
 
@@ -108,7 +117,7 @@ class FrameLog:
         """
         if aiding is not None:
             self._aiding.append(aiding)
-        if not self.rig.has_imu:
+        if not self._motion_known:
             newest_ns = None if self._imu_ns is None else self._imu_ns[1]
             imu = motionless_samples(newest_ns, frame.stamp_ns + self._lead_ns)
         if len(imu):
@@ -123,6 +132,7 @@ class FrameLog:
         frame = FeatureFrame(frame.stamp_ns, cameras)
         self._recorder.write(ImuData.concatenate(self._imu), frame)
         self._imu = []
+        self.observations += sum(map(len, cameras))
         if self._is_keyframe(frame):
             self._keyframes.append(len(self._frames))
             self._last_ids = cameras[0].ids

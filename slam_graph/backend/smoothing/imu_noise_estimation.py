@@ -51,26 +51,29 @@ class ImuNoiseFactors:
         accel: on that of the accelerometer.
         accel_walk: on the random walk of the accelerometer's bias.
         gyro_walk: on that of the gyroscope's.
+        least: the smallest factor: one where the noise was calibrated.
     """
 
     gyro: float = 1.0
     accel: float = 1.0
     accel_walk: float = 1.0
     gyro_walk: float = 1.0
+    least: float = 1.0
 
     def times(self, ratios: FloatArray) -> ImuNoiseFactors:
-        """The factors with variances multiplied by ratios (4,), walks no less than calibrated."""
+        """The factors with variances multiplied by ratios (4,), walks no less than the least."""
         gyro, accel, accel_walk, gyro_walk = np.sqrt(ratios).tolist()
         return ImuNoiseFactors(
             self.gyro * gyro,
             self.accel * accel,
-            float(np.clip(self.accel_walk * accel_walk, 1.0, MAX_FACTOR)),
-            float(np.clip(self.gyro_walk * gyro_walk, 1.0, MAX_FACTOR)),
+            float(np.clip(self.accel_walk * accel_walk, self.least, MAX_FACTOR)),
+            float(np.clip(self.gyro_walk * gyro_walk, self.least, MAX_FACTOR)),
+            self.least,
         )
 
     def white(self, gyro: float, accel: float) -> tuple[float, float]:
-        """Factors on white noise, given those that were learned on the way; at least one."""
-        found = np.clip([self.gyro * gyro, self.accel * accel], 1.0, MAX_FACTOR)
+        """Factors on white noise, given those that were learned on the way."""
+        found = np.clip([self.gyro * gyro, self.accel * accel], self.least, MAX_FACTOR)
         return float(found[0]), float(found[1])
 
     def near(self, other: ImuNoiseFactors, learned: list[float]) -> bool:

@@ -113,15 +113,21 @@ def _predict_backward(
     )
 
 
-def with_angular_rates(states: list[NavState]) -> list[NavState]:
-    """The states with the rates of the motion to the next one, as `constant_velocity` has them."""
-    rates = []
+def with_angular_rates(states: list[NavState], imu: ImuBuffer) -> list[NavState]:
+    """The states with the rates of the motion to the next one, as `constant_velocity` has them.
+
+    Args:
+        states: ascending in time.
+        imu: what is known of the motion; what differs from it stands in the place of the bias.
+    """
+    biases = []
     for state, later in pairwise(states):
         seconds = (later.stamp_ns - state.stamp_ns) * 1e-9
         turn = state.world_T_body.rotation().between(later.world_T_body.rotation())
-        rates.append(gtsam.Rot3.Logmap(turn) / seconds)
-    rates += rates[-1:] or [np.zeros(3)]
-    return [replace(s, gyro_bias=-rate) for s, rate in zip(states, rates, strict=True)]
+        known = imu.between(state.stamp_ns, later.stamp_ns).gyro.mean(axis=0)
+        biases.append(known - gtsam.Rot3.Logmap(turn) / seconds)
+    biases += biases[-1:] or [np.zeros(3)]
+    return [replace(s, gyro_bias=bias) for s, bias in zip(states, biases, strict=True)]
 
 
 def fill_in(

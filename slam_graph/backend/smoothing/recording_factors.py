@@ -140,6 +140,7 @@ class RecordingFactors:
         rig: calibrated sensors, with cameras that GTSAM has (`with_gtsam_cameras`).
         backend: noise.
         config: the robust loss.
+        least_noise: smallest factor on the noise of the IMU that is learned.
 
     Attributes:
         noise: factors on the noise of the IMU beyond those that the causal run learned.
@@ -152,10 +153,11 @@ class RecordingFactors:
         rig: Rig,
         backend: BackendConfig,
         config: FinalBaConfig,
+        least_noise: float = 1.0,
     ) -> None:
         self._segment, self._anchor, self._rig = segment, anchor, rig
         self._backend, self._config = backend, config
-        self.noise = ImuNoiseFactors()
+        self.noise = ImuNoiseFactors(least=least_noise)
         between = list(pairwise(segment.keyframe_stamps_ns.tolist()))
         self._samples = [segment.imu.between(*interval) for interval in between]
         longest_s = backend.noise.max_imu_gap_s

@@ -90,21 +90,26 @@ class SmoothingTask:
         backend: noise and triangulation.
         config: settings of the bundle adjustment.
         causal: motion between keyframes where there is no IMU to predict it.
+        least_noise: smallest factor on the noise of the IMU, or of the dynamics, that is learned.
     """
 
     rig: Rig
     backend: BackendConfig
     config: FinalBaConfig
     causal: Trajectory | None = None
+    least_noise: float = 1.0
 
     @classmethod
-    def of(cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig) -> SmoothingTask:
+    def of(
+        cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig, least_noise: float = 1.0
+    ) -> SmoothingTask:
         """The task under the dynamics that the settings choose."""
         rig = with_depth_camera(rig)
         if backend.dynamics.uses_imu(rig.has_imu):
-            return cls(rig, backend, config)
+            return cls(rig, backend, config, least_noise=least_noise)
         alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
-        return cls(model_rig(rig, backend.dynamics), without_imu(backend), alone)
+        rig = model_rig(rig, backend.dynamics)
+        return cls(rig, without_imu(backend), alone, least_noise=least_noise)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -138,11 +143,13 @@ class AdjustedSegment:
             could be computed.
         figures: of the minimum.
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
+        noise: factors on the noise of the IMU that the covariances were computed with.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
     aligned: FloatArray | None
+    noise: ImuNoiseFactors
 
 
 class BundleAdjustment:
@@ -163,7 +170,9 @@ class BundleAdjustment:
         self._backend, self._config = backend, config = task.backend, task.config
         self._projection = RigProjection(self._task.rig, taken_by=task.rig)
         self._report = report
-        self._factors = RecordingFactors(segment, start.anchor, self._task.rig, backend, config)
+        self._factors = RecordingFactors(
+            segment, start.anchor, self._task.rig, backend, config, task.least_noise
+        )
         seen = segment.seen_by_keyframes()
         chosen = longest_tracks(seen, config.features, _MIN_KEYFRAMES)
         self._candidates = seen.subset(chosen)
@@ -212,7 +221,7 @@ class BundleAdjustment:
             densities = self._factors.densities()
             frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
             states, aligned = with_covariances(states, known, frames)
-        return AdjustedSegment(states, figures, aligned)
+        return AdjustedSegment(states, figures, aligned, self.imu_noise)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.

@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Is an object one rigid body, and is its motion the one that explains its tracks best?
+
+Two things go wrong that the residuals of an estimator hardly show. Two bodies of which one comes
+nearer while the other goes away fit one body that turns. And a few points on a plane that faces the
+cameras fit two motions, mirror images of one another (Necker's cube), of which an estimator that
+began with the wrong one does not find the other. So from time to time the tracks of the last frames
+are estimated anew: all of them, and each half. Twice the logarithm of the likelihood ratio, the
+difference of the squared errors, has a χ² distribution of as many degrees of freedom as there are
+further unknowns, if nothing is wrong (Wilks 1938).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.special import chdtri
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
+from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.objects.tracked_object import TrackedObject
+from slam_graph.backend.policies import AlgorithmConfig
+
+_LEAST_FRAMES = 3
+"""Frames of a window that tell anything."""
+_AGAIN = 0.01
+"""Probability with which an object begins again without need; what it loses is its past."""
+_LABEL = 2.0 * float(np.log(2.0))
+"""What it costs that a track may be of either half: both are as likely."""
+_ROUNDS = 2
+"""Times that tracks go to the half that they fit better."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Tracks that move as one.
+
+    Attributes:
+        members: (N,) their ids, ascending.
+        motion: their estimator, which has taken the frames of the window.
+    """
+
+    members: IntArray
+    motion: RelativeMotion
+
+
+class ObjectReview:
+    """Compares the estimate of an object with those that begin now.
+
+    Args:
+        window: the last frames.
+        ego: the motion of the platform over them.
+        sigma_px: standard deviation of the observations.
+        policies: algorithm and settings of the estimators.
+        config: of objects.
+    """
+
+    def __init__(
+        self,
+        window: TrackWindow,
+        ego: EgoMotion,
+        sigma_px: float,
+        policies: tuple[AlgorithmConfig, BackendConfig],
+        config: ObjectsConfig,
+    ) -> None:
+        self._window, self._ego, self._sigma_px = window, ego, sigma_px
+        self._policies, self._config = policies, config
+
+    def of(self, item: TrackedObject) -> list[Part]:
+        """What an object is: nothing if it is as it is known, one part to begin again, or two."""
+        least = self._config.min_points
+        anew = self._begun(item.members)
+        if anew is None:
+            return []
+        stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
+        if not self._fill_the_window(stamps):
+            return []
+        current = self._total(item.members, item, stamps)
+        best, part = self._total(item.members, anew.motion, stamps), anew
+        limit = float(chdtri(6 * (len(stamps) - 1), self._config.false_alarm))
+        halves: list[Part] = []
+        if (
+            item.label == 0  # masks tell objects apart
+            and len(item.members) >= 2 * least
+            and min(current, best) > self._expected(item.members, stamps)
+        ):
+            halves = self._halves(item.members, least)
+        for half in halves:
+            squares = self._total(item.members, half.motion, stamps)
+            if squares < best:
+                best, part = squares, half
+        if halves:
+            apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
+            if min(current, best) - apart > limit + _LABEL * len(item.members):
+                return halves
+        again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
+        return [Part(item.members, part.motion)] if current - best > again else []
+
+    def _fill_the_window(self, stamps: list[int]) -> bool:
+        """Whether a motion is known over the whole window; earlier too many motions fit."""
+        if len(stamps) < _LEAST_FRAMES:
+            return False
+        period = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
+        return len(stamps) * period > self._config.window_s * 1e9
+
+    def _expected(self, members: IntArray, stamps: list[int]) -> float:
+        """Sum of the squared errors of one body; larger ones are found in one of six frames."""
+        length = np.isin(self._window.stamps_ns, stamps)
+        obs = self._window.observations(members, 3, stamps)
+        dof = float(np.sum(2 * obs.counts - 3)) - 6 * (np.count_nonzero(length) - 1)
+        return dof + float(np.sqrt(2.0 * max(dof, 1.0)))
+
+    def _halves(self, members: IntArray, least: int) -> list[Part]:
+        """Two parts of some tracks, each with a motion of its own; none if one is too small."""
+        first = _one_side(self._window.pixels(members))
+        halves: list[Part] = []
+        for _ in range(1 + _ROUNDS):
+            parts = [members[first], members[~first]]
+            if min(map(len, parts)) < least:
+                return []
+            found = [self._begun(part) for part in parts]
+            halves = [part for part in found if part is not None]
+            if len(halves) < 2:
+                return []
+            squares = [self._squares(members, half.motion.poses) for half in halves]
+            nearer = squares[0] <= squares[1]
+            if np.array_equal(nearer, first):
+                break
+            first = nearer
+        return halves
+
+    def _begun(self, members: IntArray) -> Part | None:
+        motion = motion_over(members, self._window, self._ego, self._policies, self._config)
+        return None if motion is None else Part(members, motion)
+
+    def _squares(self, members: IntArray, poses: dict[int, gtsam.Pose3]) -> FloatArray:
+        """(N,) squared errors of tracks over σ²; 0 for those that are too short."""
+        fit, squares, _ = self._window.misfit(members, poses, self._sigma_px)
+        result = np.zeros(len(members))
+        result[np.isin(members, fit)] = squares
+        return result
+
+    def _total(
+        self, members: IntArray, motion: RelativeMotion | TrackedObject, stamps: list[int]
+    ) -> float:
+        """Sum of the squared errors of tracks in some frames."""
+        poses = {stamp: motion.poses[stamp] for stamp in stamps if stamp in motion.poses}
+        if len(poses) < len(stamps):
+            return np.inf
+        return float(self._squares(members, poses).sum())
+
+
+def _one_side(pixels: FloatArray) -> BoolArray:
+    """Which points (N, 2) are on one side of their middle, along their longest axis."""
+    away = pixels - pixels.mean(axis=0)
+    axis = np.linalg.svd(away, full_matrices=False)[2][0]
+    return np.asarray(away @ axis > 0)

@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The whole way of an object as one bundle adjustment, after that of the platform.
+
+In the frame of an object the platform moves (`relative_motion.py`), so its recording is one of
+cameras without an IMU, and the adjustment is that of every recording: poses of all frames, all of
+its points, and constant velocity of the object for the dynamics. The smoothed motion of the
+platform is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.objects.ego_motion import motion_samples
+from slam_graph.backend.objects.moving_objects import MovingObjects
+from slam_graph.backend.objects.object_history import ObjectHistory
+from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.relative_motion import object_settings
+from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
+from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.object_log import ObjectLog
+from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
+from slam_graph.sensors import FeatureFrame, ImuData, Rig
+
+_ROUNDS = 4
+"""The noise of the dynamics is estimated this many times at most."""
+_SAME_FACTOR = 1.2
+"""Noise densities whose ratio is below this are the same."""
+_LEAST_NOISE = 0.01
+"""Smallest factor on the densities of the settings in one round."""
+_LEAST_SHARE = 0.5
+"""Share of the observations of an object that a minimum fits which is right."""
+_DENSITIES = ("accel_density", "angular_accel_density")
+
+
+class ObjectSmoother:
+    """Keeps the tracks of the objects of a run, and adjusts every object as a whole at its end.
+
+    Args:
+        backend: settings of the estimator of the platform.
+        objects: settings of objects.
+    """
+
+    def __init__(self, backend: BackendConfig, objects: ObjectsConfig) -> None:
+        self._settings = backend, objects
+        self._log: ObjectLog | None = None
+
+    @contextmanager
+    def recorded(self, rig: Rig, folder: Path) -> Iterator[None]:
+        """Keep what is added inside of the block, so that `smooth` can be called after it.
+
+        Args:
+            rig: the cameras.
+            folder: for files.
+        """
+        with ObjectLog.recording(rig, self._settings[1].window_s, folder) as log:
+            self._log = log
+            yield
+
+    def add(self, frame: FeatureFrame, members: Mapping[int, int]) -> None:
+        """Take a frame, as `ObjectLog.add` does."""
+        if self._log is not None:
+            self._log.add(frame, members)
+
+    def smooth(
+        self, objects: MovingObjects, rig: Rig, platform: StateHistory, config: FinalBaConfig
+    ) -> list[str]:
+        """Adjust every object as a whole.
+
+        Args:
+            objects: as they were estimated on the way; they are given the smoothed ones.
+            rig: the best calibration available.
+            platform: its smoothed states.
+            config: settings of the adjustment.
+
+        Returns:
+            What went wrong, for each object that is not smoothed for a reason.
+        """
+        if self._log is None:
+            return []
+        task = _ObjectAdjustment(rig, platform, *self._settings, config)
+        tracks, failures = self._log.tracks(), []
+        objects.smoothed = ObjectHistory(objects.classes)
+        for number in objects.numbers:
+            frames = self._log.frames(tracks.get(number, np.zeros(0, np.int64)))
+            try:
+                objects.smoothed.note(task.smoothed(objects.states(number), frames), ())
+            except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
+                failures.append(f"object {number} is not smoothed: {error}")
+        return failures
+
+
+@dataclass(frozen=True, eq=False)
+class _ObjectAdjustment:
+    """Adjusts an object as a whole.
+
+    Attributes:
+        rig: the best calibration available.
+        platform: its smoothed states, on the clock of the IMU.
+        backend: noise and triangulation.
+        objects: noise of the object's acceleration.
+        config: settings of the adjustment.
+    """
+
+    rig: Rig
+    platform: StateHistory
+    backend: BackendConfig
+    objects: ObjectsConfig
+    config: FinalBaConfig
+
+    def smoothed(
+        self, states: Sequence[ObjectState], frames: Iterable[FeatureFrame]
+    ) -> list[ObjectState]:
+        """States of an object from its first to its last one, by all of its observations.
+
+        Args:
+            states: as they were estimated on the way, in the order of time.
+            frames: all observations of its tracks.
+
+        Returns:
+            None of them if there are too few observations to improve on these. Covariances of poses
+            are relative to the first one, with that of the platform; motions have none.
+
+        Raises:
+            EstimationError: if no minimum fits the observations.
+        """
+        with TemporaryDirectory(prefix="slam_graph_") as folder:
+            rig = self.rig.without_imu()
+            with FrameLog.recording(rig, self.config, Path(folder), motion_known=True) as log:
+                self._record(log, (f for f in frames if f.stamp_ns >= states[0].stamp_ns))
+            found = self._adjusted(log, self._initial(states), rig)
+        return [] if found is None else self._states(found, states)
+
+    def _adjusted(self, log: FrameLog, initial: Trajectory, rig: Rig) -> FinalBa | None:
+        """The minimum under the noise of the object's acceleration that it shows itself.
+
+        Raises:
+            EstimationError: if the minimum fits less than half of the observations.
+        """
+        found, objects = None, self.objects
+        # tracks of points at another time of the way may be of the other side of the object
+        config = self.config.model_copy(update={"fuse_features": False})
+        for _ in range(_ROUNDS):
+            backend = object_settings(self.backend, objects)
+            found = adjust_recording(
+                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE
+            )
+            if found is None:
+                return None
+            if found.summary.observations < _LEAST_SHARE * log.observations:
+                raise EstimationError("it fits less than half of the observations")
+            factors = np.array([found.noise.accel, found.noise.gyro_walk])
+            if np.all(np.abs(np.log(factors)) < np.log(_SAME_FACTOR)):
+                break
+            densities = factors * [objects.accel_density, objects.angular_accel_density]
+            changed = dict(zip(_DENSITIES, densities.tolist(), strict=True))
+            objects, initial = objects.model_copy(update=changed), found.trajectory
+        return found
+
+    @property
+    def _offset_ns(self) -> int:
+        return round(self.rig.pose_offset_s * 1e9)
+
+    def _record(self, log: FrameLog, frames: Iterable[FeatureFrame]) -> None:
+        """Write the frames at whose time the platform is known, with its motion between them."""
+        path = self.platform.trajectory()
+        before: NavState | None = None
+        for frame in frames:
+            stamps_ns = np.array([frame.stamp_ns + self._offset_ns])
+            there, valid = interpolate(path, stamps_ns)
+            if not valid[0]:
+                continue
+            now = _state(int(stamps_ns[0]), there.pose(0), np.asarray(there.velocities)[0])
+            samples = ImuData(stamps_ns, np.zeros((1, 3)), np.zeros((1, 3)))
+            if before is not None:
+                samples = motion_samples(before, now)
+            log.add(samples, frame, (1.0, 1.0))
+            before = now
+
+    def _initial(self, states: Sequence[ObjectState]) -> Trajectory:
+        """Poses of the platform in the frame of the object as they were estimated."""
+        poses = [s.world_T_object.inverse().compose(s.world_T_body) for s in states]
+        stamps_ns = np.array([s.stamp_ns for s in states])
+        positions = np.array([pose.translation() for pose in poses])
+        velocities = np.zeros_like(positions)
+        if len(states) > 1:
+            velocities = np.gradient(positions, (stamps_ns - stamps_ns[0]) * 1e-9, axis=0)
+        history = StateHistory(level=False)
+        for stamp_ns, pose, velocity in zip(stamps_ns.tolist(), poses, velocities, strict=True):
+            history.append(_state(stamp_ns + self._offset_ns, pose, velocity))
+        return history.trajectory()
+
+    def _states(self, found: FinalBa, states: Sequence[ObjectState]) -> list[ObjectState]:
+        """Smoothed states at the times of those on the way."""
+        relative, platform = _Poses.of(found.history), _Poses.of(self.platform)
+        known = []
+        for state in states:
+            stamp_ns = state.stamp_ns + self._offset_ns
+            if stamp_ns in relative.rows and stamp_ns in platform.rows:
+                known.append(_placed(state, *platform.at(stamp_ns), *relative.at(stamp_ns)))
+        return _with_motions(known)
+
+
+@dataclass(frozen=True, eq=False)
+class _Poses:
+    """Poses with covariances by their times."""
+
+    rows: dict[int, int]
+    path: Trajectory
+    covariances: FloatArray
+
+    @staticmethod
+    def of(history: StateHistory) -> _Poses:
+        path = history.trajectory()
+        rows = {stamp_ns: row for row, stamp_ns in enumerate(path.stamps_ns.tolist())}
+        return _Poses(rows, path, history.pose_covariances())
+
+    def at(self, stamp_ns: int) -> tuple[gtsam.Pose3, FloatArray]:
+        row = self.rows[stamp_ns]
+        return self.path.pose(row), self.covariances[row]
+
+
+def _state(stamp_ns: int, pose: gtsam.Pose3, velocity: FloatArray) -> NavState:
+    return NavState(stamp_ns, pose, velocity, accel_bias=np.zeros(3), gyro_bias=np.zeros(3))
+
+
+def _placed(
+    state: ObjectState,
+    world_T_body: gtsam.Pose3,
+    world_covariance: FloatArray,
+    object_T_body: gtsam.Pose3,
+    object_covariance: FloatArray,
+) -> ObjectState:
+    """The state with the pose that two smoothed poses of the platform give."""
+    adjoint = object_T_body.AdjointMap()
+    return replace(
+        state,
+        world_T_object=world_T_body.compose(object_T_body.inverse()),
+        covariance=adjoint @ (world_covariance + object_covariance) @ adjoint.T,
+        world_T_body=world_T_body,
+    )
+
+
+def _with_motions(states: Sequence[ObjectState]) -> list[ObjectState]:
+    """States with the motions and velocities that their poses have."""
+    unknown6, unknown3 = np.full((6, 6), np.nan), np.full((3, 3), np.nan)
+    if len(states) < 2:
+        return list(states)
+    result = []
+    for k, state in enumerate(states):
+        step = None
+        if k and state.step is not None and states[k - 1].stamp_ns == state.step.before_ns:
+            motion = states[k - 1].world_T_object.between(state.world_T_object)
+            step = ObjectMotion(states[k - 1].stamp_ns, state.stamp_ns, motion, unknown6)
+        around = states[max(k - 1, 0)], states[min(k + 1, len(states) - 1)]
+        velocity = _velocity(*around)
+        result.append(replace(state, step=step, velocity=velocity, velocity_covariance=unknown3))
+    return result
+
+
+def _velocity(before: ObjectState, after: ObjectState) -> FloatArray:
+    """Mean velocity (3,) of the origin between two states, in the world."""
+    seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+    way = after.world_T_object.translation() - before.world_T_object.translation()
+    return np.asarray(way / seconds)

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Moving objects by all of their observations: the log of their tracks, the adjustment, files."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam_graph.backend.objects.ego_motion import motion_samples
+from slam_graph.backend.smoothing.keyframe_states import with_angular_rates
+from slam_graph.backend.smoothing.object_log import ObjectLog
+from slam_graph.geometry import NavState
+from slam_graph.pipeline import run
+from slam_graph.results import RunResult
+from slam_graph.results.result_files import read_tum
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer
+from slam_graph.simulation.simulator import euroc_rig, simulate
+
+PERIOD_NS = 100_000_000
+_ZERO = np.zeros(3)
+AT_REST = NavState(0, gtsam.Pose3(), _ZERO, accel_bias=_ZERO, gyro_bias=_ZERO)
+
+
+def seen(k: int, ids: list[int]) -> FeatureFrame:
+    """The frame k, in which both cameras see some features."""
+    pixels = np.full((len(ids), 2), 100.0)
+    observations = FeatureObservations(np.array(ids, np.int64), pixels, pixels / 400.0)
+    return FeatureFrame((k + 1) * PERIOD_NS, (observations, observations))
+
+
+def logged(folder: Path, frames: int, members: Mapping[int, Mapping[int, int]]) -> ObjectLog:
+    """A log of frames that see the features 1 to 4, of which some are members of objects."""
+    with ObjectLog.recording(euroc_rig(), 0.3, folder) as log:
+        for k in range(frames):
+            log.add(seen(k, [1, 2, 3, 4]), members.get(k, {}))
+    return log
+
+
+def test_a_track_is_of_the_object_that_it_was_of_in_most_frames(tmp_path: Path) -> None:
+    both, first = {1: 7, 2: 8}, {1: 7}
+    log = logged(tmp_path, 6, {1: both, 2: {1: 8, 2: 8}, 3: both, 4: first, 5: first})
+    assert {n: ids.tolist() for n, ids in log.tracks().items()} == {7: [1], 8: [2]}
+
+
+def test_a_track_that_left_its_object_early_is_of_none(tmp_path: Path) -> None:
+    log = logged(tmp_path, 8, {k: {1: 7, 3: 7} if k < 3 else {1: 7} for k in range(8)})
+    assert log.tracks()[7].tolist() == [1]
+
+
+def test_a_log_has_the_frames_from_before_a_track_was_known(tmp_path: Path) -> None:
+    """It waits for three periods, and is written when a later frame comes."""
+    log = logged(tmp_path, 10, {k: {2: 1} for k in range(6, 10)})
+    frames = list(log.frames(np.array([2])))
+    assert [frame.stamp_ns // PERIOD_NS for frame in frames] == list(range(3, 11))
+    assert all(frame.cameras[1].ids.tolist() == [2] for frame in frames)
+
+
+def test_motion_that_is_known_leaves_no_rate_to_estimate() -> None:
+    """What differs from it is the rate of the object, in the place of the gyroscope's bias."""
+    rate, other = np.array([0.3, -0.2, 0.5]), np.array([0.0, 0.4, 0.0])
+
+    def state(k: int, turn: np.ndarray) -> NavState:
+        pose = gtsam.Pose3(gtsam.Rot3.Expmap(turn * 0.1 * k), np.zeros(3))
+        return replace(AT_REST, stamp_ns=(k + 1) * PERIOD_NS, world_T_body=pose)
+
+    imu = ImuBuffer()
+    imu.add(motion_samples(state(0, rate), state(1, rate)))
+    (same, _), (different, _) = (
+        with_angular_rates([state(0, turn), state(1, turn)], imu) for turn in (rate, rate + other)
+    )
+    np.testing.assert_allclose(same.gyro_bias, 0.0, atol=1e-9)
+    np.testing.assert_allclose(different.gyro_bias, -other, atol=0.02)
+
+
+@pytest.fixture(scope="module")
+def two() -> RunResult:
+    sequence = simulate(
+        duration_s=6.0, rate_hz=10.0, seed=3, tracks={"pixel_sigma": 0.5}, objects={"count": 2}
+    )
+    changes = {"objects.enabled": True, "backend.noise.pixel_sigma": 0.5}
+    return run(sequence, overrides=changes)
+
+
+def test_smoothed_objects_are_better_than_those_on_the_way(two: RunResult) -> None:
+    table = two.metrics["moving_objects"]
+    smoothed, causal = table["smoothed"], table["accuracy"]
+    assert smoothed["steps"] > 0.9 * causal["steps"]
+    assert smoothed["motion_rotation_deg"] < 0.3 < causal["motion_rotation_deg"] * 1.5
+    assert smoothed["motion_translation_m"] < 0.0075
+    assert smoothed["pose_translation_m"] < 0.5 * causal["pose_translation_m"]
+
+
+def test_files_of_smoothed_objects(two: RunResult, tmp_path: Path) -> None:
+    two.save(tmp_path / "out")
+    assert two.objects is not None
+    assert two.objects.smoothed is not None
+    for number in two.objects.smoothed.numbers:
+        path = two.objects.smoothed.trajectory(number)
+        read = read_tum(tmp_path / "out" / "objects" / f"{number}_smoothed.tum")
+        np.testing.assert_allclose(read.positions, path.positions, atol=1e-6)
+    lines = (tmp_path / "out" / "objects_smoothed.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(two.objects.smoothed.all_states())
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["moving_objects"]["smoothed"]["nees"] is None, "motions have no covariances"
+
+
+def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:
+    truth = two.input.truth
+    assert two.objects is not None
+    assert truth is not None
+    known = truth.stamps_ns - round(two.input.rig.pose_offset_s * 1e9)
+    whole, half = (
+        two.objects.errors(two.input.object_truth, replace(part, stamps_ns=known[: len(part)]))
+        for part in (truth, truth[: len(truth) // 2])
+    )
+    assert 0 < len(half.truth) < 0.7 * len(whole.truth)
