@@ -36,22 +36,6 @@ def dense(*blocks: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("full", [0, 3, SIZE])
-def test_rows_that_begin_with_zeros_say_the_same_in_any_order(seed: int, full: int) -> None:
-    rng = np.random.default_rng(seed)
-    prior = gaussian(rng)
-    stairs = np.triu(random_rows(rng, SIZE))
-    stairs[7] = 0.0
-    rows = rng.permutation(np.concatenate([random_rows(rng, full), stairs]))
-    before = rows.copy()
-    posterior = prior.updated(rows)
-    information = prior.Rd.T @ prior.Rd + rows.T @ rows
-    np.testing.assert_allclose(posterior.Rd.T @ posterior.Rd, information, atol=1e-11)
-    np.testing.assert_array_equal(np.tril(posterior.Rd, -1), 0.0)
-    np.testing.assert_array_equal(rows, before)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("count", [0, 1, SIZE, 2 * SIZE, 2 * SIZE + 1, 20 * SIZE])
 def test_an_update_is_least_squares_of_all_rows(seed: int, count: int) -> None:
     """Also for more rows than twice the columns, which are compressed first."""

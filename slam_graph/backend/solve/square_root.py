@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray
 from slam_graph.kernels.elimination import eliminate_columns
 
 _BLOCK_SIZE = 16
@@ -34,18 +33,15 @@ class Layout:
 
     Attributes:
         dims: dimension of each key, in the order of the columns.
+        columns: the slice of each key.
         size: length of the stacked vector.
     """
 
     def __init__(self, dims: Mapping[int, int]) -> None:
         self.dims = dict(dims)
-        self.size = sum(self.dims.values())
-
-    @cached_property
-    def columns(self) -> dict[int, slice]:
-        """The slice of each key; made when somebody asks, as many layouts are never asked."""
         ends = list(accumulate(self.dims.values(), initial=0))
-        return dict(zip(self.dims, map(slice, ends, ends[1:]), strict=True))
+        self.columns = dict(zip(self.dims, map(slice, ends, ends[1:]), strict=True))
+        self.size = ends[-1]
 
     def __contains__(self, key: int) -> bool:
         return key in self.dims
@@ -169,20 +165,15 @@ class SquareRootInformation:
         """
         if len(Ab) == 0:
             return self
-        starts = (Ab != 0.0).argmax(axis=1)
-        first = int(starts.min())  # columns to the left are not touched
-        Ab, starts = Ab[:, first:], starts - first
+        first = int(np.argmax(Ab.any(axis=0)))  # columns to the left are not touched
+        Ab = Ab[:, first:]
         if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
-            starts = np.arange(len(Ab))
-        elif (starts[1:] < starts[:-1]).any():
-            order = np.argsort(starts, kind="stable")
-            Ab, starts = Ab[order], starts[order]
         triangle, rows = self.Rd[first:, first:].copy(order="F"), Ab.copy(order="F")
         block = min(_BLOCK_SIZE, len(triangle))
         # in the copies themselves: new memory costs as much as the arithmetic
         triangle, _, _, info = lapack.dtpqrt(
-            _stepped(starts), block, triangle, rows, overwrite_a=True, overwrite_b=True
+            0, block, triangle, rows, overwrite_a=True, overwrite_b=True
         )
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
@@ -266,18 +257,6 @@ class SquareRootInformation:
                 place += 1
             columns += dim
         return columns
-
-
-def _stepped(starts: IntArray) -> int:
-    """How many of the last rows are of an upper trapezoid, the i-th of them without its first i.
-
-    LAPACK leaves the zeros of these out, which halves the work where all are.
-
-    Args:
-        starts: (m,) ascending, the first column of each row that is not zero.
-    """
-    full = int((np.arange(len(starts)) - starts).max(initial=0))
-    return len(starts) - full
 
 
 def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
