@@ -54,12 +54,13 @@ class Scene:
 
     bodies: Sequence[Body]
     sigma_px: float = SIGMA_PX
+    rate_hz: float = RATE_HZ
 
     def __post_init__(self) -> None:
         rig, rng = euroc_rig(), np.random.default_rng(7)
         self.rig: Rig = rig
         self.window = TrackWindow(rig, BACKEND)
-        self.times = (np.arange(FRAMES) - FRAMES + 1) / RATE_HZ
+        self.times = (np.arange(FRAMES) - FRAMES + 1) / self.rate_hz
         self.stamps = [round(1e9 * (1.0 + t)) for t in self.times]
         first = rig.cameras[0].body_T_camera
         for stamp, t in zip(self.stamps, self.times, strict=True):
@@ -116,6 +117,15 @@ def cube(middle: tuple[float, float, float], count: int = 20, half_m: float = 0.
     """Points (N, 3) within a cube."""
     rng = np.random.default_rng(round(10 * sum(middle)))
     return np.array(middle) + rng.uniform(-half_m, half_m, (count, 3))
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 20.0, 40.0])
+def test_frames_of_a_window_have_a_spacing(rate_hz: float) -> None:
+    """So a faster camera makes no longer windows; the last frame is always there."""
+    scene = Scene([Body(cube((0.2, 0.1, 3.5)), (0.3, 0.0, 0.0))], rate_hz=rate_hz)
+    *past, last = scene.window.stamps_ns
+    assert (past[0], last) == (scene.stamps[0], scene.stamps[-1])
+    assert np.unique(np.diff(past)) == pytest.approx([100e6], abs=2)
 
 
 def test_a_motion_fits_better_than_its_mirror_image() -> None:

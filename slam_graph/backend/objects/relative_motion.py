@@ -81,6 +81,7 @@ class RelativeMotion:
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
+        self._taken_ns = 0  # motion of the platform after this has not been added
         self._frames: dict[int, int] = {}  # index in the estimator of the frame with a stamp
         self.poses: dict[int, gtsam.Pose3] = {}  # object_T_body by stamp, as known now
 
@@ -104,7 +105,7 @@ class RelativeMotion:
         Raises:
             EstimationError: if the equations cannot be solved: the object is lost.
         """
-        self._estimator.add_motion(ego.samples(frame.stamp_ns, self._offset_ns))
+        self._add_motion(frame.stamp_ns, ego)
         try:
             state = self._estimator.add_frame(frame)
         except (RuntimeError, np.linalg.LinAlgError) as error:
@@ -124,6 +125,14 @@ class RelativeMotion:
             if i in past:
                 self.poses[stamp] = values.atPose3(X(i))
         return True
+
+    def _add_motion(self, now_ns: int, ego: EgoMotion) -> None:
+        """Add the motion of the platform since the last frame that was taken."""
+        since = self._taken_ns or now_ns - 1
+        for stamp in ego.stamps_ns:
+            if since < stamp <= now_ns:
+                self._estimator.add_motion(ego.samples(stamp, self._offset_ns))
+        self._taken_ns = now_ns
 
     def points(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and positions (N, 3) of its points, in the frame of the object."""

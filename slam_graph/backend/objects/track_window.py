@@ -17,9 +17,13 @@ from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.objects.ego_motion import pose_arrays
 from slam_graph.sensors import FeatureFrame, Rig
 
+_SPACING_S = 0.08
+"""Past frames nearer to one another than this say the same: an object estimated anew over two
+seconds of 20 Hz costs twice what it does with every second frame, and is not more accurate."""
+
 
 class TrackWindow:
-    """Features of the last frames.
+    """Features of the last frame and of past ones at a least spacing.
 
     Args:
         rig: the cameras.
@@ -46,11 +50,16 @@ class TrackWindow:
         return self._tracks.seen
 
     def add(self, frame: FeatureFrame, since_ns: int) -> None:
-        """Add a frame, and forget those before a time."""
+        """Add a frame; forget those before a time, and the last one if it is near to the others."""
         self._tracks.add(self._count, frame)
         self.frames.append(frame)
         self._numbers.append(self._count)
         self._count += 1
+        if len(self.frames) > 2:
+            past, last = self.frames[-3].stamp_ns, self.frames[-2].stamp_ns
+            if last - past < _SPACING_S * 1e9:
+                del self.frames[-2]
+                del self._numbers[-2]
         while self.frames[0].stamp_ns < since_ns:
             self.frames.popleft()
             self._numbers.popleft()

@@ -196,9 +196,9 @@ class TrackedObject:
 
     def _frames_back(self, ego: EgoMotion) -> int:
         """How many frames back the motion is taken from, to judge it."""
-        back = int(np.count_nonzero(ego.seconds >= -_MOTION_S)) - 1
-        known = sum(stamp in self._motion.poses for stamp in ego.stamps_ns[-1 - back :]) - 1
-        return max(min(back, known), 1)
+        poses, stamps, seconds = self._motion.poses, ego.stamps_ns, ego.seconds
+        known = (n for n in range(1, len(stamps)) if stamps[-1 - n] in poses)
+        return max((n for n in known if seconds[-1 - n] >= -_MOTION_S), default=1)
 
     def _motion_since(self, frames: int, ego: EgoMotion) -> ObjectMotion | None:
         """The motion over the last frames; None where it is not known."""
