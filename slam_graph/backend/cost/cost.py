@@ -372,9 +372,8 @@ class Cost:
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
-        poses = np.array([layout.columns[X(i)].start for i in obs.frames])
-        keys = landmark_keys(obs.ids)
-        points = np.array([layout.columns[k].start if k in layout else 0 for k in keys])
+        poses = np.array([layout.starts[X(i)] for i in obs.frames])
+        points = np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)])
         calibration = layout.indices(self.rig.calibration_keys)
         return np.concatenate(
             [

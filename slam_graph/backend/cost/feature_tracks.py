@@ -132,11 +132,13 @@ class Removals:
 
     def add_features(self, outcome: Outcome, ids: IntArray) -> None:
         """All observations of some features (ascending ids)."""
-        self._features.append((outcome, ids))
+        if len(ids):
+            self._features.append((outcome, ids))
 
     def add_observations(self, outcome: Outcome, obs: Observations) -> None:
         """Single observations."""
-        self._observations.append((outcome, obs))
+        if len(obs):
+            self._observations.append((outcome, obs))
 
     def ids(self) -> IntArray:
         """The features of which no observation is left, ascending."""
@@ -149,7 +151,7 @@ class Removals:
             tracks: loses them.
             frames: those whose poses stay; what is left of all others goes too.
         """
-        single = [(outcome, tracks.rows_of(obs)) for outcome, obs in self._observations if len(obs)]
+        single = [(outcome, tracks.rows_of(obs)) for outcome, obs in self._observations]
         tracks.take_away(single, self._features, frames)
 
 

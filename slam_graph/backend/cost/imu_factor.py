@@ -32,6 +32,8 @@ IMU_GAP_SCALE = 1000.0
 """Factor on the noise densities between two frames where samples are missing: the IMU then hardly
 counts."""
 
+_UNIT = np.eye(15)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Transition:
@@ -52,8 +54,8 @@ class _Transition:
         """That of a factor at the values of its states."""
         A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
         # A_before e + A_after e' is white noise of 1
-        right = np.hstack([-A[:, :9], -A[:, 18:24], np.eye(15)])
-        solved = np.linalg.solve(np.hstack([A[:, 9:18], A[:, 24:]]), right)
+        right = np.concatenate([-A[:, :9], -A[:, 18:24], _UNIT], axis=1)
+        solved = np.linalg.solve(np.concatenate([A[:, 9:18], A[:, 24:]], axis=1), right)
         return _Transition(solved[:, :15], solved[:, 15:])
 
     def predicted(self, covariance: FloatArray) -> FloatArray:

@@ -351,7 +351,7 @@ def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInforma
     # δf = R_f⁻¹ (r₁ - T δx), and the body moves by R δp
     by_r_1 = np.linalg.solve(tracks.R_f.transpose(0, 2, 1), toward[:, :, None])[:, :, 0]
     by_state = -np.einsum("ji,jin->jn", by_r_1, tracks.T)
-    position = Layout(dims_of(keys)).columns[last].start + np.arange(3, 6)
+    position = Layout(dims_of(keys)).starts[last] + np.arange(3, 6)
     by_state[:, position] -= toward @ pose.rotation().matrix()
     variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)
     variances += np.sum(by_r_1**2, axis=1)

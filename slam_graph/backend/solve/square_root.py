@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -33,15 +34,22 @@ class Layout:
 
     Attributes:
         dims: dimension of each key, in the order of the columns.
-        columns: the slice of each key.
         size: length of the stacked vector.
     """
 
     def __init__(self, dims: Mapping[int, int]) -> None:
         self.dims = dict(dims)
-        ends = list(accumulate(self.dims.values(), initial=0))
-        self.columns = dict(zip(self.dims, map(slice, ends, ends[1:]), strict=True))
-        self.size = ends[-1]
+        self.size = sum(self.dims.values())
+
+    @cached_property
+    def starts(self) -> dict[int, int]:
+        """The first column of each key."""
+        return dict(zip(self.dims, accumulate(self.dims.values(), initial=0), strict=False))
+
+    @cached_property
+    def columns(self) -> dict[int, slice]:
+        """The slice of each key; most layouts are never asked for it."""
+        return {key: slice(start, start + self.dims[key]) for key, start in self.starts.items()}
 
     def __contains__(self, key: int) -> bool:
         return key in self.dims
@@ -52,10 +60,11 @@ class Layout:
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given."""
-        slices = [self.columns[k] for k in keys]
-        starts = np.array([columns.start for columns in slices], np.intp)
-        ends = np.array([columns.stop for columns in slices], np.intp)
-        dims = ends - starts
+        chosen = list(keys)
+        if not chosen:
+            return np.zeros(0, np.intp)
+        starts = np.array([self.starts[k] for k in chosen], np.intp)
+        dims = np.array([self.dims[k] for k in chosen], np.intp)
         # numbers that go on by one, but for a jump where a variable begins
         jumps = starts - np.cumsum(dims) + dims
         return np.asarray(np.arange(dims.sum()) + np.repeat(jumps, dims), np.intp)
@@ -239,7 +248,7 @@ class SquareRootInformation:
         lead, w = self._unmoved(keep), gone.size
         lead_gone = int(np.searchsorted(order[:w], lead))
         top = lead - lead_gone  # the rows of the marginal that come from the leading ones
-        tail = np.r_[lead_gone:w, w + top : len(order)]
+        tail = np.append(np.arange(lead_gone, w), np.arange(w + top, len(order)))
         triangle = triangularize(self.Rd[lead:, order[tail]])
         Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
         carried = np.zeros((w, len(order)))
