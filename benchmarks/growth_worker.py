@@ -1,19 +1,24 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""One long simulated stereo flight in a process of its own; prints what its frames cost as JSON.
+"""One long simulated stereo flight in a process of its own; prints what it costs as JSON.
 
-python -m benchmarks.growth_worker ALGORITHM DURATION_S
+python -m benchmarks.growth_worker ALGORITHM DURATION_S [complete]
+
+A complete run has the final bundle adjustment at its end, and writes all its files.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import tempfile
+import time
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.clocks import Watch, hold_to_one_core, time_flow
+from benchmarks.speed_worker import memory_mb, peak_memory_mb
 from slam_graph.config import load_config
 from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
@@ -48,11 +53,15 @@ class Clock(NullViewer, NullProgress):
     Attributes:
         flows: time of the reference, for each `FLOW_EVERY` frames.
         frames: time of each frame: simulation, back end, and the notes that are kept of it.
+        memory: resident memory at the times of the reference, MB.
+        causal_s: CPU time of the process at the last frame.
     """
 
     def __init__(self) -> None:
         self.flows = Watch()
         self.frames = Watch()
+        self.memory: list[float] = []
+        self.causal_s = 0.0
         noise = np.random.default_rng(0).integers(0, 255, IMAGE_SIZE, np.uint8)
         self._before, self._after = noise, np.ascontiguousarray(np.roll(noise, 2, axis=1))
 
@@ -65,22 +74,36 @@ class Clock(NullViewer, NullProgress):
         self.frames.stop()
         if len(self.frames.cpu) % FLOW_EVERY == 0:
             time_flow(self._before, self._after, self.flows)
+            self.memory.append(memory_mb())
+        self.causal_s = time.process_time()
         self.frames.start()
 
 
-def main(algorithm: str, duration_s: str) -> None:
-    """Run, and print the CPU milliseconds of frames and of the reference."""
+def main(algorithm: str, duration_s: str, complete: str = "") -> None:
+    """Run, and print CPU milliseconds of frames and of the reference, and memory."""
     hold_to_one_core()
     config = load_config(
-        overrides=["final_ba.enabled=false", "overlap=false"],
+        overrides=[f"final_ba.enabled={str(bool(complete)).lower()}", "overlap=false"],
         algorithm=algorithm,
         cameras=SIMULATION.cameras,
     )
     sequence = simulate(SIMULATION.model_copy(update={"duration_s": float(duration_s)}))
     clock = Clock()
     with threadpool_limits(limits=1):
-        run(sequence, config, viewer=clock, progress=clock).check()
-    print(json.dumps({"frame": clock.frames.cpu, "reference": clock.flows.cpu}))
+        result = run(sequence, config, viewer=clock, progress=clock)
+        result.check()
+        after_s = time.process_time() - clock.causal_s
+        if complete:
+            with tempfile.TemporaryDirectory() as folder:
+                result.save(folder)
+    table = {
+        "frame": clock.frames.cpu,
+        "reference": clock.flows.cpu,
+        "memory": clock.memory,
+        "peak_mb": peak_memory_mb(),
+        "after_s": after_s,
+    }
+    print(json.dumps(table))
 
 
 if __name__ == "__main__":

@@ -124,8 +124,18 @@ class Reference(NullViewer, NullProgress):
         self.frames.start()
 
 
+def memory_mb() -> float:
+    """Resident memory of this program."""
+    return _status_mb("VmRSS:")
+
+
 def peak_memory_mb() -> float:
-    """High-water mark of resident memory of this program.
+    """High-water mark of resident memory of this program."""
+    return _status_mb("VmHWM:")
+
+
+def _status_mb(field: str) -> float:
+    """What the system says of the memory of this program.
 
     `getrusage` would also count what the parent process took before this program replaced its copy;
     it is what remains where there is no /proc.
@@ -133,7 +143,7 @@ def peak_memory_mb() -> float:
     status = Path("/proc/self/status")
     if status.is_file():
         for line in status.read_text(encoding="utf-8").splitlines():
-            if line.startswith("VmHWM:"):
+            if line.startswith(field):
                 return int(line.split()[1]) / 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
