@@ -44,8 +44,8 @@ _SIGMAS = 6.0
 """A difference is a finding from so many standard deviations on, and if it is larger than these,
 which grow with the square of the noise in pixels above 1 px, as the bias by the noise does:"""
 _OFFSET_S, _BAD_OFFSET_S = 5e-3, 1.5e-2
-_FOCAL, _BAD_FOCAL = 0.02, 0.07
-_TURN_RAD, _BAD_TURN_RAD = np.deg2rad(2.0), np.deg2rad(6.0)
+_FOCAL, _BAD_FOCAL = 0.02, 0.025
+_TURN_RAD, _BAD_TURN_RAD = np.deg2rad(1.2), np.deg2rad(1.5)
 _READOUT_S = 8e-3
 _NAMED_RAD = np.deg2rad(4.0)
 """So near a named explanation must come to a mounting that was found."""
@@ -234,7 +234,7 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Findings of a fit; what is wrong is corrected in the rig."""
     sigma = dict(zip(UNKNOWNS, fit.sigmas.tolist(), strict=True))
     before = len(now.findings)
-    _judge_mounting(now, fit, max(sigma["rx"], sigma["ry"], sigma["rz"]))
+    _judge_mounting(now, fit)
     _judge_readout(now, fit, sigma["readout"])
     camera = now.rig.cameras[0]
     change_s = fit.values.offset_s - camera.clock_offset_s
@@ -272,21 +272,24 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
         now.findings.append(Finding("camera_and_gyroscope", "info", text))
 
 
-def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> None:
+def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Whether the calibrated rotation is wrong; it is corrected then."""
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
-    away = float(Rotation.from_matrix(R.T @ fit.values.body_R_camera).magnitude())
-    if away < max(_TURN_RAD * _noisier(fit), _SIGMAS * sigma):
+    turn, covariance = fit.turn_from(R)
+    away = float(np.linalg.norm(turn))
+    sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
+    if away < _TURN_RAD * _noisier(fit) or sigmas < _SIGMAS:
         return
+    sigma = away / sigmas
     named = explained(fit.values.body_R_camera, R)
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < _TURNED_RAD:
         named = Explanation("other", "", 0.0, np.eye(3))
     now.findings.append(_mounting_finding(named, fit.values.body_R_camera, away, sigma))
-    turn = gtsam.Rot3(fit.values.body_R_camera @ R.T)
+    by = gtsam.Pose3(gtsam.Rot3(fit.values.body_R_camera @ R.T), np.zeros(3))
     cameras = []
     for mounted in now.rig.cameras:
         pose = mounted.body_T_camera
-        pose = pose.inverse() if named.kind == "inverse" else gtsam.Pose3(turn, np.zeros(3)) * pose
+        pose = pose.inverse() if named.kind == "inverse" else by * pose
         cameras.append(replace(mounted, body_T_camera=pose))
     now.rig = replace(now.rig, cameras=tuple(cameras))
 

@@ -6,8 +6,11 @@ The rotation between two frames follows from the gyroscope. Under it, bearings f
 rest and the direction of the translation t lie in one plane, t · (f₁ × R f₂) = 0. All pairs
 together give the time offset, the mounting, a factor on the focal lengths, the readout time and the
 gyroscope bias in one robust least-squares problem, the directions eliminated. So a fault in one of
-them is not taken for one in another. Standard deviations are those of a sandwich estimator over
-blocks of time (Huber 1967), because errors of tracks are alike in neighbouring pairs.
+them is not taken for one in another. Distances are in units of the deviation that the noise of the
+pixels gives them, and directions the eigenvectors that take that deviation into account (Chojnacki
+et al. 2000): by squares alone the noise of slow motion would look like a wrong focal length.
+Covariances are by the jackknife over blocks of time, because errors of tracks are alike in
+neighbouring pairs.
 """
 
 from __future__ import annotations
@@ -41,6 +44,10 @@ _BLOCK_S = 2.0
 """Errors within so long count as one."""
 _LEAST_PX = 0.05
 """No noise is smaller than this."""
+_PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+"""Pixels moved for the derivatives of bearings."""
+_LEAST_VARIANCE = 0.01
+"""Of t · n, as a part of the sum over all directions: towards an epipole distances tell nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +85,60 @@ class RotationFit:
 
     Attributes:
         values: of the unknowns.
-        sigmas: (9,) standard deviations in the order of `UNKNOWNS`.
+        covariance: (9, 9) in the order of `UNKNOWNS`; infinite variances where one is not free.
         noise_px: robust standard deviation of the epipolar distances.
         free: which unknowns were estimated.
     """
 
     values: Kinematics
-    sigmas: FloatArray
+    covariance: FloatArray
     noise_px: float
     free: tuple[str, ...]
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(9,) standard deviations in the order of `UNKNOWNS`."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)
+
+    def turn_from(self, body_R_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The turn (3,) of the camera from a mounting to the one that was found.
+
+        Returns:
+            A rotation vector in the frame of the camera, rad, and its covariance (3, 3).
+        """
+        turn = Rotation.from_matrix(body_R_camera.T @ self.values.body_R_camera).as_rotvec()
+        return np.asarray(turn, dtype=np.float64), self.covariance[3:6, 3:6]
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """Bearings of both frames of P pairs in the camera of the first one.
+
+    Attributes:
+        normals: (P, N, 3) f₁ × R f₂ of the features.
+        noise: (P, N, 3, 3) their covariances for pixels with unit noise.
+    """
+
+    normals: FloatArray
+    noise: FloatArray
+
+    @staticmethod
+    def of(
+        one: FloatArray, by_one: FloatArray, two: FloatArray, by_two: FloatArray, R: FloatArray
+    ) -> _Turned:
+        """From bearings (P, N, 3) with derivatives (P, N, 3, 2), and first_R_second (P, 3, 3)."""
+        two = two @ R.transpose(0, 2, 1)
+        by_two = R[:, None] @ by_two
+        spread = _cross_matrix(-two) @ by_one, _cross_matrix(one) @ by_two
+        noise = sum(part @ part.swapaxes(-1, -2) for part in spread)
+        return _Turned(np.cross(one, two), np.asarray(noise))
+
+    def residuals(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of."""
+        e = np.einsum("pni,pi->pn", self.normals, t)
+        variance = np.einsum("pnij,pi,pj->pn", self.noise, t, t)
+        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self.noise.trace(0, 2, 3) + 1e-12))
+        return e / sigma, sigma
 
 
 class RotationProblem:
@@ -111,25 +163,31 @@ class RotationProblem:
         self._block = np.unique(blocks, axis=0, return_inverse=True)[1].ravel()
         rows = self._pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
-        self._normalized: dict[float, FloatArray] = {}
+        self._bearings: dict[float, tuple[FloatArray, FloatArray]] = {}
 
-    def bearings(self, focal: float) -> FloatArray:
-        """Unit bearings (2, P, N, 3) with a factor on the focal lengths."""
-        if focal not in self._normalized:
+    def bearings(self, focal: float) -> tuple[FloatArray, FloatArray]:
+        """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
+
+        The derivatives (2, P, N, 3, 2) are by the pixels.
+        """
+        if focal not in self._bearings:
             camera = self._mounted.camera
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
+            moved = self._pixels[None] + _PIXEL_STEPS[:, None, None, None]
             with np.errstate(all="ignore"):  # beyond the edge of a wide lens
-                m = scaled.undistort(self._pixels.reshape(-1, 2)).reshape(self._pixels.shape)
+                m = scaled.undistort(moved.reshape(-1, 2)).reshape(moved.shape)
                 rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
                 rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-            if len(self._normalized) > 4:
-                self._normalized.clear()
-            self._normalized[focal] = np.where(np.isfinite(rays), rays, 0.0)
-        return self._normalized[focal]
+            rays = np.where(np.isfinite(rays), rays, 0.0)
+            slopes = np.stack([rays[1] - rays[0], rays[2] - rays[0]], axis=-1)
+            if len(self._bearings) > 4:
+                self._bearings.clear()
+            self._bearings[focal] = rays[0], slopes
+        return self._bearings[focal]
 
-    def _turned(self, at: Kinematics) -> tuple[FloatArray, FloatArray]:
-        """Bearings (P, N, 3) of both frames, turned into the camera of the first one."""
-        f = self.bearings(at.focal)
+    def _turned(self, at: Kinematics) -> _Turned:
+        """Bearings of both frames, turned into the camera of the first one."""
+        f, slopes = self.bearings(at.focal)
         C, t = at.body_R_camera, self._t + at.offset_s
         R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))
         for number, gyroscope in enumerate(self._gyroscopes):
@@ -146,29 +204,28 @@ class RotationProblem:
         drift = Rotation.from_rotvec(-half).as_matrix() @ by_bias
         body = body @ Rotation.from_rotvec(-drift[..., 0]).as_matrix()
         camera = C.T @ body @ C
-        return f[0], f[1] @ camera.transpose(0, 2, 1)
+        return _Turned.of(f[0], slopes[0], f[1], slopes[1], camera)
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
-        one, two = self._turned(at)
-        normals = np.cross(one, two)
-        weights = self._there / np.maximum(np.sum(normals**2, axis=-1), 1e-6)
-        t = _least(normals, weights)
+        turned = self._turned(at)
+        weights = self._there / np.maximum(np.sum(turned.normals**2, axis=-1), 1e-6)
+        t = _least(_scatter(turned.normals, weights))
         for _ in range(_DIRECTIONS):
-            e, sigma = _residuals(one, two, normals, t)
-            e = e / sigma * self._mounted.camera.fx * at.focal
+            e, sigma = turned.residuals(t)
             scale = np.maximum(_scales(np.abs(e), self._there), noise)[:, None]
             weights = self._there / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
-            t = _least(normals, weights)
+            by_noise = np.einsum("pn,pnij->pij", weights * e**2, turned.noise)
+            t = _least(_scatter(turned.normals, weights) - by_noise)
         return t
 
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and their derivatives (P, N, 2) by the directions."""
-        one, two = self._turned(at)
-        normals = np.cross(one, two)
-        e, sigma = _residuals(one, two, normals, t)
-        factor = self._mounted.camera.fx * at.focal / sigma
-        return e * factor, (normals @ _tangents(t)) * factor[..., None]
+        turned, tangents = self._turned(at), _tangents(t)
+        e, sigma = turned.residuals(t)
+        by_sigma = np.einsum("pnij,pj->pni", turned.noise, t) @ tangents
+        by_t = (turned.normals @ tangents) / sigma[..., None]
+        return e, by_t - by_sigma * (e / sigma**2)[..., None]
 
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
@@ -179,17 +236,17 @@ class RotationProblem:
         """Gauss-Newton from a start; what is not free stays as it is."""
         columns = [k for k, name in enumerate(UNKNOWNS) if name in free]
         at, noise = start, self.noise_px(start)
-        H = np.eye(len(columns))
+        weight = 1.0 / _PRIOR[columns] ** 2
+        information = np.zeros((1, len(columns), len(columns)))
         scores = np.zeros((1, len(columns)))
         for _ in range(_MOST_STEPS):
-            H, scores = self._normal_equations(at, noise, columns)
+            information, scores = self._normal_equations(at, noise, columns)
             prior = np.zeros(9)
             prior[0], prior[6:] = at.offset_s - start.offset_s, at.bias
             prior[1] = np.log(at.focal / start.focal)
             prior[2] = at.readout_s - start.readout_s
-            weight = 1.0 / _PRIOR[columns] ** 2
             gradient = scores.sum(axis=0) + weight * prior[columns]
-            step = -np.linalg.solve(H + np.diag(weight), gradient)
+            step = -np.linalg.solve(information.sum(axis=0) + np.diag(weight), gradient)
             step *= min(1.0, float(np.min(_LARGEST[columns] / np.maximum(np.abs(step), 1e-12))))
             change = np.zeros(9)
             change[columns] = step
@@ -202,17 +259,14 @@ class RotationProblem:
             at, noise = tried, lower
             if np.all(np.abs(change) < 0.1 * _LARGEST * 1e-2):
                 break
-        inverse = np.linalg.inv(H + np.diag(1.0 / _PRIOR[columns] ** 2))
-        sandwich = inverse @ (scores.T @ scores) @ inverse
-        sigmas = np.full(9, np.inf)
-        diagonal = np.maximum(np.diag(sandwich), np.diag(inverse))
-        sigmas[columns] = np.sqrt(diagonal)
-        return RotationFit(at, sigmas, noise, free)
+        covariance = np.diag(np.full(9, np.inf))
+        covariance[np.ix_(columns, columns)] = _covariance(information, scores, np.diag(weight))
+        return RotationFit(at, covariance, noise, free)
 
     def _normal_equations(
         self, at: Kinematics, noise: float, columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Information (n, n) without the directions, and gradients (B, n) of the blocks of time."""
+        """Information (B, n, n) without the directions, and gradients (B, n), of blocks of time."""
         t = self.directions(at, noise)
         e, by_t = self.residuals(at, t)
         J = np.empty((*e.shape, len(columns)))
@@ -227,32 +281,63 @@ class RotationProblem:
         root = np.sqrt(self._there / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
         e, J, by_t = e * root, J * root[..., None], by_t * root[..., None]
         inner = by_t.transpose(0, 2, 1) @ by_t + 1e-9 * np.eye(2)
+        gradients = np.einsum("pni,pn->pi", J, e)  # the directions are at their best: none by them
         J = J - by_t @ np.linalg.solve(inner, by_t.transpose(0, 2, 1) @ J)
-        H = np.einsum("pni,pnj->ij", J, J)
-        gradients = np.einsum("pni,pn->pi", J, e)
-        scores = np.zeros((int(self._block.max()) + 1, len(columns)))
+        blocks, n = int(self._block.max()) + 1, len(columns)
+        information, scores = np.zeros((blocks, n, n)), np.zeros((blocks, n))
+        np.add.at(information, self._block, J.transpose(0, 2, 1) @ J)
         np.add.at(scores, self._block, gradients)
-        return H, scores
+        return information, scores
 
 
-def _least(normals: FloatArray, weights: FloatArray) -> FloatArray:
-    """Directions (P, 3) most orthogonal to normals (P, N, 3)."""
-    scatter = np.einsum("pni,pn,pnj->pij", normals, weights, normals)
-    return np.asarray(np.linalg.eigh(scatter)[1][:, :, 0])
+def _scatter(normals: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted second moments (P, 3, 3) of normals (P, N, 3)."""
+    return np.asarray((normals * weights[..., None]).transpose(0, 2, 1) @ normals)
 
 
-def _residuals(
-    one: FloatArray, two: FloatArray, normals: FloatArray, t: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The t · (f₁ × R f₂) (P, N), and its deviation for unit noise of both bearings."""
-    e = np.einsum("pni,pi->pn", normals, t)
-    along = np.einsum("pni,pi->pn", one, t) ** 2 + np.einsum("pni,pi->pn", two, t) ** 2
-    return e, np.sqrt(np.maximum(2.0 - along, 0.02))
+def _least(moments: FloatArray) -> FloatArray:
+    """Directions (P, 3) along which second moments (P, 3, 3) are least."""
+    return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
+
+
+def _cross_matrix(vectors: FloatArray) -> FloatArray:
+    """Matrices (..., 3, 3) of the products v × w with vectors (..., 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _scales(sizes: FloatArray, there: FloatArray) -> FloatArray:
     """Robust standard deviations (P,) of residuals (P, N)."""
     return _SIGMA_OF_MEDIAN * np.nanmedian(np.where(there, sizes, np.nan), axis=1)
+
+
+def _covariance(information: FloatArray, scores: FloatArray, prior: FloatArray) -> FloatArray:
+    """Covariance (n, n) of the solution by the jackknife: without one block of time after another.
+
+    A block that says most of what is known moves the solution much when it is left out, so that few
+    such blocks do not make it look certain. Not below that of independent errors.
+
+    Args:
+        information: (B, n, n) of the blocks.
+        scores: (B, n) gradients of the blocks at the solution.
+        prior: (n, n) information beside them.
+    """
+    total = information.sum(axis=0) + prior
+    moved = np.linalg.solve(total - information, scores[..., None])[..., 0]
+    count = len(scores)
+    jackknife = moved.T @ moved * (count - 1) / count
+    return _not_below(jackknife, np.asarray(np.linalg.inv(total)))
+
+
+def _not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """The covariance (n, n) enlarged where it is below another one."""
+    root = np.linalg.cholesky(least)
+    white = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    values, axes = np.linalg.eigh(0.5 * (white + white.T))
+    stretched = root @ axes * np.sqrt(np.maximum(values, 1.0))
+    return np.asarray(stretched @ stretched.T, dtype=np.float64)
 
 
 def _noise(e: FloatArray) -> float:
