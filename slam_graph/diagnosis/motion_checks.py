@@ -31,6 +31,8 @@ _COMPARED = 4
 """So many of the best axes are compared by a full solution."""
 _CLEARER = 1.12
 """Residuals with the axes as they are must be so many times those with others …"""
+_FITS_PX = 4.0
+"""… which must fit: where neither does, something else is wrong, such as features that move …"""
 _BEHIND = 0.2
 """… or at most such a share of the observations in front of the camera."""
 _BASELINE, _BAD_BASELINE = 0.12, 0.3
@@ -113,7 +115,8 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     P, score, usual = candidates[k], _score_of(solved[k]), _score_of(nominal)
     # wrong axes spoil every window; a single one may end in a wrong minimum under right ones
     better = np.median(_sizes_px(nominal) / _sizes_px(solved[k]))
-    if np.allclose(P, np.eye(3)) or min(better, usual / score) < _CLEARER:
+    unclear = min(better, usual / score) < _CLEARER or score > _FITS_PX
+    if np.allclose(P, np.eye(3)) or unclear:
         return np.eye(3), []
     values = {"axes": axes_text(P), "residual_px": score, "residual_as_it_is_px": usual}
     found = "accelerometer_axes"

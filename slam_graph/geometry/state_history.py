@@ -21,10 +21,11 @@ _STATE_WIDTH = 16
 
 _ERROR_WIDTH = len(NavState.COMPONENTS)
 _POSE_WIDTH = 6
+_UPPER = np.triu_indices(_POSE_WIDTH)
 
 
 class StateHistory:
-    """All states of a run, as compact rows: about 0.6 kB a state.
+    """All states of a run, as compact rows: about 0.4 kB a state.
 
     It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
     NaN.
@@ -39,8 +40,8 @@ class StateHistory:
         self.level, self.has_scale = level, has_scale
         self._stamps_ns = array("q")
         self._states = array("d")
-        self._sigmas = array("d")
-        self._pose_covariances = array("d")
+        self._pose_covariances = array("d")  # their upper triangles: runs may be of hours
+        self._other_variances = array("d")
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -75,26 +76,25 @@ class StateHistory:
         covariance = state.covariance
         if covariance is None:
             covariance = np.full((_ERROR_WIDTH, _ERROR_WIDTH), np.nan)
-        variances = np.maximum(np.diag(covariance), 0.0)
         self._stamps_ns.append(state.stamp_ns)
         self._states.extend(row.tolist())
-        self._sigmas.extend(np.sqrt(variances).tolist())
-        self._pose_covariances.extend(covariance[:_POSE_WIDTH, :_POSE_WIDTH].ravel().tolist())
+        self._pose_covariances.extend(covariance[_UPPER].tolist())
+        self._other_variances.extend(np.diag(covariance)[_POSE_WIDTH:].tolist())
 
     def extend(self, other: StateHistory) -> None:
         """Add all states of another history, which are later."""
         self._stamps_ns.extend(other._stamps_ns)
         self._states.extend(other._states)
-        self._sigmas.extend(other._sigmas)
         self._pose_covariances.extend(other._pose_covariances)
+        self._other_variances.extend(other._other_variances)
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the states at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
         del self._states[kept * _STATE_WIDTH :]
-        del self._sigmas[kept * _ERROR_WIDTH :]
-        del self._pose_covariances[kept * _POSE_WIDTH**2 :]
+        del self._pose_covariances[kept * len(_UPPER[0]) :]
+        del self._other_variances[kept * (_ERROR_WIDTH - _POSE_WIDTH) :]
 
     def trajectory(self) -> Trajectory:
         """The states as a trajectory with velocities and biases."""
@@ -110,13 +110,18 @@ class StateHistory:
 
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
-        return _table(self._sigmas, _ERROR_WIDTH)
+        poses = np.diagonal(self.pose_covariances(), axis1=1, axis2=2)
+        others = _table(self._other_variances, _ERROR_WIDTH - _POSE_WIDTH)
+        variances = np.concatenate([poses, others], axis=1)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
 
     def pose_covariances(self) -> FloatArray:
         """(N, 6, 6) covariances of rotation and position, in the body frame."""
-        return _table(self._pose_covariances, _POSE_WIDTH * _POSE_WIDTH).reshape(
-            -1, _POSE_WIDTH, _POSE_WIDTH
-        )
+        triangles = _table(self._pose_covariances, len(_UPPER[0]))
+        covariances = np.empty((len(triangles), _POSE_WIDTH, _POSE_WIDTH))
+        rows, columns = _UPPER
+        covariances[:, rows, columns] = covariances[:, columns, rows] = triangles
+        return covariances
 
 
 def _table(values: array[float], width: int) -> FloatArray:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors import FeatureFrame
@@ -37,7 +38,7 @@ class FrameTable:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._cells = array("d")
+        self._cells = array("f")  # as many digits as are written
         self._row_of: dict[int, int] = {}
         self._keyframe_rows: set[int] = set()
 
@@ -69,6 +70,7 @@ class FrameTable:
         row += [found.passed_distance, found.passed_dof, found.expected] if tested else 3 * [np.nan]
         self._cells.extend([*row, *costs, *(_MAX_COSTS - len(costs)) * [np.nan]])
         if window is not None:
+            self._row_of = {n: r for n, r in self._row_of.items() if n in window.past}
             self._row_of[window.frame] = len(self)
             self._keyframe_rows |= {self._row_of[n] for n in window.keyframes if n in self._row_of}
         self._stamps_ns.append(features.stamp_ns)
@@ -103,7 +105,7 @@ class FrameTable:
             keyframes_ns: (K,) times of keyframes.
             nees: times (N,) and NEES (N, 2) of position and orientation, if there is a truth.
         """
-        stamps_ns, table = self.stamps_ns, self._table()
+        stamps_ns, table = self.stamps_ns, self._table().astype(np.float64)
         errors = np.full((len(self), 2), np.nan)
         if nees is not None:
             _, rows, found = np.intersect1d(stamps_ns, nees[0], return_indices=True)
@@ -119,9 +121,9 @@ class FrameTable:
             cells += [_cell(value, False) for value in error.tolist()]
             yield ",".join([str(stamp_ns), str(int(mark)), *cells]) + "\n"
 
-    def _table(self) -> FloatArray:
+    def _table(self) -> NDArray[np.float32]:
         """(F, columns) a view of all cells."""
-        return np.frombuffer(self._cells, np.float64).reshape(-1, len(_COLUMNS))
+        return np.frombuffer(self._cells, np.float32).reshape(-1, len(_COLUMNS))
 
 
 def _cell(value: float, whole: bool) -> str:

@@ -195,7 +195,7 @@ class TimingLog:
     def append(self, stamp_ns: int, milliseconds: Mapping[str, float]) -> None:
         """Add the times of the next frame."""
         for stage in milliseconds.keys() - self._columns.keys():
-            self._columns[stage] = array("d", [np.nan] * len(self))
+            self._columns[stage] = array("f", [np.nan] * len(self))
         self._stamps_ns.append(stamp_ns)
         for stage, column in self._columns.items():
             column.append(milliseconds.get(stage, np.nan))
@@ -207,7 +207,7 @@ class TimingLog:
 
     def column(self, stage: str) -> FloatArray:
         """(N,) milliseconds of a stage."""
-        return np.array(self._columns[stage])
+        return np.array(self._columns[stage], dtype=np.float64)
 
     def stages(self) -> list[str]:
         """Names of all stages, sorted; `a.b` is a part of `a`."""
