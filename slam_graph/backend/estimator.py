@@ -173,6 +173,10 @@ class Estimator(EstimatorKnowledge):
         """Add what is known of the motion without an IMU: an ideal one's samples, no gravity."""
         self._context.imu.add(known)
 
+    def assume_pixel_noise(self, sigma_px: float) -> None:
+        """Take observations for so noisy from now on, unless their noise is estimated."""
+        self._context.pixels.assume(sigma_px)
+
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
         """Take the features of one time and estimate the state then.
 

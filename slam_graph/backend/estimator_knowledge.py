@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.engine_protocol import Engine
+from slam_graph.backend.engine_protocol import Engine, EngineContext
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
@@ -25,6 +25,7 @@ class EstimatorKnowledge:
 
     window: Window | None
     _engine: Engine
+    _context: EngineContext
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The joint covariance (n, n) of variables after the last step.
@@ -57,6 +58,13 @@ class EstimatorKnowledge:
         if self.window is None:
             raise EstimationError("there is no state yet, and so no factor graph")
         return self._engine.factor_graph(self.window)
+
+    def pixel_noise_px(self) -> float:
+        """Standard deviation of the observations as tracks show it; that of the settings at first.
+
+        A mean over the cameras.
+        """
+        return float(np.mean(self._context.pixels.estimate_px))
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

@@ -87,6 +87,10 @@ class PixelNoise:
         self._squares = self._dof * self.sigma_px**2
         self._stamp_ns: int | None = None
 
+    def assume(self, sigma_px: float) -> None:
+        """Take observations for so noisy from now on."""
+        self.sigma_px = self.estimate_px = np.full(len(self.sigma_px), sigma_px)
+
     def learn(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
         """Learn from the tracks of a step.
 

@@ -65,7 +65,7 @@ class MovingObjects(ObjectHistory):
         ego = self._window.add(frame.stamp_ns, state, estimator)
         if ego is None:
             return ObjectFrame()
-        found = self._tracker.add(frame, ego, self._sigma_px)
+        found = self._tracker.add(frame, ego, self._sigma_px, estimator.pixel_noise_px())
         estimator.exclude(found.moving)
         self.note(found.states, self._tracker.objects)
         self.milliseconds += 1e3 * (time.perf_counter() - began)

@@ -79,7 +79,8 @@ class ObjectTracker:
         config: ObjectsConfig,
         first: int = 1,
     ) -> None:
-        self._policies = (algorithm, backend)
+        self._backend = backend
+        self._policies = algorithm, backend
         self._config = config
         self._window = TrackWindow(rig, backend)
         self._rig = rig
@@ -88,17 +89,22 @@ class ObjectTracker:
         self.objects: list[TrackedObject] = []
         self._hidden: list[TrackedObject] = []
 
-    def add(self, frame: FeatureFrame, ego: EgoMotion, sigma_px: float) -> ObjectFrame:
+    def add(
+        self, frame: FeatureFrame, ego: EgoMotion, sigma_px: float, noise_px: float
+    ) -> ObjectFrame:
         """Take the features of one frame.
 
         Args:
             frame: all of them, with those that are known to move.
             ego: the motion of the platform up to it.
-            sigma_px: standard deviation of the observations.
+            sigma_px: standard deviation of the observations by the settings, for the tests.
+            noise_px: that which the platform's tracks show, for the estimates.
         """
+        noise = self._backend.noise.model_copy(update={"pixel_sigma": noise_px})
+        self._policies = self._policies[0], self._backend.model_copy(update={"noise": noise})
         self._window.add(frame, ego.stamps_ns[0])
         self._labels = TrackLabels(frame)
-        states = self._follow(ego)
+        states = self._follow(ego, noise_px)
         own = members_of(self.objects)
         others = np.setdiff1d(self._window.seen, own, assume_unique=True)
         test = self._tested(others, ego, sigma_px)
@@ -114,11 +120,12 @@ class ObjectTracker:
 
     # --- objects that are known ------------------------------------------------------------------
 
-    def _follow(self, ego: EgoMotion) -> list[ObjectState]:
+    def _follow(self, ego: EgoMotion, noise_px: float) -> list[ObjectState]:
         states: list[ObjectState] = []
         now = ego.stamps_ns[-1]
         for item in list(self.objects):
             try:
+                item.assume_pixel_noise(noise_px)
                 state = item.add(self._window, ego)
             except EstimationError:
                 self.objects.remove(item)

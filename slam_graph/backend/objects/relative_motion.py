@@ -134,6 +134,10 @@ class RelativeMotion:
                 self._estimator.add_motion(ego.samples(stamp, self._offset_ns))
         self._taken_ns = now_ns
 
+    def assume_pixel_noise(self, sigma_px: float) -> None:
+        """Take observations for so noisy from now on."""
+        self._estimator.assume_pixel_noise(sigma_px)
+
     def points(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and positions (N, 3) of its points, in the frame of the object."""
         return self._estimator.landmarks()
@@ -195,8 +199,11 @@ def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendCon
         "start_at_images": False,  # few points on a plane have two poses; prediction is good
     }
     default = BackendConfig()
+    # few features, close together, do not show their noise; that of the platform's is given
+    noise = {"adaptive_pixels": "never"}
     return backend.model_copy(
         update={
+            "noise": backend.noise.model_copy(update=noise),
             "dynamics": backend.dynamics.model_copy(update=dynamics),
             "calibration": default.calibration,
             "initialization": default.initialization,

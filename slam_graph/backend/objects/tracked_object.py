@@ -133,6 +133,10 @@ class TrackedObject:
         world_T_start = ego.poses[-1].compose(self._motion.poses[now].inverse())
         self._object_T_start = pose.inverse().compose(world_T_start)
 
+    def assume_pixel_noise(self, sigma_px: float) -> None:
+        """Take observations for so noisy from now on."""
+        self._motion.assume_pixel_noise(sigma_px)
+
     def add(self, window: TrackWindow, ego: EgoMotion) -> ObjectState | None:
         """Take the last frame of the window.
 
