@@ -17,7 +17,7 @@ from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_test import judge_tracks
 from slam_graph.backend.objects.object_review import ObjectReview
 from slam_graph.backend.objects.objects_config import ObjectsConfig
-from slam_graph.backend.objects.relative_motion import motion_over
+from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
 from slam_graph.backend.objects.track_assignment import TrackAssignment
 from slam_graph.backend.objects.track_labels import TrackLabels
 from slam_graph.backend.objects.track_window import TrackWindow
@@ -106,9 +106,9 @@ class Scene:
         return ObjectReview(self.window, self.ego, SIGMA_PX, policies(), CONFIG)
 
 
-def policies() -> tuple[AlgorithmConfig, BackendConfig]:
+def policies(sigma_px: float = SIGMA_PX) -> tuple[AlgorithmConfig, BackendConfig]:
     """Of objects, and settings with the noise of the tracks."""
-    noise = BACKEND.noise.model_copy(update={"pixel_sigma": SIGMA_PX})
+    noise = BACKEND.noise.model_copy(update={"pixel_sigma": sigma_px})
     algorithm = load_config(config_folder() / "objects.yaml").algorithm
     return algorithm, BACKEND.model_copy(update={"noise": noise})
 
@@ -126,6 +126,20 @@ def test_frames_of_a_window_have_a_spacing(rate_hz: float) -> None:
     *past, last = scene.window.stamps_ns
     assert (past[0], last) == (scene.stamps[0], scene.stamps[-1])
     assert np.unique(np.diff(past)) == pytest.approx([100e6], abs=2)
+
+
+def test_noise_that_is_assumed_on_the_way_is_that_of_the_settings() -> None:
+    """As long as nothing was estimated, it takes their place."""
+    scene = Scene([Body(cube((0.2, 0.1, 3.5)), (0.3, 0.0, 0.0))])
+    covariances = []
+    for setting in (SIGMA_PX, 4.0 * SIGMA_PX):
+        motion = RelativeMotion(scene.rig, *policies(setting), CONFIG, CONFIG.window_s)
+        motion.assume_pixel_noise(SIGMA_PX)
+        for frame in scene.window.frames:
+            motion.add(frame, scene.ego)
+        covariances.append(motion.covariance(scene.stamps[-1]))
+    assert covariances[0] == pytest.approx(covariances[1], rel=0.05)
+    assert 1e-5 < np.sqrt(covariances[0][3, 3]) < 0.1
 
 
 def test_a_motion_fits_better_than_its_mirror_image() -> None:
