@@ -16,6 +16,7 @@ neighbouring pairs.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,7 +48,7 @@ _LEAST_PX = 0.05
 _PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 """Pixels moved for the derivatives of bearings."""
 _LEAST_VARIANCE = 0.01
-"""Of t · n, as a part of the sum over all directions: towards an epipole distances tell nothing."""
+"""Of t · n, as a part of the largest one: towards an epipole distances tell nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,30 +116,37 @@ class _Turned:
     """Bearings of both frames of P pairs in the camera of the first one.
 
     Attributes:
-        normals: (P, N, 3) f₁ × R f₂ of the features.
-        noise: (P, N, 3, 3) their covariances for pixels with unit noise.
+        one, two: (P, N, 3) bearings f₁ and R f₂.
+        by_one, by_two: (P, N, 3, 2) their derivatives by the pixels.
     """
 
-    normals: FloatArray
-    noise: FloatArray
+    one: FloatArray
+    two: FloatArray
+    by_one: FloatArray
+    by_two: FloatArray
 
-    @staticmethod
-    def of(
-        one: FloatArray, by_one: FloatArray, two: FloatArray, by_two: FloatArray, R: FloatArray
-    ) -> _Turned:
-        """From bearings (P, N, 3) with derivatives (P, N, 3, 2), and first_R_second (P, 3, 3)."""
-        two = two @ R.transpose(0, 2, 1)
-        by_two = R[:, None] @ by_two
-        spread = _cross_matrix(-two) @ by_one, _cross_matrix(one) @ by_two
-        noise = sum(part @ part.swapaxes(-1, -2) for part in spread)
-        return _Turned(np.cross(one, two), np.asarray(noise))
+    @cached_property
+    def normals(self) -> FloatArray:
+        """(P, N, 3) f₁ × R f₂ of the features."""
+        return np.cross(self.one, self.two)
 
-    def residuals(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(P, N, 3, 3) covariances of the normals for pixels with unit noise."""
+        spread = _cross_matrix(-self.two) @ self.by_one, _cross_matrix(self.one) @ self.by_two
+        return np.asarray(sum(part @ part.swapaxes(-1, -2) for part in spread))
+
+    def distances(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of."""
-        e = np.einsum("pni,pi->pn", self.normals, t)
-        variance = np.einsum("pnij,pi,pj->pn", self.noise, t, t)
-        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self.noise.trace(0, 2, 3) + 1e-12))
-        return e / sigma, sigma
+        along = t[:, None]
+        by_pixels = (
+            np.cross(self.two, along)[..., None, :] @ self.by_one,
+            np.cross(along, self.one)[..., None, :] @ self.by_two,
+        )
+        variance = np.sum(by_pixels[0] ** 2 + by_pixels[1] ** 2, axis=(2, 3))
+        largest = np.sum(self.by_one**2 + self.by_two**2, axis=(2, 3))
+        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * largest + 1e-12))
+        return np.einsum("pni,pi->pn", self.normals, t) / sigma, sigma
 
 
 class RotationProblem:
@@ -204,7 +212,8 @@ class RotationProblem:
         drift = Rotation.from_rotvec(-half).as_matrix() @ by_bias
         body = body @ Rotation.from_rotvec(-drift[..., 0]).as_matrix()
         camera = C.T @ body @ C
-        return _Turned.of(f[0], slopes[0], f[1], slopes[1], camera)
+        two = f[1] @ camera.transpose(0, 2, 1)
+        return _Turned(f[0], two, slopes[0], camera[:, None] @ slopes[1])
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
@@ -212,24 +221,28 @@ class RotationProblem:
         weights = self._there / np.maximum(np.sum(turned.normals**2, axis=-1), 1e-6)
         t = _least(_scatter(turned.normals, weights))
         for _ in range(_DIRECTIONS):
-            e, sigma = turned.residuals(t)
+            e, sigma = turned.distances(t)
             scale = np.maximum(_scales(np.abs(e), self._there), noise)[:, None]
             weights = self._there / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
             by_noise = np.einsum("pn,pnij->pij", weights * e**2, turned.noise)
             t = _least(_scatter(turned.normals, weights) - by_noise)
         return t
 
+    def distances(self, at: Kinematics, t: FloatArray) -> FloatArray:
+        """Epipolar distances (P, N), pixels."""
+        return self._turned(at).distances(t)[0]
+
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and their derivatives (P, N, 2) by the directions."""
         turned, tangents = self._turned(at), _tangents(t)
-        e, sigma = turned.residuals(t)
+        e, sigma = turned.distances(t)
         by_sigma = np.einsum("pnij,pj->pni", turned.noise, t) @ tangents
         by_t = (turned.normals @ tangents) / sigma[..., None]
         return e, by_t - by_sigma * (e / sigma**2)[..., None]
 
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
-        e, _ = self.residuals(at, self.directions(at, _LEAST_PX))
+        e = self.distances(at, self.directions(at, _LEAST_PX))
         return _noise(e[self._there])
 
     def solve(self, start: Kinematics, free: tuple[str, ...] = UNKNOWNS) -> RotationFit:
@@ -273,7 +286,7 @@ class RotationProblem:
         for c, k in enumerate(columns):
             change = np.zeros(9)
             change[k] = _STEP[k]
-            J[..., c] = (self.residuals(at.moved(change), t)[0] - e) / _STEP[k]
+            J[..., c] = (self.distances(at.moved(change), t) - e) / _STEP[k]
         # beyond the edge of a wide lens there is no bearing, so that a distance jumps in a step
         most = _JUMP * self._mounted.camera.fx / _LARGEST[columns]
         steady = np.all(np.abs(J) < most, axis=-1, keepdims=True)
