@@ -122,8 +122,8 @@ def test_laps_of_a_stopwatch_add_up() -> None:
 
 def test_map_keeps_the_last_estimate_and_reads_back(tmp_path: Path) -> None:
     points = PointMap()
-    points.update(np.array([1, 2]), np.array([[0.0, 0, 0], [1, 2, 3]]))
-    points.update(np.array([1, 3]), np.array([[4.0, 5, 6], [np.nan, 0, 0]]))
+    points.update(10, np.array([1, 2]), np.array([[0.0, 0, 0], [1, 2, 3]]))
+    points.update(20, np.array([1, 3]), np.array([[4.0, 5, 6], [np.nan, 0, 0]]))
     path = tmp_path / "map.ply"
     write_ply(path, points.points())
     header, _, body = path.read_bytes().partition(b"end_header\n")
@@ -139,13 +139,25 @@ def test_map_of_many_features_is_what_a_table_of_them_would_be(
     monkeypatch.setattr("slam_graph.results.map_output.RECENT", 300)
     rng, points = np.random.default_rng(2), PointMap()
     table: dict[int, list[float]] = {}
-    for _ in range(40):
+    for stamp_ns in range(40):
         ids = rng.choice(2000, 50, replace=False)
         positions = rng.normal(size=(50, 3))
-        points.update(ids, positions)
+        points.update(stamp_ns, ids, positions)
         table.update(zip(ids.tolist(), positions.tolist(), strict=True))
     assert len(points) == len(table)
     assert sorted(points.points().tolist()) == sorted(table.values())
+
+
+def test_points_of_states_that_are_taken_back_leave_the_map() -> None:
+    """Those that were estimated before and not since stay; what comes afterwards is taken."""
+    points = PointMap()
+    for stamp_ns, ids in ((10, [1, 2, 3]), (20, [2, 3, 4]), (30, [4, 5])):
+        points.update(stamp_ns, np.array(ids), np.full((len(ids), 3), float(stamp_ns)))
+    points.forget_from(20)
+    np.testing.assert_array_equal(points.points(), [[10.0, 10.0, 10.0]])
+    points.update(40, np.array([5]), np.full((1, 3), 40.0))
+    points.forget_from(50)
+    assert len(points) == 2
 
 
 def test_what_json_cannot_hold_becomes_null() -> None:

@@ -227,7 +227,8 @@ class Estimation:
                 logs.steps.append(stamp_ns, estimator.report.costs, estimator.report.columns)
             logs.innovations.append(stamp_ns, estimator.report.innovations)
         if frame.state is not None:
-            result.point_map.update(frame.landmark_ids, frame.landmarks)
+            points = frame.landmark_ids, frame.landmarks
+            result.point_map.update(frame.state.stamp_ns, *points)
             if estimator.calibration is not None:
                 logs.calibration.append(estimator.calibration)
         estimated = len(frame.landmark_ids)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,12 +26,15 @@ _POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
 
 RECENT = 10_000
 """Features are moved from the dictionary into the arrays when there are more than this."""
+_REMEMBERED_NS = 30_000_000_000
+"""So long it is known which features were estimated when: states are taken back sooner."""
 
 
 class PointMap:
     """The last estimate of every feature; 32 bytes for each but the recent ones."""
 
     def __init__(self) -> None:
+        self._updates: deque[tuple[int, IntArray]] = deque()
         self._recent: dict[int, tuple[float, float, float]] = {}
         self._ids = np.zeros(0, np.int64)
         self._points = np.zeros((0, 3))
@@ -39,16 +43,29 @@ class PointMap:
         self._pack()
         return len(self._ids)
 
-    def update(self, ids: IntArray, points: FloatArray) -> None:
+    def update(self, stamp_ns: int, ids: IntArray, points: FloatArray) -> None:
         """Replace the positions of features.
 
         Args:
+            stamp_ns: time of the state that they were estimated with, later than those before.
             ids: (N,) of the features.
             points: (N, 3) in the world, m.
         """
         self._recent.update(zip(ids.tolist(), map(tuple, points.tolist()), strict=True))
         if len(self._recent) > RECENT:
             self._pack()
+        self._updates.append((stamp_ns, ids))
+        while self._updates[0][0] < stamp_ns - _REMEMBERED_NS:
+            self._updates.popleft()
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the features that were estimated at or after a time, of the last half minute."""
+        self._pack()
+        gone = [np.zeros(0, np.int64)]
+        while self._updates and self._updates[-1][0] >= stamp_ns:
+            gone.append(self._updates.pop()[1])
+        kept = ~np.isin(self._ids, np.concatenate(gone))
+        self._ids, self._points = self._ids[kept], self._points[kept]
 
     def points(self) -> FloatArray:
         """(N, 3) in the world, m."""

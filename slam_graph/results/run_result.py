@@ -105,12 +105,14 @@ class RunResult(RunSummary):
         """Take back the states from a time on, and what was logged of them.
 
         Args:
-            since_ns: the time; None for all states. The points of the map begin anew with these.
+            since_ns: the time; None for all states. The points of the map that were estimated with
+                them go too.
         """
         if since_ns is None:
             self.history, self.point_map = self.history.like(), PointMap()
         else:
             self.history.forget_from(since_ns)
+            self.point_map.forget_from(since_ns)
         self.logs.forget_states(since_ns)
 
     @property
