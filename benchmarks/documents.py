@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.baseline import Baseline, benchmark_of, value_of
 from benchmarks.faults import ALGORITHMS as FAULTY
-from benchmarks.faults import FAULTS, fault_key
+from benchmarks.faults import FAULTS, OF_TRACKS, fault_key
 from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
@@ -251,13 +251,23 @@ def held_out(figures: Figures) -> Iterator[str]:
 
 
 def faults(figures: Figures) -> Iterator[str]:
-    """What becomes of runs with a fault; algorithms that were not measured yet are left out."""
-    names = [name for name in FAULTY if figures.has(f"faults.none.{name}.error")]
+    """What becomes of runs with a fault in images."""
+    yield from _faulty(figures, "faults", FAULTS)
+
+
+def faults_tracks(figures: Figures) -> Iterator[str]:
+    """What becomes of runs with a fault in tracks."""
+    yield from _faulty(figures, "faults_tracks", OF_TRACKS)
+
+
+def _faulty(figures: Figures, suite: str, struck: Iterable[str]) -> Iterator[str]:
+    """Runs of a benchmark; algorithms that were not measured yet are left out."""
+    names = [name for name in FAULTY if figures.has(f"{suite}.none.{name}.error")]
     yield "| fault | " + " | ".join(f"`{name}`" for name in names) + " |"
     yield "|---|" + "---|" * len(names)
-    yield line("none [m]", *(figures(f"faults.none.{name}.error", 4) for name in names))
-    for fault in FAULTS:
-        yield line(fault, *(_survived(figures, f"faults.{fault_key(fault)}.{n}") for n in names))
+    yield line("none [m]", *(figures(f"{suite}.none.{name}.error", 4) for name in names))
+    for fault in struck:
+        yield line(fault, *(_survived(figures, f"{suite}.{fault_key(fault)}.{n}") for n in names))
 
 
 def _survived(figures: Figures, run: str) -> str:
@@ -296,6 +306,7 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "kernels": kernels,
     "growth": growth,
     "faults": faults,
+    "faults_tracks": faults_tracks,
     "verdict": verdict,
 }
 """By the name in the marker of a document."""

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults put into MH_01, under several algorithms: how each run ends, and what is reached after it.
+"""Faults put into two recordings, under several algorithms: how runs end, and what is reached then.
 
-A fault strikes at 6 s of 17. What counts is the error of each segment, aligned on its own, relative
+Images of MH_01, and tracks of OpenVINS' simulation, which images cannot be put into. A fault
+strikes at 6 s of 17. What counts is the error of each segment, aligned on its own, relative
 to that of the run without a fault; the time from the end of the fault to the next state in a
 segment that is good; and that no run ends with an internal error.
 """
@@ -21,7 +22,8 @@ from slam_graph.datasets import open_dataset
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
 
-RECORDING = "euroc/MH_01_easy_17s"
+RECORDING, TRACKS = "euroc/MH_01_easy_17s", "openvins_sim/euroc_V1_01"
+CLIP_S = 17.0
 AT_S = 6.0
 ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "fixed_lag_isam2")
 FAULTS = {
@@ -56,6 +58,8 @@ FAULTS = {
     "carried away": ("kidnapped:duration_s=2", 0.0),
 }
 """Faults as texts for `inject`, without the time, and how long they last, s."""
+OF_TRACKS = {name: fault for name, fault in FAULTS.items() if not fault[0].startswith("image_")}
+"""Those that recordings of tracks can have."""
 RECOVERY_BAR_S = 5.0
 """Longest time to recover."""
 _TOLERANCE = 0.5
@@ -84,7 +88,8 @@ class Survived:
 def survive(recording: Path, algorithm: str, fault: str, lasts_s: float) -> Survived:
     """One run with a fault, or without one if the text is empty."""
     logging.getLogger("slam_graph").setLevel(logging.CRITICAL)  # what is said is expected
-    run = Run(open_dataset(recording, faults=[fault] if fault else []), algorithm, 2)
+    sequence = open_dataset(recording, faults=[fault] if fault else [])
+    run = Run(sequence, algorithm, 2, duration_s=CLIP_S)
     result, errors = run.result, []
     for segment in result.segments:
         try:
@@ -103,19 +108,30 @@ def survive(recording: Path, algorithm: str, fault: str, lasts_s: float) -> Surv
 
 
 def measure(data: Path, algorithms: tuple[str, ...] = ALGORITHMS) -> Outcome:
-    """How runs end, for each fault and algorithm."""
+    """How runs end on images, for each fault and algorithm."""
+    return _measured(data / RECORDING, FAULTS, algorithms)
+
+
+def measure_tracks(data: Path, algorithms: tuple[str, ...] = ALGORITHMS) -> Outcome:
+    """The same on tracks."""
+    return _measured(data / TRACKS, OF_TRACKS, algorithms)
+
+
+def _measured(
+    recording: Path, faults: dict[str, tuple[str, float]], algorithms: tuple[str, ...]
+) -> Outcome:
     texts = {"none": ("", 0.0)}
-    for name, (text, lasts_s) in FAULTS.items():
+    for name, (text, lasts_s) in faults.items():
         kind, _, settings = text.partition(":")
         at = f"at_s={AT_S:g}"
         texts[name] = (f"{kind}:{','.join(filter(None, [at, settings]))}", lasts_s)
-    rows = [(data / RECORDING, name, *texts[fault]) for name in algorithms for fault in texts]
+    rows = [(recording, name, *texts[fault]) for name in algorithms for fault in texts]
     found = iter(in_parallel(survive, rows))
     outcome = Outcome()
     for name in algorithms:
         clean = next(found)
         outcome.add(f"none.{name}", [Metric("error", clean.whole_m, "m", "lower")])
-        for fault in FAULTS:
+        for fault in faults:
             run = next(found)
             outcome.add(f"{fault_key(fault)}.{name}", figures_of(run, clean))
             outcome.notes.append(f"{fault}, {name}: {run.status}")
@@ -145,5 +161,10 @@ BENCHMARKS = {
         "29 faults put into MH_01, under five algorithms: how runs end, errors, time to recover",
         (RECORDING,),
         measure,
-    )
+    ),
+    "faults_tracks": Benchmark(
+        "23 faults put into tracks of OpenVINS' simulation, under five algorithms",
+        (TRACKS,),
+        measure_tracks,
+    ),
 }
