@@ -31,10 +31,11 @@ _COMPARED = 4
 """So many of the best axes are compared by a full solution."""
 _CLEARER = 1.12
 """Residuals with the axes as they are must be so many times those with others …"""
-_FITS_PX = 4.0
-"""… which must fit: where neither does, something else is wrong, such as features that move …"""
 _BEHIND = 0.2
 """… or at most such a share of the observations in front of the camera."""
+_FITS_PX = 4.0
+"""Axes with larger residuals are not believed: something else is wrong, such as features that move.
+"""
 _BASELINE, _BAD_BASELINE = 0.12, 0.3
 """Logarithms of wrong baselines that are a warning, and an error."""
 _BASELINE_SIGMAS = 6.0
