@@ -17,8 +17,8 @@ BoolArray = NDArray[np.bool_]
 
 
 def skew(v: FloatArray) -> FloatArray:
-    """[v]ₓ (N, 3, 3) of vectors v (N, 3), so that [v]ₓ u = v × u."""
-    return np.cross(v[:, None, :], -np.eye(3))
+    """[v]ₓ (..., 3, 3) of vectors v (..., 3), so that [v]ₓ u = v × u."""
+    return np.cross(v[..., None, :], -np.eye(3))
 
 
 def median(values: NDArray[Any]) -> FloatArray:

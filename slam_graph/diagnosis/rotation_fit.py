@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, median
+from slam_graph.arrays import FloatArray, median, skew
 from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.sensors import RigCamera
@@ -133,7 +133,7 @@ class _Turned:
     @cached_property
     def noise(self) -> FloatArray:
         """(P, N, 3, 3) covariances of the normals for pixels with unit noise."""
-        spread = _cross_matrix(-self.two) @ self.by_one, _cross_matrix(self.one) @ self.by_two
+        spread = skew(-self.two) @ self.by_one, skew(self.one) @ self.by_two
         return np.asarray(sum(part @ part.swapaxes(-1, -2) for part in spread))
 
     def distances(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -311,14 +311,6 @@ def _scatter(normals: FloatArray, weights: FloatArray) -> FloatArray:
 def _least(moments: FloatArray) -> FloatArray:
     """Directions (P, 3) along which second moments (P, 3, 3) are least."""
     return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
-
-
-def _cross_matrix(vectors: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) of the products v × w with vectors (..., 3)."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _scales(sizes: FloatArray, there: FloatArray) -> FloatArray:
