@@ -29,9 +29,21 @@ class Diagnostics:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self._held: list[tuple[str, str]] | None = None
+
+    def hold(self) -> list[tuple[str, str]]:
+        """From now on neither count nor log: keep events in the list that is returned.
+
+        It is for a process whose events are to be counted and logged in another one.
+        """
+        self._held = []
+        return self._held
 
     def warn(self, kind: str, message: str) -> None:
         """Count one event of `kind` and log `message` if it is among the first of its kind."""
+        if self._held is not None:
+            self._held.append((kind, message))
+            return
         self.counts[kind] += 1
         if self.counts[kind] <= _LOGGED_PER_KIND:
             last = (

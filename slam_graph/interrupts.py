@@ -128,10 +128,18 @@ def end_with(pipe: int) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def leave_to_parent() -> None:
+    """Let Ctrl-C and SIGTERM do nothing in this process: its parent gets them too, and ends it."""
+    signal.set_wakeup_fd(-1)  # of an event loop of the parent
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 class Interrupts:
     """What is done about signals."""
 
     between_steps = staticmethod(between_steps)
     completed = staticmethod(completed)
     end_with = staticmethod(end_with)
+    leave_to_parent = staticmethod(leave_to_parent)
     terminate_like_interrupt = staticmethod(terminate_like_interrupt)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -82,7 +81,7 @@ class FrontendReport:
         end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
         packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
         logs = RunLogs()
-        with closing(Tracking(packets, frontend, overlap=False).run()) as tracking:
+        with Tracking(packets, frontend).in_turn() as tracking:
             for tracked in tracking:
                 packet, features = tracked.packet, tracked.features
                 quality.write(packet.imu, features)

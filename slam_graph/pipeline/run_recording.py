@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as SequenceOf
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ from slam_graph.pipeline.observers import (
 from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.pipeline.stage import NoObjects, Stage
 from slam_graph.pipeline.supervision import finish, outcome
-from slam_graph.pipeline.tracking import Tracking, packets_of
+from slam_graph.pipeline.tracking import TrackedPacket, Tracking, can_overlap, packets_of
 from slam_graph.pipeline.verdict import Verdict
 from slam_graph.results import RunInput, RunResult
 
@@ -114,7 +114,7 @@ def run(
         with (
             outcome(result, estimator),
             Interrupts.between_steps() as frame_done,
-            closing(tracking.run()) as packets,
+            _tracked(tracking, result, sequence) as packets,
         ):
             for stage in stages:
                 stage.begin(resources)
@@ -220,4 +220,14 @@ def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:
         asked.info.content,
         config.backend.noise.gravity,
     )
-    return Tracking(packets_of(sequence, asked), frontend, config.overlap)
+    return Tracking(packets_of(sequence, asked), frontend)
+
+
+def _tracked(
+    tracking: Tracking, result: RunResult, sequence: Sequence
+) -> AbstractContextManager[Iterator[TrackedPacket]]:
+    """The tracked packets, by a process of its own where that is wanted and gains something."""
+    asked = result.input
+    if asked.config.overlap and asked.info.content == "images" and can_overlap():
+        return tracking.beside(asked.rig, sequence.diagnostics)
+    return tracking.in_turn()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking: reading and the front end, in a thread beside the back end or in turn with it.
+"""Tracking: reading and the front end, in a process beside the back end or in turn with it.
 
 While the back end works on frame k, the front end tracks frame k + 1. So the back end's feedback on
 frame k reaches the front end before frame k + 2, in either mode: results are the same.
@@ -8,19 +8,21 @@ frame k reaches the front end before frame k + 2, in either mode: results are th
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from slam_graph.datasets import Sequence
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback, Frontend
+from slam_graph.pipeline.forked_call import CallInTurn, ForkedCall
 from slam_graph.results import RunInput
-from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 _LEAD_MARGIN_NS = 10_000_000
 """Packets lead by so much more than the time offset wants: it is estimated on."""
@@ -122,42 +124,49 @@ class Tracking:
     """Tracks the packets of a sequence one after the other.
 
     Args:
-        packets: to track; read in the thread of the front end.
+        packets: to track; read where the front end works.
         frontend: tracks them.
-        overlap: whether to track the next packet in a thread while the caller works on this one.
     """
 
-    def __init__(self, packets: Iterator[Packet], frontend: Frontend, overlap: bool) -> None:
+    def __init__(self, packets: Iterator[Packet], frontend: Frontend) -> None:
         self._packets = _LeadingPackets(packets)
         self._frontend = frontend
-        self._overlap = overlap
         self._feedback: Feedback | None = None
 
     def give_feedback(self, feedback: Feedback) -> None:
         """Pass on what the back end knows after the packet that was yielded last."""
         self._feedback = feedback
 
-    def run(self) -> Generator[TrackedPacket, None, None]:
-        """The tracked packets; close the generator when no more are wanted.
+    @contextmanager
+    def in_turn(self) -> Iterator[Iterator[TrackedPacket]]:
+        """The tracked packets, each tracked when it is asked for."""
+        yield self._tracked(CallInTurn(self._track))
+
+    @contextmanager
+    def beside(self, rig: Rig, diagnostics: Diagnostics) -> Iterator[Iterator[TrackedPacket]]:
+        """The same packets, each tracked in a process of its own while the caller works on the one
+        before.
 
         A fault in a packet is raised when its turn comes, not while it is read ahead.
-        """
-        if self._overlap:
-            yield from self._ahead()
-            return
-        feedback = None
-        while (tracked := self._track(feedback)) is not None:
-            feedback, self._feedback = self._feedback, None
-            yield tracked
 
-    def _ahead(self) -> Generator[TrackedPacket, None, None]:
-        with ThreadPoolExecutor(1, thread_name_prefix="slam_graph-frontend") as pool:
-            future = pool.submit(self._track, None)
-            while (tracked := future.result()) is not None:
-                feedback, self._feedback = self._feedback, None
-                future = pool.submit(partial(self._track, feedback))
-                tracked.clock.restart()
-                yield tracked
+        Args:
+            rig: tells how large images are.
+            diagnostics: that reader and front end warn by.
+        """
+        with closing(ForkedCall(self._track, _image_bytes(rig), diagnostics)) as process:
+            yield self._tracked(process)
+
+    def _tracked(
+        self,
+        frontend: CallInTurn[Feedback | None, TrackedPacket | None]
+        | ForkedCall[Feedback | None, TrackedPacket | None],
+    ) -> Generator[TrackedPacket, None, None]:
+        frontend.begin(None)
+        while (tracked := frontend.result()) is not None:
+            feedback, self._feedback = self._feedback, None
+            frontend.begin(feedback)
+            tracked.clock.restart()
+            yield tracked
 
     def _track(self, feedback: Feedback | None) -> TrackedPacket | None:
         """Read and track the next packet; None at the end."""
@@ -178,11 +187,24 @@ class Tracking:
         return TrackedPacket(packet, features, stats, clock)
 
 
+def _image_bytes(rig: Rig) -> int:
+    """Bytes of the images of a frame: grey ones of all cameras, and depth as float32."""
+    pixels = [mounted.camera.width * mounted.camera.height for mounted in rig.cameras]
+    depth = 0 if rig.depth is None else 4 * pixels[rig.depth.camera]
+    return sum(pixels) + depth
+
+
 def _milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:
     """The stages among what a front end counts: the keys that end in `_ms`, without that end."""
     return {
         key.removesuffix("_ms"): value for key, value in frame_stats.items() if key.endswith("_ms")
     }
+
+
+def can_overlap() -> bool:
+    """Whether a process beside this one can be started here, and has a core of its own."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return ForkedCall.is_possible() and (cores or 1) > 1
 
 
 def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
