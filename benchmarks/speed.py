@@ -37,6 +37,9 @@ COST_BARS = {
     ("msckf", 1): 2.8,
 }
 """Of `cost_mean`, by algorithm and number of cameras; 2.8 is that of OpenVINS with two."""
+OVERLAPPED, OVERLAP_BAR = "msckf", 2.8
+"""What is run with front and back end in two processes, and the bar of the time of a frame."""
+
 MEMORY_BAR_MB = 250.0
 
 QUICK_S, QUICK_TOLERANCE, QUICK_RUNS = 8.0, 0.5, 2
@@ -99,6 +102,43 @@ def quick(data: Path) -> Outcome:
         timed = worker("benchmarks.speed_worker", "interleaved", *arguments)
         costs.append(next(m.value for m in parts(timed) if m.key == "cost_mean"))
     return Outcome([Metric("cost_mean", min(costs), UNIT, "lower", None, QUICK_TOLERANCE)])
+
+
+def overlap(data: Path) -> Outcome:
+    """Time of a frame by the wall clock, with the front end in a process of its own and without."""
+    outcome = Outcome()
+    table = worker("benchmarks.overlap_worker", str(data / RECORDING), OVERLAPPED)
+    outcome.add(OVERLAPPED, overlap_figures(table))
+    busy = max(run["cpu"] / run["wall"] for run in table["in_turn"])
+    outcome.notes += [
+        f"images are decoded before; {table['cores']} cores; runs in turn had theirs for at most "
+        f"{busy:.0%} of the time (below 95%: other programs were running, and all times by the "
+        "wall clock are too long)"
+    ]
+    return outcome
+
+
+def overlap_figures(table: dict[str, Any]) -> list[Metric]:
+    """The figures of runs with and without overlap, as multiples of the reference.
+
+    Args:
+        table: milliseconds of `reference` (M,); and for each run `in_turn` and `overlapped`
+            milliseconds a frame, `wall`, `cpu` and `cpu_front_end`.
+    """
+    unit_ms = float(np.median(table["reference"]))
+
+    def least(kind: str, key: str) -> float:
+        return min(float(run[key]) for run in table[kind]) / unit_ms
+
+    wall, before = least("overlapped", "wall"), least("in_turn", "wall")
+    return [
+        Metric("wall_overlapped", wall, UNIT, "lower", OVERLAP_BAR, TIMING_TOLERANCE),
+        info("wall_in_turn", before, UNIT),
+        info("wall_ratio", wall / before, "overlapped / in turn"),
+        info("cpu_in_turn", least("in_turn", "cpu"), UNIT),
+        info("cpu_back_end", least("overlapped", "cpu"), UNIT),
+        info("cpu_front_end", least("overlapped", "cpu_front_end"), UNIT),
+    ]
 
 
 def whole(shipped: dict[str, Any]) -> list[Metric]:
@@ -225,6 +265,11 @@ BENCHMARKS = {
     ),
     "speed_mh01_mono": Benchmark(
         "MH_01 with one camera on one core: cost in Lucas-Kanade flows", (RECORDING,), mono
+    ),
+    "speed_overlap": Benchmark(
+        "MH_01 stereo on two cores, front end beside the back end: time in Lucas-Kanade flows",
+        (RECORDING,),
+        overlap,
     ),
     "speed_quick": Benchmark(
         f"{QUICK_S:g} s of MH_01 stereo on one core: cost in Lucas-Kanade flows",

@@ -162,7 +162,7 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     assert ate_m(result) < 1.65 * clean_m
 
 
-def test_a_thread_for_the_front_end_changes_nothing(folder: Path) -> None:
+def test_a_process_for_the_front_end_changes_nothing(folder: Path) -> None:
     """Not even where the front end hears of the back end in every frame."""
     changes = ["frontend.prediction=state", "frontend.drop_rejected=true"]
     changes += ["frontend.map_check_px=3", "frontend.outliers=gyroscope", "min_coverage=0"]

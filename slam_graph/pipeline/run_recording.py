@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as SequenceOf
 from contextlib import AbstractContextManager, ExitStack
@@ -40,6 +41,8 @@ from slam_graph.results import RunInput, RunResult
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
 
+
+logger = logging.getLogger(__name__)
 
 _NO_SCALE = (
     "one camera without an IMU: all lengths are up to scale, and fixes and odometry are not used"
@@ -226,8 +229,11 @@ def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:
 def _tracked(
     tracking: Tracking, result: RunResult, sequence: Sequence
 ) -> AbstractContextManager[Iterator[TrackedPacket]]:
-    """The tracked packets, by a process of its own where that is wanted and gains something."""
+    """The tracked packets, by a process of its own where that is wanted and possible."""
     asked = result.input
-    if asked.config.overlap and asked.info.content == "images" and can_overlap():
-        return tracking.beside(asked.rig, sequence.diagnostics)
-    return tracking.in_turn()
+    if not asked.config.overlap or asked.info.content == "tracks":
+        return tracking.in_turn()
+    if not can_overlap():
+        logger.warning("overlap needs two cores and a system that forks: both ends take turns")
+        return tracking.in_turn()
+    return tracking.beside(asked.rig, sequence.diagnostics)

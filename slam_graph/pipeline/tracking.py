@@ -144,8 +144,7 @@ class Tracking:
 
     @contextmanager
     def beside(self, rig: Rig, diagnostics: Diagnostics) -> Iterator[Iterator[TrackedPacket]]:
-        """The same packets, each tracked in a process of its own while the caller works on the one
-        before.
+        """The same packets, each tracked in a process of its own, one ahead of the caller.
 
         A fault in a packet is raised when its turn comes, not while it is read ahead.
 
