@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph import run
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.fix_factors import FixGate, fix_factor
+from slam_graph.backend.aiding.fix_factors import FixGate, PositionFix
 from slam_graph.backend.aiding.regauging import gauge_directions, with_free_gauge
-from slam_graph.backend.aiding.world_alignment import align_world
+from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import dims_of
 from slam_graph.datasets import TrackRecorder, open_dataset
@@ -76,7 +76,7 @@ def random_pose(rng: np.random.Generator) -> gtsam.Pose3:
 
 def test_the_jacobian_of_a_fix_is_the_numerical_one() -> None:
     rng, arm = np.random.default_rng(3), np.array([0.3, -0.2, 1.1])
-    factor = fix_factor(X(0), rng.normal(size=3), np.diag([1.0, 2.0, 4.0]), arm)
+    factor = PositionFix(0, rng.normal(size=3), np.diag([1.0, 2.0, 4.0]), arm).factor(X(0))
     values = gtsam.Values()
     values.insert(X(0), random_pose(rng))
     A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
@@ -130,6 +130,20 @@ def test_a_free_gauge_adds_its_covariance() -> None:
 # --- alignment and gate --------------------------------------------------------------------------
 
 
+def aligned(places: FloatArray, fixes: FloatArray, level: bool) -> WorldAlignment | None:
+    """The world of fixes (N, 3) of 1 m along a path."""
+    pairs = [
+        PathFix(fix_of(fix), gtsam.Pose3(gtsam.Rot3(), place))
+        for place, fix in zip(places, fixes, strict=True)
+    ]
+    return align_world(pairs, places[-1], level)
+
+
+def fix_of(position: FloatArray) -> PositionFix:
+    """A fix of 1 m of the origin of the body."""
+    return PositionFix(0, position, np.eye(3), np.zeros(3))
+
+
 @pytest.mark.parametrize("level", [True, False])
 def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> None:
     """NEES of the gauge over 40 draws within its 99.9 % bounds; none is lost to outliers."""
@@ -143,8 +157,7 @@ def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> N
         wrong = rng.random(len(fixes)) < 0.2
         angles = rng.uniform(0, 2 * np.pi, len(fixes))
         fixes[wrong, :2] += 10.0 * np.column_stack([np.cos(angles), np.sin(angles)])[wrong]
-        ones = np.tile(np.eye(3), (len(fixes), 1, 1))
-        found = align_world(places, fixes, ones, places[-1], level)
+        found = aligned(places, fixes, level)
         assert found is not None
         assert not found.fits[wrong].any()
         error = truth.compose(found.motion.inverse())
@@ -159,26 +172,24 @@ def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> N
 def test_a_straight_line_does_not_tell_the_world_without_gravity() -> None:
     rng = np.random.default_rng(7)
     places = np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)])
-    ones = np.tile(np.eye(3), (60, 1, 1))
     noisy = places + rng.normal(size=places.shape)
-    assert align_world(places, noisy, ones, places[-1], False) is None
-    assert align_world(places, noisy, ones, places[-1], True) is not None
+    assert aligned(places, noisy, level=False) is None
+    assert aligned(places, noisy, level=True) is not None
 
 
 def test_the_gate_rejects_multipath_and_few_good_fixes() -> None:
     rng, gate, pose = np.random.default_rng(8), FixGate(), gtsam.Pose3()
-    known, noise, arm = 0.01 * np.eye(6), np.eye(3), np.zeros(3)
-    good = [gate.weight(pose, known, rng.normal(size=3), noise, arm) for _ in range(400)]
+    known = 0.01 * np.eye(6)
+    good = [gate.weight(fix_of(rng.normal(size=3)), pose, known) for _ in range(400)]
     assert np.mean(np.array(good) == 0.0) < 0.01
     assert np.mean(good) > 0.95
     for _ in range(2):
-        assert gate.weight(pose, known, np.array([10.0, 0.0, 0.0]), noise, arm) == 0.0
+        assert gate.weight(fix_of(np.array([10.0, 0.0, 0.0])), pose, known) == 0.0
 
 
 def test_the_gate_gives_in_if_all_fixes_say_the_same() -> None:
     gate, pose, there = FixGate(), gtsam.Pose3(), np.array([30.0, 0.0, 0.0])
-    known, noise, arm = 0.01 * np.eye(6), np.eye(3), np.zeros(3)
-    weights = [gate.weight(pose, known, there, noise, arm) for _ in range(12)]
+    weights = [gate.weight(fix_of(there), pose, 0.01 * np.eye(6)) for _ in range(12)]
     assert weights[0] == 0.0
     assert weights[-1] > 0.0
 

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Position fixes and odometry on their way into the cost of each step.
+"""Fixes, known poses and odometry on their way into the cost of each step.
 
-The estimator begins in a world of its own. It waits until the fixes along its path tell where that
-world is (`world_alignment.py`), and moves everything there once. From then on each fix is a factor
-at the frame that follows it. Odometry is a factor between consecutive frames from the beginning.
+The estimator begins in a world of its own. It waits until the absolute measurements along its path
+tell where that world is (`world_alignment.py`), and moves everything there once. From then on each
+of them is a factor at the frame that follows it. Odometry is a factor between consecutive frames
+from the beginning.
 """
 
 from __future__ import annotations
+
+from collections import defaultdict
 
 import gtsam
 import numpy as np
@@ -15,13 +18,13 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.fix_factors import (
     FixGate,
-    antenna,
-    between_poses,
-    fix_factor,
+    fixes_of,
+    on_the_clock,
+    pose_between,
     pose_key,
 )
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
-from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
+from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.state import State
 from slam_graph.backend.visual_motion import moved_to
@@ -36,7 +39,7 @@ _HISTORY_NS = 5_000_000_000
 
 
 class Aiding:
-    """Takes fixes and odometry, and makes factors of them.
+    """Takes fixes, known poses and odometry, and makes factors of them.
 
     Args:
         config: settings.
@@ -45,14 +48,14 @@ class Aiding:
     Attributes:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
+        gates: of the sources of fixes, by name.
     """
 
     def __init__(self, config: BackendConfig, level: bool) -> None:
         self._config, self._level = config, level
-        self._arm = np.array(config.gnss.lever_arm_m)
-        self._offset_ns = round(config.gnss.time_offset_s * 1e9)
         self._data = AidingData.empty()
-        self.gate, self.used = FixGate(), False
+        self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
+        self.used = False
         self.restart()
 
     def restart(self) -> None:
@@ -60,16 +63,15 @@ class Aiding:
         self.aligned = False
         self._states: list[NavState] = []
         self._waiting = AidingData.empty()
-        self._pairs: list[tuple[FloatArray, FloatArray, FloatArray, float]] = []
+        self._pairs: list[PathFix] = []
 
     def add(self, data: AidingData) -> None:
         """Take measurements that follow those before; none say that there will be some."""
         self.used = True
-        if not self._config.gnss.enabled:
-            data = data.without_fixes()
-        self._data = AidingData.concatenate([self._data, data.shifted(self._offset_ns)])
-        if len(data.fix_stamps_ns) and not self.aligned:
-            self._waiting = AidingData.concatenate([self._waiting, data.shifted(self._offset_ns)])
+        data = on_the_clock(data, self._config)
+        self._data = AidingData.concatenate([self._data, data])
+        if not self.aligned:
+            self._waiting = AidingData.concatenate([self._waiting, data])
 
     # --- factors ---------------------------------------------------------------------------------
 
@@ -97,17 +99,12 @@ class Aiding:
                 factors.append(odometry_factor(frames, moved, self._config.odometry))
         if not self.aligned:
             return factors
-        fixes = self._data.within(*stamps_ns)
-        for k, stamp_ns in enumerate(fixes.fix_stamps_ns.tolist()):
-            share = (stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
-            ahead = antenna(last, self._arm) - between_poses((first, last), share, self._arm)
-            position, covariance = fixes.fix_positions[k] + ahead, fixes.fix_covariances[k]
-            weight = 1.0
-            if known is not None:
-                weight = self.gate.weight(last, known, position, covariance, self._arm)
+        for fix in fixes_of(self._data.within(*stamps_ns), self._config):
+            share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
+            here = fix.moved(pose_between(first, last, share), last)
+            weight = 1.0 if known is None else self.gates[fix.source].weight(here, last, known)
             if weight > 0.0:
-                key = pose_key(frames[1])
-                factors.append(fix_factor(key, position, covariance / weight, self._arm))
+                factors.append(here.factor(pose_key(frames[1]), weight))
         return factors
 
     def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
@@ -140,28 +137,24 @@ class Aiding:
         self._states.append(state)
         if not self._pair(state):
             return None
-        columns = zip(*self._pairs, strict=True)
-        places, fixes, covariances, known = (np.array(column) for column in columns)
-        # older fixes tell less of the world: the path has drifted since
-        drift = np.maximum(_variance(state) - known, 0.0)
-        covariances = covariances + drift[:, None, None] * np.eye(3)
+        position, rotation = _variances(state)
         now = np.asarray(state.world_T_body.translation())
-        return align_world(places, fixes, covariances, now, self._level)
+        # older fixes tell less of the world: the path has drifted since
+        drifted = [pair.after_drift(position, rotation) for pair in self._pairs]
+        return align_world(drifted, now, self._level)
 
     def _pair(self, state: NavState) -> bool:
-        """Note the fixes up to a state with the antenna's place then; whether there are any."""
+        """Note the fixes up to a state with the pose of the body then; whether there are any."""
+        due = self._waiting.within(None, state.stamp_ns)
+        self._waiting = self._waiting.within(state.stamp_ns, None)
         if len(self._states) < 2:
-            self._waiting = self._waiting.within(state.stamp_ns, None)
             return False
         before, count = self._states[-2], len(self._pairs)
-        due = self._waiting.within(before.stamp_ns, state.stamp_ns)
-        self._waiting = self._waiting.within(state.stamp_ns, None)
-        poses = before.world_T_body, state.world_T_body
-        for k, stamp_ns in enumerate(due.fix_stamps_ns.tolist()):
-            share = (stamp_ns - before.stamp_ns) / (state.stamp_ns - before.stamp_ns)
-            place = between_poses(poses, share, self._arm)
-            fix, covariance = due.fix_positions[k], due.fix_covariances[k]
-            self._pairs.append((place, fix, covariance, _variance(before)))
+        due = due.within(before.stamp_ns, None)
+        for fix in fixes_of(due, self._config):
+            share = (fix.stamp_ns - before.stamp_ns) / (state.stamp_ns - before.stamp_ns)
+            pose = pose_between(before.world_T_body, state.world_T_body, share)
+            self._pairs.append(PathFix(fix, pose, *_variances(before)))
         grew, self._pairs = len(self._pairs) > count, self._pairs[-_MOST_PAIRS:]
         return grew
 
@@ -174,6 +167,9 @@ class Aiding:
         return states
 
 
-def _variance(state: NavState) -> float:
-    """Of the position of a state, the sum of its axes, m²."""
-    return 0.0 if state.covariance is None else float(np.trace(state.covariance[3:6, 3:6]))
+def _variances(state: NavState) -> tuple[float, float]:
+    """Of the position (m²) and the orientation (rad²) of a state, the sums of their axes."""
+    if state.covariance is None:
+        return 0.0, 0.0
+    variances = np.diag(state.covariance)
+    return float(variances[3:6].sum()), float(variances[:3].sum())

@@ -158,9 +158,9 @@ class FrameLog:
 
     @cached_property
     def aiding(self) -> AidingData:
-        """Odometry of the whole run, and position fixes if the estimate is in their world."""
+        """Odometry of the whole run, and fixes and poses if the estimate is in their world."""
         data = AidingData.concatenate(self._aiding)
-        return data if self.georeferenced else data.without_fixes()
+        return data if self.georeferenced else data.without_fixes().without_poses()
 
     @property
     def frames_ns(self) -> IntArray:
