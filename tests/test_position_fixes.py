@@ -177,6 +177,28 @@ def test_a_straight_line_does_not_tell_the_world_without_gravity() -> None:
     assert aligned(places, noisy, level=True) is not None
 
 
+def test_a_clock_that_is_off_is_found_as_well_as_it_says() -> None:
+    """NEES of world and offset over 40 draws of fixes that come late by an unknown time."""
+    rng, squares = np.random.default_rng(9), []
+    way = np.linspace(0.0, 2 * np.pi, 60)
+    places = np.column_stack([60 * np.cos(way), 40 * np.sin(2 * way), np.zeros(60)])
+    speeds = np.column_stack([-60 * np.sin(way), 80 * np.cos(2 * way), np.zeros(60)]) / 5.0
+    for _ in range(40):
+        late = 0.2 * rng.normal()
+        truth = gtsam.Pose3(gtsam.Rot3.Yaw(rng.normal()), 100.0 * rng.normal(size=3))
+        exact = np.asarray(truth.transformFrom((places + late * speeds).T)).T
+        pairs = [
+            PathFix(
+                fix_of(fix + rng.normal(size=3)), gtsam.Pose3(gtsam.Rot3(), place), velocity=speed
+            )
+            for fix, place, speed in zip(exact, places, speeds, strict=True)
+        ]
+        found = align_world(pairs, places[-1], True, (0.0, 0.2))
+        assert found is not None
+        squares.append(((found.offset_s - late) / found.offset_sigma_s) ** 2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=3.3 * np.sqrt(2 / 40))
+
+
 def test_the_gate_rejects_multipath_and_few_good_fixes() -> None:
     rng, gate, pose = np.random.default_rng(8), FixGate(), gtsam.Pose3()
     known = 0.01 * np.eye(6)
@@ -275,6 +297,17 @@ def test_a_drive_ends_in_the_world_of_the_fixes(algorithm: str) -> None:
     assert result.metrics["world"]["of_fixes"]
     assert len(result.trajectory) > 590  # what came before the alignment is not lost
     assert error_m(result, sequence) < 1.5
+
+
+@pytest.mark.parametrize(("given", "sigma"), [(-0.3, 0.0), (0.0, 0.3)])
+def test_fixes_that_come_late_count_where_they_were_measured(given: float, sigma: float) -> None:
+    """By an offset that is given, or found; neglected, it is 3 m on the road."""
+    sequence = drive(30.0, rate_hz=10.0, gnss={"sigma_m": 0.3, "rate_hz": 2.0, "late_s": 0.3})
+    gnss = {"gnss": {"time_offset_s": given, "time_offset_sigma_s": sigma}}
+    result = run(sequence, algorithm="msckf", backend=gnss, **CAUSAL_ONLY)
+    assert result.georeferenced
+    assert given + result.fix_offset_s == pytest.approx(-0.3, abs=0.06)
+    assert error_m(result, sequence) < 0.6
 
 
 def test_fixes_bound_the_error_of_odometry_that_drifts() -> None:

@@ -273,6 +273,9 @@ class GnssConfig(Settings):
     time_offset_s: float = expert(0.0, ge=-10, le=10)
     """Added to the times of the fixes to get them on the clock of the IMU, or of the cameras where
     there is no IMU."""
+    time_offset_sigma_s: float = expert(0.0, ge=0, le=1)
+    """How well that offset is known, in seconds. Above zero it is estimated from the path, together
+    with the world of the fixes."""
 
 
 class KnownPosesConfig(Settings):

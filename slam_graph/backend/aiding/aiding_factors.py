@@ -11,20 +11,24 @@ from the beginning.
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.estimated_path import EstimatedPath, variances_of
 from slam_graph.backend.aiding.fix_factors import (
+    Fix,
     FixGate,
+    PositionFix,
     fixes_of,
     on_the_clock,
     pose_between,
     pose_key,
 )
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
-from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
+from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.state import State
 from slam_graph.backend.visual_motion import moved_to
@@ -32,10 +36,12 @@ from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData
 
-_MOST_PAIRS = 300
+_MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
+_TIMINGS = 3
+"""Alignments, each at the times that the one before has found."""
 _HISTORY_NS = 5_000_000_000
-"""How long what was measured is kept."""
+"""How long odometry and states are kept."""
 
 
 class Aiding:
@@ -49,29 +55,29 @@ class Aiding:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
         gates: of the sources of fixes, by name.
+        offset_s: time that was found to be missing from those of position fixes.
     """
 
     def __init__(self, config: BackendConfig, level: bool) -> None:
         self._config, self._level = config, level
         self._data = AidingData.empty()
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
-        self.used = False
+        self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self.restart()
 
     def restart(self) -> None:
         """The estimate begins anew, in another world."""
         self.aligned = False
-        self._states: list[NavState] = []
+        self._path = EstimatedPath()
         self._waiting = AidingData.empty()
-        self._pairs: list[PathFix] = []
+        self._fixes: list[Fix] = []
 
     def add(self, data: AidingData) -> None:
         """Take measurements that follow those before; none say that there will be some."""
         self.used = True
-        data = on_the_clock(data, self._config)
+        data = on_the_clock(data, self._config).shifted(round(self.offset_s * 1e9))
         self._data = AidingData.concatenate([self._data, data])
-        if not self.aligned:
-            self._waiting = AidingData.concatenate([self._waiting, data])
+        self._waiting = AidingData.concatenate([self._waiting, data])
 
     # --- factors ---------------------------------------------------------------------------------
 
@@ -99,13 +105,34 @@ class Aiding:
                 factors.append(odometry_factor(frames, moved, self._config.odometry))
         if not self.aligned:
             return factors
-        for fix in fixes_of(self._data.within(*stamps_ns), self._config):
+        for fix in self._due(stamps_ns[1]):
             share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
-            here = fix.moved(pose_between(first, last, share), last)
+            then = (
+                pose_between(first, last, share) if share > 0.0 else self._path.pose(fix.stamp_ns)
+            )
+            if then is None:
+                continue
+            here = self._of_unsure_time(fix.moved(then, last), (first, last), stamps_ns)
             weight = 1.0 if known is None else self.gates[fix.source].weight(here, last, known)
             if weight > 0.0:
                 factors.append(here.factor(pose_key(frames[1]), weight))
         return factors
+
+    def _due(self, stamp_ns: int) -> list[Fix]:
+        """The fixes up to a time that were not taken yet."""
+        due = self._waiting.within(None, stamp_ns)
+        self._waiting = self._waiting.within(stamp_ns, None)
+        return fixes_of(due, self._config)
+
+    def _of_unsure_time(
+        self, fix: Fix, poses: tuple[gtsam.Pose3, gtsam.Pose3], stamps_ns: tuple[int, int]
+    ) -> Fix:
+        """A fix with the noise that an offset of its clock which is not known well adds."""
+        if not isinstance(fix, PositionFix) or not fix.is_timed or self._offset_sigma_s == 0.0:
+            return fix
+        velocity = (fix.of(poses[1]) - fix.of(poses[0])) / ((stamps_ns[1] - stamps_ns[0]) * 1e-9)
+        along = self._offset_sigma_s * velocity
+        return replace(fix, covariance=fix.covariance + np.outer(along, along))
 
     def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
         """A predicted state where the odometry has it; None without odometry of this time.
@@ -130,46 +157,36 @@ class Aiding:
         Args:
             state: of the newest frame; None without one.
         """
-        if state is None or not self.used or self.aligned:
+        if state is None or not self.used or not self._path.append(state):
             return None
-        if self._states and state.stamp_ns <= self._states[-1].stamp_ns:
+        if self.aligned:  # for fixes that come late
+            if state.stamp_ns - self._path.states[0].stamp_ns > 2 * _HISTORY_NS:
+                self._path.forget_before(state.stamp_ns - _HISTORY_NS)
             return None
-        self._states.append(state)
-        if not self._pair(state):
-            return None
-        position, rotation = _variances(state)
-        now = np.asarray(state.world_T_body.translation())
-        # older fixes tell less of the world: the path has drifted since
-        drifted = [pair.after_drift(position, rotation) for pair in self._pairs]
-        return align_world(drifted, now, self._level)
+        due = self._due(state.stamp_ns)
+        self._fixes = [*self._fixes, *due][-_MOST_FIXES:]
+        return self._aligned(state) if due else None
 
-    def _pair(self, state: NavState) -> bool:
-        """Note the fixes up to a state with the pose of the body then; whether there are any."""
-        due = self._waiting.within(None, state.stamp_ns)
-        self._waiting = self._waiting.within(state.stamp_ns, None)
-        if len(self._states) < 2:
-            return False
-        before, count = self._states[-2], len(self._pairs)
-        due = due.within(before.stamp_ns, None)
-        for fix in fixes_of(due, self._config):
-            share = (fix.stamp_ns - before.stamp_ns) / (state.stamp_ns - before.stamp_ns)
-            pose = pose_between(before.world_T_body, state.world_T_body, share)
-            self._pairs.append(PathFix(fix, pose, *_variances(before)))
-        grew, self._pairs = len(self._pairs) > count, self._pairs[-_MOST_PAIRS:]
-        return grew
+    def _aligned(self, state: NavState) -> WorldAlignment | None:
+        """Where the world is, by the fixes so far."""
+        sigma_s, offset_s = self._config.gnss.time_offset_sigma_s, 0.0
+        now = np.asarray(state.world_T_body.translation())
+        found: WorldAlignment | None = None
+        for _ in range(_TIMINGS if sigma_s > 0.0 else 1):
+            pairs = [self._path.at(fix, round(offset_s * 1e9)) for fix in self._fixes]
+            # older fixes tell less of the world: the path has drifted since
+            drifted = [pair.after_drift(*variances_of(state)) for pair in pairs if pair is not None]
+            found = align_world(drifted, now, self._level, (-offset_s, sigma_s))
+            if found is None:
+                return None
+            offset_s += found.offset_s
+        return replace(found, offset_s=offset_s) if found is not None else None
 
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""
-        states = in_moved_world(self._states, found.motion)
+        states = in_moved_world(self._path.states, found.motion)
         states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
-        self.aligned, self._states, self._pairs = True, [], []
-        self._waiting = AidingData.empty()
+        self.aligned, self._fixes, self._path.states = True, [], list(states)
+        self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s
+        self._waiting = self._waiting.shifted(round(found.offset_s * 1e9))
         return states
-
-
-def _variances(state: NavState) -> tuple[float, float]:
-    """Of the position (m²) and the orientation (rad²) of a state, the sums of their axes."""
-    if state.covariance is None:
-        return 0.0, 0.0
-    variances = np.diag(state.covariance)
-    return float(variances[3:6].sum()), float(variances[:3].sum())

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
@@ -49,6 +49,11 @@ class PositionFix:
     covariance: FloatArray
     arm: FloatArray
     source: str = "gnss"
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the time offset of its source may be estimated."""
+        return self.source == "gnss"
 
     def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> PositionFix:
         """The same measurement at another pose of the body.
@@ -90,6 +95,7 @@ class OrientationFix:
     world_R_body: gtsam.Rot3
     covariance: FloatArray
     source: str = "orientations"
+    is_timed: ClassVar[bool] = False
 
     def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> OrientationFix:
         """See `PositionFix`."""
@@ -118,7 +124,7 @@ def _noise(covariance: FloatArray, robust: bool) -> gtsam.noiseModel.Base:
 
 
 def on_the_clock(data: AidingData, config: BackendConfig) -> AidingData:
-    """Measurements with the time offsets of their sources added, without those that are not used."""
+    """Measurements that are used, with the time offsets of their sources added."""
     if not config.gnss.enabled:
         data = data.without_fixes()
     if not config.known_poses.enabled:

@@ -8,12 +8,15 @@ six degrees of freedom, that brings the path to the fixes. A few known orientati
 rotation without a path. Some fixes are wrong by far (multipath, ambiguous tags), so it is found by
 graduated non-convexity with the loss of Geman and McClure (Yang, Antonante, Tzoumas & Carlone
 2020).
+
+The clock of the fixes may be off by a time that is known to some extent only. Then that time is one
+more unknown: a fix that is late by τ is where the path was τ before, along its velocity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -52,12 +55,14 @@ class PathFix:
         pose: of the body then, in the estimator's own world.
         position_variance: of that pose, the sum of its axes, m².
         rotation_variance: the same of its orientation, rad².
+        velocity: (3,) of the sensor there, m/s; zero if the time of the fix is known.
     """
 
     fix: Fix
     pose: gtsam.Pose3
     position_variance: float = 0.0
     rotation_variance: float = 0.0
+    velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def after_drift(self, position: float, rotation: float) -> PathFix:
         """The same with the noise that the drift since then adds.
@@ -83,12 +88,16 @@ class WorldAlignment:
             `world_gauge`: position (m), then yaw or rotation (rad).
         centre: (3,) the point about which the world turns, in the world of the fixes.
         fits: (N,) which fixes fit.
+        offset_s: to be added to the times of fixes with a velocity.
+        offset_sigma_s: its standard deviation; zero if it is known.
     """
 
     motion: gtsam.Pose3
     covariance: FloatArray
     centre: FloatArray
     fits: BoolArray
+    offset_s: float = 0.0
+    offset_sigma_s: float = 0.0
 
 
 def enough_fixes(fixes: Sequence[Fix]) -> bool:
@@ -97,42 +106,52 @@ def enough_fixes(fixes: Sequence[Fix]) -> bool:
     return len(fixes) - orientations >= MIN_FIXES or orientations >= _MIN_ORIENTATIONS
 
 
-def align_world(pairs: Sequence[PathFix], centre: FloatArray, level: bool) -> WorldAlignment | None:
+def align_world(
+    pairs: Sequence[PathFix],
+    centre: FloatArray,
+    level: bool,
+    offset: tuple[float, float] = (0.0, 0.0),
+) -> WorldAlignment | None:
     """The motion that brings a path to fixes of it; None as long as they do not tell it.
 
     Args:
         pairs: N fixes with the path; the covariances are those of their differences.
         centre: (3,) the point, in the world of the estimate, about which the world turns.
         level: whether gravity is measured, so that the motion is one in position and yaw.
+        offset: mean and standard deviation of what is to be added to the times of fixes with a
+            velocity, s; it is known if the latter is zero.
     """
     if not enough_fixes([pair.fix for pair in pairs]):
         return None
-    path = _Path.of(pairs, centre, level)
+    path = _Path.of(pairs, centre, level, offset)
     motion = path.start()
     if motion is None:
         return None
-    distances = path.distances(motion)
+    late, distances = offset[0], path.distances(motion, offset[0])
     scale = max(2.0 * float(distances.max() / _WIDTH) ** 2, 1.0)
     while scale > 1.0:  # the loss is nearly quadratic at first
         weights = (scale * _WIDTH**2 / (distances**2 + scale * _WIDTH**2)) ** 2
-        motion, _ = path.step(motion, weights)
-        distances = path.distances(motion)
+        motion, late, _ = path.step(motion, late, weights)
+        distances = path.distances(motion, late)
         scale /= _SHRINKING
     information = np.zeros((4, 4))
     for _ in range(_STEPS):
         fits = distances < _WIDTH
         if not path.supported(fits):
             return None
-        motion, information = path.step(motion, fits.astype(np.float64))
-        distances = path.distances(motion)
+        motion, late, information = path.step(motion, late, fits.astype(np.float64))
+        distances = path.distances(motion, late)
     if np.linalg.cond(information) > 1e12:
         return None
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    whole = np.asarray(np.linalg.inv(information), np.float64)
+    covariance = whole[:-1, :-1] if offset[1] > 0.0 else whole
+    sigma_s = float(np.sqrt(whole[-1, -1])) if offset[1] > 0.0 else 0.0
     if np.sqrt(np.diag(covariance)[3:].max()) > _ROTATION_SIGMA_RAD:
         return None
     fitting = np.zeros(len(fits), np.bool_)
     fitting[path.order] = fits
-    return WorldAlignment(motion, covariance, _moved(motion, centre[None])[0], fitting)
+    there = _moved(motion, centre[None])[0]
+    return WorldAlignment(motion, covariance, there, fitting, late, sigma_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,6 +165,8 @@ class _Path:
         order: (N,) numbers of the fixes as they were given.
         centre: (3,) the point about which the world turns, in the estimator's own world.
         level: whether the motion is one in position and yaw.
+        velocities: (P, 3) of the sensor.
+        offset: see `align_world`.
     """
 
     places: FloatArray
@@ -156,9 +177,13 @@ class _Path:
     order: list[int]
     centre: FloatArray
     level: bool
+    velocities: FloatArray
+    offset: tuple[float, float]
 
     @staticmethod
-    def of(pairs: Sequence[PathFix], centre: FloatArray, level: bool) -> _Path:
+    def of(
+        pairs: Sequence[PathFix], centre: FloatArray, level: bool, offset: tuple[float, float]
+    ) -> _Path:
         """See `align_world`."""
         positions: list[tuple[FloatArray, FloatArray]] = []
         rotations: list[tuple[FloatArray, FloatArray]] = []
@@ -176,16 +201,21 @@ class _Path:
             order[kind].append(number)
         places, fixes = np.array(positions).reshape(-1, 2, 3).transpose(1, 0, 2)
         turns, orientations = np.array(rotations).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
-        roots = np.linalg.inv(np.linalg.cholesky(np.array(noise[0] + noise[1])))
+        covariances: FloatArray = np.array(noise[0] + noise[1])
+        roots: FloatArray = np.linalg.inv(np.linalg.cholesky(covariances))
         given = order[0] + order[1]
-        return _Path(places, fixes, turns, orientations, roots, given, centre, level)
+        velocities = np.array([pairs[n].velocity for n in order[0]]).reshape(-1, 3)
+        return _Path(
+            places, fixes, turns, orientations, roots, given, centre, level, velocities, offset
+        )
 
     def start(self) -> gtsam.Pose3 | None:
         """A motion to begin with; None if the fixes tell none."""
         if len(self.turns) < _MIN_ORIENTATIONS:
             try:
-                alignment = "yaw" if self.level else "se3"
-                found = Similarity.of_positions(self.fixes, self.places, alignment)
+                found = Similarity.of_positions(
+                    self.fixes, self.places, "yaw" if self.level else "se3"
+                )
             except DataError:
                 return None
             return gtsam.Pose3(gtsam.Rot3(found.rotation), found.translation)
@@ -211,36 +241,58 @@ class _Path:
             least = min(2, len(among))
         return bool(np.count_nonzero(among) >= max(least, _LEAST_SHARE * len(among)))
 
-    def residuals(self, motion: gtsam.Pose3) -> FloatArray:
-        """(N, 3) what was measured beyond the moved path, m or rad, not whitened."""
+    def residuals(self, motion: gtsam.Pose3, late: float) -> FloatArray:
+        """(N, 3) what was measured beyond the moved path, m or rad, not whitened.
+
+        Args:
+            motion: of the world.
+            late: time that is added to the fixes, s.
+        """
         turned = motion.rotation().matrix() @ self.turns
         off = Rotation.from_matrix(self.orientations @ turned.transpose(0, 2, 1)).as_rotvec()
-        return np.concatenate([self.fixes - _moved(motion, self.places), off.reshape(-1, 3)])
+        moved = _moved(motion, self.places + late * self.velocities)
+        return np.concatenate([self.fixes - moved, off.reshape(-1, 3)])
 
-    def distances(self, motion: gtsam.Pose3) -> FloatArray:
+    def distances(self, motion: gtsam.Pose3, late: float) -> FloatArray:
         """Residuals (N,) in σ."""
-        white = np.einsum("nij,nj->ni", self.roots, self.residuals(motion))
+        white = np.einsum("nij,nj->ni", self.roots, self.residuals(motion, late))
         return np.asarray(np.linalg.norm(white, axis=1))
 
-    def step(self, motion: gtsam.Pose3, weights: FloatArray) -> tuple[gtsam.Pose3, FloatArray]:
-        """One Gauss-Newton step, and the information (4, 4) or (6, 6) on the gauge."""
-        moved, axes = _moved(motion, self.places), turned_axes(self.level)
-        middle, count = _moved(motion, self.centre[None])[0], len(moved)
-        J = np.zeros((len(weights), 3, 3 + len(axes)))
+    def step(
+        self, motion: gtsam.Pose3, late: float, weights: FloatArray
+    ) -> tuple[gtsam.Pose3, float, FloatArray]:
+        """One Gauss-Newton step, and the information on the gauge, and on the time if it is open.
+
+        Args:
+            motion: of the world.
+            late: time that is added to the fixes, s.
+            weights: (N,) of the fixes.
+        """
+        moved, axes = _moved(motion, self.places + late * self.velocities), turned_axes(self.level)
+        middle, count, turned = _moved(motion, self.centre[None])[0], len(moved), 3 + len(axes)
+        timed = self.offset[1] > 0.0
+        J = np.zeros((len(weights), 3, turned + timed))
         J[:count, :, :3] = np.eye(3)
-        J[:count, :, 3:] = np.cross(axes, (moved - middle)[:, None]).transpose(0, 2, 1)
-        J[count:, :, 3:] = axes.T
+        J[:count, :, 3:turned] = np.cross(axes, (moved - middle)[:, None]).transpose(0, 2, 1)
+        J[count:, :, 3:turned] = axes.T
+        if timed:
+            J[:count, :, turned] = self.velocities @ motion.rotation().matrix().T
         roots = np.sqrt(weights)[:, None, None] * self.roots
         white = (roots @ J).reshape(-1, J.shape[2])
-        right = np.einsum("nij,nj->ni", roots, self.residuals(motion)).reshape(-1)
+        right = np.einsum("nij,nj->ni", roots, self.residuals(motion, late)).reshape(-1)
+        known, of_known = np.zeros((4, J.shape[2])), np.zeros(4)
         if not count:
-            stays = np.eye(3, J.shape[2]) / _KEPT_SIGMA_M
-            white, right = np.vstack([white, stays]), np.concatenate([right, np.zeros(3)])
+            known[:3, :3] = np.eye(3) / _KEPT_SIGMA_M
+        if timed:
+            known[3, -1] = 1.0 / self.offset[1]
+            of_known[3] = (self.offset[0] - late) / self.offset[1]
+        white, right = np.vstack([white, known]), np.concatenate([right, of_known])
         delta = np.linalg.lstsq(white, right, rcond=None)[0]
-        turn = gtsam.Rot3.Expmap(axes.T @ delta[3:])
+        turn = gtsam.Rot3.Expmap(axes.T @ delta[3:turned])
         # x -> turn (x - middle) + middle + shift
         shift = middle + delta[:3] - turn.rotate(middle)
-        return gtsam.Pose3(turn, shift).compose(motion), white.T @ white
+        late += float(delta[-1]) if timed else 0.0
+        return gtsam.Pose3(turn, shift).compose(motion), late, white.T @ white
 
 
 def _moved(motion: gtsam.Pose3, places: FloatArray) -> FloatArray:

@@ -289,6 +289,7 @@ def _read_poses(
     good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     good &= (measured | unknown).all(axis=1) & measured.any(axis=1)
     good &= (table["sigma"] > 0).all(axis=1)
+    good = np.asarray(good, np.bool_)
     table = table[kept_of(table["stamp"], good, "poses_dropped", f"{path}: pose", diagnostics)]
     return table["stamp"], table["position"], table["quaternion"], table["sigma"]
 
