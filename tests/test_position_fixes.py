@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph import run
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.fix_factors import FixGate, fix_factor
+from slam_graph.backend.aiding.fix_factors import FixGate, PositionFix
 from slam_graph.backend.aiding.regauging import gauge_directions, with_free_gauge
-from slam_graph.backend.aiding.world_alignment import align_world
+from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import dims_of
 from slam_graph.datasets import TrackRecorder, open_dataset
@@ -76,7 +76,7 @@ def random_pose(rng: np.random.Generator) -> gtsam.Pose3:
 
 def test_the_jacobian_of_a_fix_is_the_numerical_one() -> None:
     rng, arm = np.random.default_rng(3), np.array([0.3, -0.2, 1.1])
-    factor = fix_factor(X(0), rng.normal(size=3), np.diag([1.0, 2.0, 4.0]), arm)
+    factor = PositionFix(0, rng.normal(size=3), np.diag([1.0, 2.0, 4.0]), arm).factor(X(0))
     values = gtsam.Values()
     values.insert(X(0), random_pose(rng))
     A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
@@ -130,6 +130,20 @@ def test_a_free_gauge_adds_its_covariance() -> None:
 # --- alignment and gate --------------------------------------------------------------------------
 
 
+def aligned(places: FloatArray, fixes: FloatArray, level: bool) -> WorldAlignment | None:
+    """The world of fixes (N, 3) of 1 m along a path."""
+    pairs = [
+        PathFix(fix_of(fix), gtsam.Pose3(gtsam.Rot3(), place))
+        for place, fix in zip(places, fixes, strict=True)
+    ]
+    return align_world(pairs, places[-1], level)
+
+
+def fix_of(position: FloatArray) -> PositionFix:
+    """A fix of 1 m of the origin of the body."""
+    return PositionFix(0, position, np.eye(3), np.zeros(3))
+
+
 @pytest.mark.parametrize("level", [True, False])
 def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> None:
     """NEES of the gauge over 40 draws within its 99.9 % bounds; none is lost to outliers."""
@@ -143,8 +157,7 @@ def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> N
         wrong = rng.random(len(fixes)) < 0.2
         angles = rng.uniform(0, 2 * np.pi, len(fixes))
         fixes[wrong, :2] += 10.0 * np.column_stack([np.cos(angles), np.sin(angles)])[wrong]
-        ones = np.tile(np.eye(3), (len(fixes), 1, 1))
-        found = align_world(places, fixes, ones, places[-1], level)
+        found = aligned(places, fixes, level)
         assert found is not None
         assert not found.fits[wrong].any()
         error = truth.compose(found.motion.inverse())
@@ -159,26 +172,46 @@ def test_the_world_is_found_among_multipath_as_well_as_it_says(level: bool) -> N
 def test_a_straight_line_does_not_tell_the_world_without_gravity() -> None:
     rng = np.random.default_rng(7)
     places = np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)])
-    ones = np.tile(np.eye(3), (60, 1, 1))
     noisy = places + rng.normal(size=places.shape)
-    assert align_world(places, noisy, ones, places[-1], False) is None
-    assert align_world(places, noisy, ones, places[-1], True) is not None
+    assert aligned(places, noisy, level=False) is None
+    assert aligned(places, noisy, level=True) is not None
+
+
+def test_a_clock_that_is_off_is_found_as_well_as_it_says() -> None:
+    """NEES of world and offset over 40 draws of fixes that come late by an unknown time."""
+    rng, squares = np.random.default_rng(9), []
+    way = np.linspace(0.0, 2 * np.pi, 60)
+    places = np.column_stack([60 * np.cos(way), 40 * np.sin(2 * way), np.zeros(60)])
+    speeds = np.column_stack([-60 * np.sin(way), 80 * np.cos(2 * way), np.zeros(60)]) / 5.0
+    for _ in range(40):
+        late = 0.2 * rng.normal()
+        truth = gtsam.Pose3(gtsam.Rot3.Yaw(rng.normal()), 100.0 * rng.normal(size=3))
+        exact = np.asarray(truth.transformFrom((places + late * speeds).T)).T
+        pairs = [
+            PathFix(
+                fix_of(fix + rng.normal(size=3)), gtsam.Pose3(gtsam.Rot3(), place), velocity=speed
+            )
+            for fix, place, speed in zip(exact, places, speeds, strict=True)
+        ]
+        found = align_world(pairs, places[-1], True, (0.0, 0.2))
+        assert found is not None
+        squares.append(((found.offset_s - late) / found.offset_sigma_s) ** 2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=3.3 * np.sqrt(2 / 40))
 
 
 def test_the_gate_rejects_multipath_and_few_good_fixes() -> None:
     rng, gate, pose = np.random.default_rng(8), FixGate(), gtsam.Pose3()
-    known, noise, arm = 0.01 * np.eye(6), np.eye(3), np.zeros(3)
-    good = [gate.weight(pose, known, rng.normal(size=3), noise, arm) for _ in range(400)]
+    known = 0.01 * np.eye(6)
+    good = [gate.weight(fix_of(rng.normal(size=3)), pose, known) for _ in range(400)]
     assert np.mean(np.array(good) == 0.0) < 0.01
     assert np.mean(good) > 0.95
     for _ in range(2):
-        assert gate.weight(pose, known, np.array([10.0, 0.0, 0.0]), noise, arm) == 0.0
+        assert gate.weight(fix_of(np.array([10.0, 0.0, 0.0])), pose, known) == 0.0
 
 
 def test_the_gate_gives_in_if_all_fixes_say_the_same() -> None:
     gate, pose, there = FixGate(), gtsam.Pose3(), np.array([30.0, 0.0, 0.0])
-    known, noise, arm = 0.01 * np.eye(6), np.eye(3), np.zeros(3)
-    weights = [gate.weight(pose, known, there, noise, arm) for _ in range(12)]
+    weights = [gate.weight(fix_of(there), pose, 0.01 * np.eye(6)) for _ in range(12)]
     assert weights[0] == 0.0
     assert weights[-1] > 0.0
 
@@ -264,6 +297,17 @@ def test_a_drive_ends_in_the_world_of_the_fixes(algorithm: str) -> None:
     assert result.metrics["world"]["of_fixes"]
     assert len(result.trajectory) > 590  # what came before the alignment is not lost
     assert error_m(result, sequence) < 1.5
+
+
+@pytest.mark.parametrize(("given", "sigma"), [(-0.3, 0.0), (0.0, 0.3)])
+def test_fixes_that_come_late_count_where_they_were_measured(given: float, sigma: float) -> None:
+    """By an offset that is given, or found; neglected, it is 3 m on the road."""
+    sequence = drive(30.0, rate_hz=10.0, gnss={"sigma_m": 0.3, "rate_hz": 2.0, "late_s": 0.3})
+    gnss = {"gnss": {"time_offset_s": given, "time_offset_sigma_s": sigma}}
+    result = run(sequence, algorithm="msckf", backend=gnss, **CAUSAL_ONLY)
+    assert result.georeferenced
+    assert given + result.fix_offset_s == pytest.approx(-0.3, abs=0.06)
+    assert error_m(result, sequence) < 0.6
 
 
 def test_fixes_bound_the_error_of_odometry_that_drifts() -> None:

@@ -273,6 +273,24 @@ class GnssConfig(Settings):
     time_offset_s: float = expert(0.0, ge=-10, le=10)
     """Added to the times of the fixes to get them on the clock of the IMU, or of the cameras where
     there is no IMU."""
+    time_offset_sigma_s: float = expert(0.0, ge=0, le=1)
+    """How well that offset is known, in seconds. Above zero it is estimated from the path, together
+    with the world of the fixes."""
+
+
+class KnownPosesConfig(Settings):
+    """Known poses: of a motion-capture system, another estimator, or fiducial tags."""
+
+    enabled: bool = expert(True)
+    """Use the known poses of the recording, and report the trajectory in their world. Switch it off
+    to compare."""
+    lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
+    """Position in the body frame of the sensor whose poses are known, in metres."""
+    quaternion: tuple[float, float, float, float] = expert((0.0, 0.0, 0.0, 1.0))
+    """Orientation of that sensor in the body frame, body_R_sensor as x y z w."""
+    time_offset_s: float = expert(0.0, ge=-10, le=10)
+    """Added to the times of the poses to get them on the clock of the IMU, or of the cameras where
+    there is no IMU."""
 
 
 class OdometryConfig(Settings):
@@ -298,6 +316,8 @@ class BackendConfig(Settings):
     """What predicts the state from frame to frame."""
     gnss: GnssConfig = GnssConfig()
     """Position fixes."""
+    known_poses: KnownPosesConfig = KnownPosesConfig()
+    """Known poses."""
     odometry: OdometryConfig = OdometryConfig()
     """Odometry of wheels or legs."""
     noise: NoiseConfig = NoiseConfig()

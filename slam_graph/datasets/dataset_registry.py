@@ -50,7 +50,7 @@ class Format:
     fallback: bool = False
 
 
-_AIDING = ("gnss", "odometry", MASKS)
+_AIDING = ("gnss", "poses", "odometry", MASKS)
 """Sensors that any recording may have, or a file beside it."""
 
 
@@ -127,7 +127,8 @@ def open_dataset(
         diagnostics: where faults are counted.
         sources: where each sensor is, in formats that leave it open: topics of a ROS bag or files
             beside a video, e.g. ``{"imu": "/imu0", "cam0": "/cam0/image_raw"}``; in every format
-            the files or topics of ``gnss`` and ``odometry``, and the folder of ``masks``.
+            the files or topics of ``gnss`` and ``odometry``, the file of ``poses``, and the folder
+            of ``masks``.
         faults: to put into it on purpose, such as ``imu_missing:at_s=6,duration_s=1``.
         imu: False to read it as if it had no IMU.
 

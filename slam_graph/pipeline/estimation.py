@@ -165,6 +165,7 @@ class Estimation:
             tracked.clock.milliseconds,
             tracked.frame_stats,
             estimator.aiding.aligned,
+            estimator.aiding.offset_s,
         )
         self._note(frame, tracked)
         return frame
@@ -209,6 +210,7 @@ class Estimation:
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
             result.georeferenced = estimator.aiding.aligned
+            result.fix_offset_s = estimator.aiding.offset_s
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
         if state is not None:

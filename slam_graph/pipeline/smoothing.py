@@ -62,6 +62,7 @@ class Smoothing(Stage):
             aiding = packet.aiding if self._log.rig.has_scale else None
             self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
             self._log.georeferenced = frame.georeferenced
+            self._log.fix_offset_s = frame.fix_offset_s
         except (OSError, SlamGraphError) as error:
             self._give_up(error)
 

@@ -56,6 +56,7 @@ class EstimatedFrame:
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
         georeferenced: whether the world of the estimate is that of position fixes.
+        fix_offset_s: time that was found to be missing from those of the fixes.
         objects: what moves; None where moving objects are not estimated.
     """
 
@@ -73,6 +74,7 @@ class EstimatedFrame:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
     georeferenced: bool = False
+    fix_offset_s: float = 0.0
     objects: ObjectFrame | None = None
 
     @property

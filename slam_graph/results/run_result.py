@@ -61,6 +61,7 @@ class RunResult(RunSummary):
         segments: stretches of it, each from a start to where the estimate was lost.
         start_was_given: whether the first state came with the data, in the world of the truth.
         georeferenced: whether the world is that of the position fixes.
+        fix_offset_s: time that was found to be missing from those of the fixes.
         corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
         logs: what was noted at every frame.
@@ -79,6 +80,7 @@ class RunResult(RunSummary):
     segments: Segments = field(default_factory=Segments)
     start_was_given: bool = False
     georeferenced: bool = False
+    fix_offset_s: float = 0.0
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
     logs: RunLogs = field(default_factory=RunLogs)
@@ -253,7 +255,11 @@ class RunResult(RunSummary):
                 "algorithm": self.config.algorithm.name,
                 "cameras": len(asked.rig.cameras),
                 "seed": self.config.seed,
-                "world": {"of_fixes": self.georeferenced, "datum": asked.datum},
+                "world": {
+                    "of_fixes": self.georeferenced,
+                    "datum": asked.datum,
+                    "fix_offset_s": self.fix_offset_s,
+                },
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(
                     self.segments, self.trajectory, truth, self.history.has_scale

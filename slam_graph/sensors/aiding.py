@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements that aid cameras and IMU: position fixes (GNSS) and odometry of wheels or legs.
+"""Measurements that aid cameras and IMU: position fixes (GNSS), known poses, odometry of wheels.
 
-Both are few beside images and samples of an IMU, and come with the packet of the first frame that
+All are few beside images and samples of an IMU, and come with the packet of the first frame that
 is not earlier. Their times are on the clock of the IMU, or of the cameras where there is no IMU.
 """
 
@@ -22,7 +22,7 @@ _MAX_ODOMETRY_GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AidingData:
-    """Position fixes and odometry of a stretch of time.
+    """Position fixes, known poses and odometry of a stretch of time.
 
     Attributes:
         fix_stamps_ns: (N,) int64, ascending.
@@ -34,6 +34,11 @@ class AidingData:
         odometry_stamps_ns: (M,) int64, ascending.
         odometry_positions: (M, 3) of the body in the frame of the odometry, which drifts, m.
         odometry_quaternions: (M, 4) its orientation there, x y z w.
+        pose_stamps_ns: (K,) int64, ascending; of known poses.
+        pose_positions: (K, 3) of their sensor in the world of the fixes, m.
+        pose_quaternions: (K, 4) its orientation there, x y z w.
+        pose_sigmas: (K, 6) standard deviations along and about the axes of the world: position (m),
+            then orientation (rad); infinite where the three of either were not measured.
     """
 
     fix_stamps_ns: IntArray
@@ -43,13 +48,18 @@ class AidingData:
     odometry_stamps_ns: IntArray
     odometry_positions: FloatArray
     odometry_quaternions: FloatArray
+    pose_stamps_ns: IntArray
+    pose_positions: FloatArray
+    pose_quaternions: FloatArray
+    pose_sigmas: FloatArray
 
     @staticmethod
     def empty() -> AidingData:
         """Nothing."""
         none = np.zeros(0, np.int64)
         fixes = none, np.zeros((0, 3)), np.zeros((0, 3, 3))
-        return AidingData(*fixes, None, none, np.zeros((0, 3)), np.zeros((0, 4)))
+        poses = none, np.zeros((0, 3)), np.zeros((0, 4))
+        return AidingData(*fixes, None, *poses, *poses, np.zeros((0, 6)))
 
     @staticmethod
     def of_fixes(
@@ -78,14 +88,39 @@ class AidingData:
             odometry_quaternions=quaternions,
         )
 
+    def with_poses(
+        self,
+        stamps_ns: IntArray,
+        positions: FloatArray,
+        quaternions: FloatArray,
+        sigmas: FloatArray,
+    ) -> AidingData:
+        """The same with known poses; see the attributes."""
+        return replace(
+            self,
+            pose_stamps_ns=stamps_ns,
+            pose_positions=positions,
+            pose_quaternions=quaternions,
+            pose_sigmas=sigmas,
+        )
+
     def without_fixes(self) -> AidingData:
-        """The odometry alone."""
+        """The same without position fixes."""
         names = "fix_stamps_ns", "fix_positions", "fix_covariances"
         return replace(self, **{name: getattr(self, name)[:0] for name in names})
 
+    def without_poses(self) -> AidingData:
+        """The same without known poses."""
+        none = AidingData.empty()
+        return self.with_poses(
+            none.pose_stamps_ns, none.pose_positions, none.pose_quaternions, none.pose_sigmas
+        )
+
     def __len__(self) -> int:
-        """Number of fixes and of samples of odometry."""
-        return len(self.fix_stamps_ns) + len(self.odometry_stamps_ns)
+        """Number of fixes, of known poses and of samples of odometry."""
+        return sum(
+            len(part) for part in (self.fix_stamps_ns, self.pose_stamps_ns, self.odometry_stamps_ns)
+        )
 
     @staticmethod
     def concatenate(parts: Iterable[AidingData]) -> AidingData:
@@ -108,6 +143,7 @@ class AidingData:
             return inside
 
         fixes, odometry = rows(self.fix_stamps_ns), rows(self.odometry_stamps_ns)
+        poses = rows(self.pose_stamps_ns)
         return AidingData(
             self.fix_stamps_ns[fixes],
             self.fix_positions[fixes],
@@ -116,11 +152,19 @@ class AidingData:
             self.odometry_stamps_ns[odometry],
             self.odometry_positions[odometry],
             self.odometry_quaternions[odometry],
+            self.pose_stamps_ns[poses],
+            self.pose_positions[poses],
+            self.pose_quaternions[poses],
+            self.pose_sigmas[poses],
         )
 
-    def shifted(self, fixes_ns: int) -> AidingData:
-        """The same with fixes that are later by so much."""
-        return replace(self, fix_stamps_ns=self.fix_stamps_ns + fixes_ns)
+    def shifted(self, fixes_ns: int, poses_ns: int = 0) -> AidingData:
+        """The same with fixes, and known poses, that are later by so much."""
+        return replace(
+            self,
+            fix_stamps_ns=self.fix_stamps_ns + fixes_ns,
+            pose_stamps_ns=self.pose_stamps_ns + poses_ns,
+        )
 
     def odometry_between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """How the body moved by its odometry; None where that does not cover both times.

@@ -109,12 +109,10 @@ class SimulatedSequence(RecordedSequence):
         return self.flight.imu.blocks(after_ns)
 
     def read_aiding(self) -> AidingData:
-        """Position fixes and odometry, as far as there are any."""
-        stamps, config = self.flight.exposures_ns, self.config
+        """Position fixes, known poses and odometry, as far as there are any."""
+        stamps = self.flight.exposures_ns
         span_ns = int(stamps[0]), int(stamps[-1])
-        return simulated_aiding(
-            self.flight.motion, span_ns, config.gnss, config.odometry, config.seed
-        )
+        return simulated_aiding(self.flight.motion, span_ns, self.config)
 
     def groundtruth(self) -> Trajectory:
         """The ground truth at the times of the frames, on the clock of the IMU."""

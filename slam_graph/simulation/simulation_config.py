@@ -161,6 +161,25 @@ class SimulatedGnssConfig(Settings):
     lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
     """Position of the antenna in the body frame, in metres; a run must be told the same
     (`backend.gnss.lever_arm_m`)."""
+    late_s: float = expert(0.0, ge=-10, le=10)
+    """How much later the fixes are stamped than they were measured, in seconds."""
+
+
+class SimulatedPosesConfig(Settings):
+    """Simulated known poses of a sensor on the body; their world is that of the ground truth."""
+
+    position_sigma_m: float | None = expert(None, gt=0)
+    """Standard deviation of the position on each axis, in metres; not measured if not given."""
+    rotation_sigma_rad: float | None = expert(None, gt=0)
+    """The same of the orientation about each axis, in rad."""
+    rate_hz: float = expert(5.0, gt=0)
+    """Poses per second."""
+    outliers: float = expert(0.0, ge=0, lt=1)
+    """Share of poses that are off by a metre, and by a rad, in any direction."""
+    lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
+    """Position of the sensor in the body frame, in metres; a run must be told the same."""
+    quaternion: tuple[float, float, float, float] = expert((0.0, 0.0, 0.0, 1.0))
+    """Orientation of the sensor in the body frame, x y z w; a run must be told the same."""
 
 
 class SimulatedOdometryConfig(Settings):
@@ -295,6 +314,8 @@ class SimulationConfig(Settings):
     """A board that moves in front of the cameras, in rendered images; none if not given."""
     gnss: SimulatedGnssConfig = SimulatedGnssConfig()
     """Position fixes."""
+    known_poses: SimulatedPosesConfig = SimulatedPosesConfig()
+    """Known poses."""
     odometry: SimulatedOdometryConfig = SimulatedOdometryConfig()
     """Odometry of wheels."""
     objects: SimulatedObjectsConfig = SimulatedObjectsConfig()

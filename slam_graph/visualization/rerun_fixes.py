@@ -112,7 +112,7 @@ class FixViews:
             offset_ns = round(estimator.config.gnss.time_offset_s * 1e9)
             later = AidingData.of_fixes(*fixes).shifted(offset_ns)
             self._waiting = AidingData.concatenate([self._waiting, later])
-        gate = estimator.aiding.gate
+        gate = estimator.aiding.gates["gnss"]
         counts = np.array([gate.tested, gate.rejected])
         tested, rejected = (counts - self._counts).tolist()
         self._counts = counts

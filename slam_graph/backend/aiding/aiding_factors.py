@@ -1,23 +1,30 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Position fixes and odometry on their way into the cost of each step.
+"""Fixes, known poses and odometry on their way into the cost of each step.
 
-The estimator begins in a world of its own. It waits until the fixes along its path tell where that
-world is (`world_alignment.py`), and moves everything there once. From then on each fix is a factor
-at the frame that follows it. Odometry is a factor between consecutive frames from the beginning.
+The estimator begins in a world of its own. It waits until the absolute measurements along its path
+tell where that world is (`world_alignment.py`), and moves everything there once. From then on each
+of them is a factor at the frame that follows it. Odometry is a factor between consecutive frames
+from the beginning.
 """
 
 from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.estimated_path import EstimatedPath, variances_of
 from slam_graph.backend.aiding.fix_factors import (
+    Fix,
     FixGate,
-    antenna,
-    between_poses,
-    fix_factor,
+    PositionFix,
+    fixes_of,
+    on_the_clock,
+    pose_between,
     pose_key,
 )
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
@@ -29,14 +36,16 @@ from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData
 
-_MOST_PAIRS = 300
+_MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
+_TIMINGS = 3
+"""Alignments, each at the times that the one before has found."""
 _HISTORY_NS = 5_000_000_000
-"""How long what was measured is kept."""
+"""How long odometry and states are kept."""
 
 
 class Aiding:
-    """Takes fixes and odometry, and makes factors of them.
+    """Takes fixes, known poses and odometry, and makes factors of them.
 
     Args:
         config: settings.
@@ -45,31 +54,30 @@ class Aiding:
     Attributes:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
+        gates: of the sources of fixes, by name.
+        offset_s: time that was found to be missing from those of position fixes.
     """
 
     def __init__(self, config: BackendConfig, level: bool) -> None:
         self._config, self._level = config, level
-        self._arm = np.array(config.gnss.lever_arm_m)
-        self._offset_ns = round(config.gnss.time_offset_s * 1e9)
         self._data = AidingData.empty()
-        self.gate, self.used = FixGate(), False
+        self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
+        self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self.restart()
 
     def restart(self) -> None:
         """The estimate begins anew, in another world."""
         self.aligned = False
-        self._states: list[NavState] = []
+        self._path = EstimatedPath()
         self._waiting = AidingData.empty()
-        self._pairs: list[tuple[FloatArray, FloatArray, FloatArray, float]] = []
+        self._fixes: list[Fix] = []
 
     def add(self, data: AidingData) -> None:
         """Take measurements that follow those before; none say that there will be some."""
         self.used = True
-        if not self._config.gnss.enabled:
-            data = data.without_fixes()
-        self._data = AidingData.concatenate([self._data, data.shifted(self._offset_ns)])
-        if len(data.fix_stamps_ns) and not self.aligned:
-            self._waiting = AidingData.concatenate([self._waiting, data.shifted(self._offset_ns)])
+        data = on_the_clock(data, self._config).shifted(round(self.offset_s * 1e9))
+        self._data = AidingData.concatenate([self._data, data])
+        self._waiting = AidingData.concatenate([self._waiting, data])
 
     # --- factors ---------------------------------------------------------------------------------
 
@@ -97,18 +105,34 @@ class Aiding:
                 factors.append(odometry_factor(frames, moved, self._config.odometry))
         if not self.aligned:
             return factors
-        fixes = self._data.within(*stamps_ns)
-        for k, stamp_ns in enumerate(fixes.fix_stamps_ns.tolist()):
-            share = (stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
-            ahead = antenna(last, self._arm) - between_poses((first, last), share, self._arm)
-            position, covariance = fixes.fix_positions[k] + ahead, fixes.fix_covariances[k]
-            weight = 1.0
-            if known is not None:
-                weight = self.gate.weight(last, known, position, covariance, self._arm)
+        for fix in self._due(stamps_ns[1]):
+            share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
+            then = (
+                pose_between(first, last, share) if share > 0.0 else self._path.pose(fix.stamp_ns)
+            )
+            if then is None:
+                continue
+            here = self._of_unsure_time(fix.moved(then, last), (first, last), stamps_ns)
+            weight = 1.0 if known is None else self.gates[fix.source].weight(here, last, known)
             if weight > 0.0:
-                key = pose_key(frames[1])
-                factors.append(fix_factor(key, position, covariance / weight, self._arm))
+                factors.append(here.factor(pose_key(frames[1]), weight))
         return factors
+
+    def _due(self, stamp_ns: int) -> list[Fix]:
+        """The fixes up to a time that were not taken yet."""
+        due = self._waiting.within(None, stamp_ns)
+        self._waiting = self._waiting.within(stamp_ns, None)
+        return fixes_of(due, self._config)
+
+    def _of_unsure_time(
+        self, fix: Fix, poses: tuple[gtsam.Pose3, gtsam.Pose3], stamps_ns: tuple[int, int]
+    ) -> Fix:
+        """A fix with the noise that an offset of its clock which is not known well adds."""
+        if not isinstance(fix, PositionFix) or not fix.is_timed or self._offset_sigma_s == 0.0:
+            return fix
+        velocity = (fix.of(poses[1]) - fix.of(poses[0])) / ((stamps_ns[1] - stamps_ns[0]) * 1e-9)
+        along = self._offset_sigma_s * velocity
+        return replace(fix, covariance=fix.covariance + np.outer(along, along))
 
     def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
         """A predicted state where the odometry has it; None without odometry of this time.
@@ -133,47 +157,36 @@ class Aiding:
         Args:
             state: of the newest frame; None without one.
         """
-        if state is None or not self.used or self.aligned:
+        if state is None or not self.used or not self._path.append(state):
             return None
-        if self._states and state.stamp_ns <= self._states[-1].stamp_ns:
+        if self.aligned:  # for fixes that come late
+            if state.stamp_ns - self._path.states[0].stamp_ns > 2 * _HISTORY_NS:
+                self._path.forget_before(state.stamp_ns - _HISTORY_NS)
             return None
-        self._states.append(state)
-        if not self._pair(state):
-            return None
-        columns = zip(*self._pairs, strict=True)
-        places, fixes, covariances, known = (np.array(column) for column in columns)
-        # older fixes tell less of the world: the path has drifted since
-        drift = np.maximum(_variance(state) - known, 0.0)
-        covariances = covariances + drift[:, None, None] * np.eye(3)
-        now = np.asarray(state.world_T_body.translation())
-        return align_world(places, fixes, covariances, now, self._level)
+        due = self._due(state.stamp_ns)
+        self._fixes = [*self._fixes, *due][-_MOST_FIXES:]
+        return self._aligned(state) if due else None
 
-    def _pair(self, state: NavState) -> bool:
-        """Note the fixes up to a state with the antenna's place then; whether there are any."""
-        if len(self._states) < 2:
-            self._waiting = self._waiting.within(state.stamp_ns, None)
-            return False
-        before, count = self._states[-2], len(self._pairs)
-        due = self._waiting.within(before.stamp_ns, state.stamp_ns)
-        self._waiting = self._waiting.within(state.stamp_ns, None)
-        poses = before.world_T_body, state.world_T_body
-        for k, stamp_ns in enumerate(due.fix_stamps_ns.tolist()):
-            share = (stamp_ns - before.stamp_ns) / (state.stamp_ns - before.stamp_ns)
-            place = between_poses(poses, share, self._arm)
-            fix, covariance = due.fix_positions[k], due.fix_covariances[k]
-            self._pairs.append((place, fix, covariance, _variance(before)))
-        grew, self._pairs = len(self._pairs) > count, self._pairs[-_MOST_PAIRS:]
-        return grew
+    def _aligned(self, state: NavState) -> WorldAlignment | None:
+        """Where the world is, by the fixes so far."""
+        sigma_s, offset_s = self._config.gnss.time_offset_sigma_s, 0.0
+        now = np.asarray(state.world_T_body.translation())
+        found: WorldAlignment | None = None
+        for _ in range(_TIMINGS if sigma_s > 0.0 else 1):
+            pairs = [self._path.at(fix, round(offset_s * 1e9)) for fix in self._fixes]
+            # older fixes tell less of the world: the path has drifted since
+            drifted = [pair.after_drift(*variances_of(state)) for pair in pairs if pair is not None]
+            found = align_world(drifted, now, self._level, (-offset_s, sigma_s))
+            if found is None:
+                return None
+            offset_s += found.offset_s
+        return replace(found, offset_s=offset_s) if found is not None else None
 
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""
-        states = in_moved_world(self._states, found.motion)
+        states = in_moved_world(self._path.states, found.motion)
         states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
-        self.aligned, self._states, self._pairs = True, [], []
-        self._waiting = AidingData.empty()
+        self.aligned, self._fixes, self._path.states = True, [], list(states)
+        self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s
+        self._waiting = self._waiting.shifted(round(found.offset_s * 1e9))
         return states
-
-
-def _variance(state: NavState) -> float:
-    """Of the position of a state, the sum of its axes, m²."""
-    return 0.0 if state.covariance is None else float(np.trace(state.covariance[3:6, 3:6]))

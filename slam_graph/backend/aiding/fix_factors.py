@@ -1,23 +1,27 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Position fixes as factors: the antenna at a frame is where a fix near it in time says.
+"""Absolute measurements of a sensor on the body as factors: its position, or its orientation.
 
-A fix between two frames is moved to one of them by how far the antenna came in between, which
-images and IMU know to millimetres. The residual is that of GTSAM's `GPSFactorArm`.
+A measurement between two frames is moved to one of them by how far the sensor came and turned in
+between, which images and IMU know to millimetres. The residuals are those of GTSAM's
+`GPSFactorArm` and `PoseRotationPrior3D`. A known pose is both measurements: their errors are
+independent, and a tag whose orientation is ambiguous may still be in the right place.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass, replace
+from typing import ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import chdtri
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.geometry import Trajectory, interpolate
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.sensors import AidingData
 
 _GATE = float(np.sqrt(chdtri(3, 0.001)))
 _HUBER = float(np.sqrt(chdtri(3, 0.05)))
@@ -26,36 +30,131 @@ _CAUCHY = 4.0
 """Width of the Cauchy loss (σ): a good fix counts for 0.84, one that is off by 10 σ for 0.14."""
 _REMEMBERED, _MOST_REJECTED = 10, 7
 """Where more of the last fixes were rejected, not they are wrong but the estimate is."""
-_LONGEST_GAP_S = 1.0
-"""Poses farther apart are not interpolated."""
 
 
-def fix_factor(
-    key: int, position: FloatArray, covariance: FloatArray, arm: FloatArray, robust: bool = False
-) -> gtsam.NoiseModelFactor:
-    """A fix of the antenna at a pose.
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionFix:
+    """A position of a sensor.
 
-    Args:
-        key: of the pose.
-        position: (3,) of the antenna, m.
+    Attributes:
+        stamp_ns: time.
+        position: (3,) in the world, m.
         covariance: (3, 3) of it, m².
-        arm: (3,) of the antenna in the body, m.
-        robust: whether a Cauchy loss lets it count less the farther it is off.
+        arm: (3,) position of the sensor in the body, m.
+        source: what measured it.
     """
+
+    stamp_ns: int
+    position: FloatArray
+    covariance: FloatArray
+    arm: FloatArray
+    source: str = "gnss"
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the time offset of its source may be estimated."""
+        return self.source == "gnss"
+
+    def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> PositionFix:
+        """The same measurement at another pose of the body.
+
+        Args:
+            then: estimated pose of the body at the time of the measurement.
+            now: the pose to which it is moved.
+        """
+        return replace(self, position=self.position + self.of(now) - self.of(then))
+
+    def of(self, pose: gtsam.Pose3) -> FloatArray:
+        """Position (3,) of the sensor in the world, at a pose of the body."""
+        return np.asarray(pose.transformFrom(self.arm))
+
+    def factor(self, key: int, weight: float = 1.0, robust: bool = False) -> gtsam.NoiseModelFactor:
+        """The measurement of a pose.
+
+        Args:
+            key: of the pose.
+            weight: on its information.
+            robust: whether a Cauchy loss lets it count less the farther it is off.
+        """
+        noise = _noise(self.covariance / weight, robust)
+        return gtsam.GPSFactorArm(key, self.position, self.arm, noise)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrientationFix:
+    """An orientation of a sensor.
+
+    Attributes:
+        stamp_ns: time.
+        world_R_body: the orientation of the body that it means.
+        covariance: (3, 3) of a rotation about the axes of the world, rad².
+        source: what measured it.
+    """
+
+    stamp_ns: int
+    world_R_body: gtsam.Rot3
+    covariance: FloatArray
+    source: str = "orientations"
+    is_timed: ClassVar[bool] = False
+
+    def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> OrientationFix:
+        """See `PositionFix`."""
+        turn = then.rotation().between(now.rotation())
+        return replace(self, world_R_body=self.world_R_body.compose(turn))
+
+    def factor(self, key: int, weight: float = 1.0, robust: bool = False) -> gtsam.NoiseModelFactor:
+        """See `PositionFix`."""
+        body_R_world = self.world_R_body.matrix().T
+        covariance = body_R_world @ self.covariance @ body_R_world.T
+        pose = gtsam.Pose3(self.world_R_body, np.zeros(3))
+        return gtsam.PoseRotationPrior3D(key, pose, _noise(covariance / weight, robust))
+
+
+Fix: TypeAlias = PositionFix | OrientationFix
+"""An absolute measurement of a sensor at one time."""
+
+
+def _noise(covariance: FloatArray, robust: bool) -> gtsam.noiseModel.Base:
+    """Gaussian noise of a covariance (3, 3), under a Cauchy loss or not."""
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
     if robust:
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
         noise = gtsam.noiseModel.Robust.Create(cauchy, noise)
-    return gtsam.GPSFactorArm(key, position, arm, noise)
+    return noise
 
 
-def antenna(pose: gtsam.Pose3, arm: FloatArray) -> FloatArray:
-    """Position (3,) of the antenna in the world."""
-    return np.asarray(pose.transformFrom(arm))
+def on_the_clock(data: AidingData, config: BackendConfig) -> AidingData:
+    """Measurements that are used, with the time offsets of their sources added."""
+    if not config.gnss.enabled:
+        data = data.without_fixes()
+    if not config.known_poses.enabled:
+        data = data.without_poses()
+    offsets = config.gnss.time_offset_s, config.known_poses.time_offset_s
+    return data.shifted(*(round(offset * 1e9) for offset in offsets))
+
+
+def fixes_of(data: AidingData, config: BackendConfig) -> list[Fix]:
+    """Absolute measurements of a stretch of time: positions by the fixes, then the known poses."""
+    arm = np.array(config.gnss.lever_arm_m)
+    rows = zip(data.fix_stamps_ns.tolist(), data.fix_positions, data.fix_covariances, strict=True)
+    fixes: list[Fix] = [PositionFix(*row, arm) for row in rows]
+    arm = np.array(config.known_poses.lever_arm_m)
+    x, y, z, w = config.known_poses.quaternion
+    sensor_R_body = gtsam.Rot3.Quaternion(w, x, y, z).inverse()
+    for k, stamp_ns in enumerate(data.pose_stamps_ns.tolist()):
+        of_position, of_rotation = data.pose_sigmas[k].reshape(2, 3)
+        if np.isfinite(of_position).all():
+            covariance = np.diag(of_position**2)
+            fixes.append(PositionFix(stamp_ns, data.pose_positions[k], covariance, arm, "poses"))
+        if np.isfinite(of_rotation).all():
+            x, y, z, w = data.pose_quaternions[k].tolist()
+            turned = gtsam.Rot3.Quaternion(w, x, y, z).compose(sensor_R_body)
+            fixes.append(OrientationFix(stamp_ns, turned, np.diag(of_rotation**2)))
+    return fixes
 
 
 class FixGate:
-    """The χ² gate of fixes, and the loss of those that pass it.
+    """The χ² gate of absolute measurements of three numbers, and the loss of those that pass it.
 
     The innovation decides, under the covariance that the prediction and the fix give it. A fix
     beyond the 95 % sphere counts less (Huber), one beyond the 99.9 % sphere not at all. If most of
@@ -69,27 +168,20 @@ class FixGate:
         self.tested = self.rejected = 0
         self._recent: deque[bool] = deque(maxlen=_REMEMBERED)
 
-    def weight(
-        self,
-        pose: gtsam.Pose3,
-        known: FloatArray,
-        position: FloatArray,
-        covariance: FloatArray,
-        arm: FloatArray,
-    ) -> float:
+    def weight(self, fix: Fix, pose: gtsam.Pose3, known: FloatArray) -> float:
         """Factor on the information of a fix, from 0 to 1.
 
         Args:
+            fix: at this pose.
             pose: predicted, of the body.
             known: (6, 6) its covariance, in the tangent of the pose.
-            position: (3,) measured, of the antenna.
-            covariance: (3, 3) of the measurement.
-            arm: (3,) of the antenna in the body.
         """
-        R = pose.rotation().matrix()
-        H = np.hstack([-R @ gtsam.Rot3.Hat(arm), R])
-        S = H @ known @ H.T + covariance
-        innovation = position - antenna(pose, arm)
+        values = gtsam.Values()
+        values.insert(pose_key(0), pose)
+        # whitened: the innovation has the covariance H P Hᵀ + I
+        whitened = gtsam.JacobianFactor(fix.factor(pose_key(0)).linearize(values))
+        H, innovation = whitened.jacobian()
+        S = H @ known @ H.T + np.eye(3)
         distance = float(np.sqrt(innovation @ np.linalg.solve(S, innovation)))
         rejected = distance > _GATE
         self._recent.append(rejected)
@@ -100,31 +192,10 @@ class FixGate:
         return min(1.0, _HUBER / max(distance, 1e-12))
 
 
-def antenna_path(
-    trajectory: Trajectory, stamps_ns: IntArray, arm: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Positions (N, 3) of the antenna at times (N,), NaN where the trajectory has none, and which.
-
-    Args:
-        trajectory: of the body.
-        stamps_ns: ascending.
-        arm: (3,) of the antenna in the body.
-    """
-    near, valid = interpolate(trajectory, stamps_ns, _LONGEST_GAP_S)
-    places = np.full((len(stamps_ns), 3), np.nan)
-    places[valid] = near.positions + Rotation.from_quat(near.quaternions).apply(arm)
-    return places, valid
-
-
-def between_poses(
-    poses: tuple[gtsam.Pose3, gtsam.Pose3], share: float, arm: FloatArray
-) -> FloatArray:
-    """Position (3,) of the antenna between two poses, at a share of the time from 0 to 1."""
-    first, last = poses
-    ends = Rotation.from_matrix([first.rotation().matrix(), last.rotation().matrix()])
-    turned = Slerp([0.0, 1.0], ends)(share).apply(arm)
-    place: FloatArray = (1.0 - share) * first.translation() + share * last.translation() + turned
-    return place
+def pose_between(first: gtsam.Pose3, last: gtsam.Pose3, share: float) -> gtsam.Pose3:
+    """The pose between two, at a share of the time from 0 to 1."""
+    place = (1.0 - share) * first.translation() + share * last.translation()
+    return gtsam.Pose3(first.rotation().slerp(share, last.rotation()), place)
 
 
 def pose_key(frame: int) -> int:

@@ -1,28 +1,37 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The alignment of the estimator's own world with that of position fixes.
+"""The alignment of the estimator's own world with that of absolute measurements.
 
 Cameras and IMU know neither where they are nor in which direction north is; without an IMU not even
 where down is. Fixes along a path tell it: the motion of the world, in position and yaw or in all
-six degrees of freedom, that brings the path to the fixes. Some fixes are wrong by far (multipath),
-so it is found by graduated non-convexity with the loss of Geman and McClure (Yang, Antonante,
-Tzoumas & Carlone 2020).
+six degrees of freedom, that brings the path to the fixes. A few known orientations tell the
+rotation without a path. Some fixes are wrong by far (multipath, ambiguous tags), so it is found by
+graduated non-convexity with the loss of Geman and McClure (Yang, Antonante, Tzoumas & Carlone
+2020).
+
+The clock of the fixes may be off by a time that is known to some extent only. Then that time is one
+more unknown: a fix that is late by τ is where the path was τ before, along its velocity.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.aiding.fix_factors import Fix, OrientationFix, PositionFix
 from slam_graph.backend.world_gauge import turned_axes
 from slam_graph.errors import DataError
 from slam_graph.geometry import Similarity
 
 MIN_FIXES = 8
-"""Fewer fixes show no outliers among them."""
+"""Fewer positions show no outliers among them."""
+_MIN_ORIENTATIONS = 3
+"""Fewer orientations do not; each of them tells the whole rotation."""
 _LEAST_SHARE = 0.6
 """Part of the fixes that must fit."""
 _ROTATION_SIGMA_RAD = 0.03
@@ -33,6 +42,40 @@ _SHRINKING = 1.4
 """Factor by which the loss comes nearer to that of outliers from one step to the next."""
 _STEPS = 4
 """Gauss-Newton steps at the end."""
+_KEPT_SIGMA_M = 1e-3
+"""Standard deviation of the position of a world that only orientations are known of: it stays."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathFix:
+    """A fix and the estimate at its time.
+
+    Attributes:
+        fix: the measurement.
+        pose: of the body then, in the estimator's own world.
+        position_variance: of that pose, the sum of its axes, m².
+        rotation_variance: the same of its orientation, rad².
+        velocity: (3,) of the sensor there, m/s; zero if the time of the fix is known.
+    """
+
+    fix: Fix
+    pose: gtsam.Pose3
+    position_variance: float = 0.0
+    rotation_variance: float = 0.0
+    velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def after_drift(self, position: float, rotation: float) -> PathFix:
+        """The same with the noise that the drift since then adds.
+
+        Args:
+            position: variance of the position now, as above.
+            rotation: the same of the orientation.
+        """
+        grown = position - self.position_variance
+        if isinstance(self.fix, OrientationFix):
+            grown = rotation - self.rotation_variance
+        noise = self.fix.covariance + max(grown, 0.0) * np.eye(3)
+        return replace(self, fix=replace(self.fix, covariance=noise))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,95 +88,214 @@ class WorldAlignment:
             `world_gauge`: position (m), then yaw or rotation (rad).
         centre: (3,) the point about which the world turns, in the world of the fixes.
         fits: (N,) which fixes fit.
+        offset_s: to be added to the times of fixes with a velocity.
+        offset_sigma_s: its standard deviation; zero if it is known.
     """
 
     motion: gtsam.Pose3
     covariance: FloatArray
     centre: FloatArray
     fits: BoolArray
+    offset_s: float = 0.0
+    offset_sigma_s: float = 0.0
+
+
+def enough_fixes(fixes: Sequence[Fix]) -> bool:
+    """Whether so many fixes may tell a world, with outliers among them."""
+    orientations = sum(isinstance(fix, OrientationFix) for fix in fixes)
+    return len(fixes) - orientations >= MIN_FIXES or orientations >= _MIN_ORIENTATIONS
 
 
 def align_world(
-    places: FloatArray,
-    fixes: FloatArray,
-    covariances: FloatArray,
+    pairs: Sequence[PathFix],
     centre: FloatArray,
     level: bool,
+    offset: tuple[float, float] = (0.0, 0.0),
 ) -> WorldAlignment | None:
     """The motion that brings a path to fixes of it; None as long as they do not tell it.
 
     Args:
-        places: (N, 3) estimated positions of the antenna.
-        fixes: (N, 3) measured ones.
-        covariances: (N, 3, 3) of their differences but for the motion, m².
+        pairs: N fixes with the path; the covariances are those of their differences.
         centre: (3,) the point, in the world of the estimate, about which the world turns.
         level: whether gravity is measured, so that the motion is one in position and yaw.
+        offset: mean and standard deviation of what is to be added to the times of fixes with a
+            velocity, s; it is known if the latter is zero.
     """
-    if len(places) < MIN_FIXES:
+    if not enough_fixes([pair.fix for pair in pairs]):
         return None
-    roots = np.linalg.inv(np.linalg.cholesky(covariances))  # whiten by these
-    try:
-        start = Similarity.of_positions(fixes, places, "yaw" if level else "se3")
-    except DataError:
+    path = _Path.of(pairs, centre, level, offset)
+    motion = path.start()
+    if motion is None:
         return None
-    motion = gtsam.Pose3(gtsam.Rot3(start.rotation), start.translation)
-    distances = _distances(motion, places, fixes, roots)
+    late, distances = offset[0], path.distances(motion, offset[0])
     scale = max(2.0 * float(distances.max() / _WIDTH) ** 2, 1.0)
     while scale > 1.0:  # the loss is nearly quadratic at first
         weights = (scale * _WIDTH**2 / (distances**2 + scale * _WIDTH**2)) ** 2
-        motion, _ = _step(motion, places, fixes, roots, weights, centre, level)
-        distances = _distances(motion, places, fixes, roots)
+        motion, late, _ = path.step(motion, late, weights)
+        distances = path.distances(motion, late)
         scale /= _SHRINKING
     information = np.zeros((4, 4))
     for _ in range(_STEPS):
         fits = distances < _WIDTH
-        if np.count_nonzero(fits) < max(MIN_FIXES, _LEAST_SHARE * len(fits)):
+        if not path.supported(fits):
             return None
-        weights = fits.astype(np.float64)
-        motion, information = _step(motion, places, fixes, roots, weights, centre, level)
-        distances = _distances(motion, places, fixes, roots)
+        motion, late, information = path.step(motion, late, fits.astype(np.float64))
+        distances = path.distances(motion, late)
     if np.linalg.cond(information) > 1e12:
         return None
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    whole = np.asarray(np.linalg.inv(information), np.float64)
+    covariance = whole[:-1, :-1] if offset[1] > 0.0 else whole
+    sigma_s = float(np.sqrt(whole[-1, -1])) if offset[1] > 0.0 else 0.0
     if np.sqrt(np.diag(covariance)[3:].max()) > _ROTATION_SIGMA_RAD:
         return None
-    return WorldAlignment(motion, covariance, _moved(motion, centre[None])[0], fits)
+    fitting = np.zeros(len(fits), np.bool_)
+    fitting[path.order] = fits
+    there = _moved(motion, centre[None])[0]
+    return WorldAlignment(motion, covariance, there, fitting, late, sigma_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Path:
+    """Residuals of N fixes, of which the first P are positions.
+
+    Attributes:
+        places, fixes: (P, 3) estimated and measured positions of the sensor.
+        turns, orientations: (N - P, 3, 3) estimated and measured orientations of the body.
+        roots: (N, 3, 3) whiten the residuals.
+        order: (N,) numbers of the fixes as they were given.
+        centre: (3,) the point about which the world turns, in the estimator's own world.
+        level: whether the motion is one in position and yaw.
+        velocities: (P, 3) of the sensor.
+        offset: see `align_world`.
+    """
+
+    places: FloatArray
+    fixes: FloatArray
+    turns: FloatArray
+    orientations: FloatArray
+    roots: FloatArray
+    order: list[int]
+    centre: FloatArray
+    level: bool
+    velocities: FloatArray
+    offset: tuple[float, float]
+
+    @staticmethod
+    def of(
+        pairs: Sequence[PathFix], centre: FloatArray, level: bool, offset: tuple[float, float]
+    ) -> _Path:
+        """See `align_world`."""
+        positions: list[tuple[FloatArray, FloatArray]] = []
+        rotations: list[tuple[FloatArray, FloatArray]] = []
+        noise: tuple[list[FloatArray], list[FloatArray]] = [], []
+        order: tuple[list[int], list[int]] = [], []
+        for number, pair in enumerate(pairs):
+            fix = pair.fix
+            if isinstance(fix, PositionFix):
+                positions.append((fix.of(pair.pose), fix.position))
+            else:
+                estimated = pair.pose.rotation().matrix()
+                rotations.append((estimated, fix.world_R_body.matrix()))
+            kind = int(isinstance(fix, OrientationFix))
+            noise[kind].append(fix.covariance)
+            order[kind].append(number)
+        places, fixes = np.array(positions).reshape(-1, 2, 3).transpose(1, 0, 2)
+        turns, orientations = np.array(rotations).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
+        covariances: FloatArray = np.array(noise[0] + noise[1])
+        roots: FloatArray = np.linalg.inv(np.linalg.cholesky(covariances))
+        given = order[0] + order[1]
+        velocities = np.array([pairs[n].velocity for n in order[0]]).reshape(-1, 3)
+        return _Path(
+            places, fixes, turns, orientations, roots, given, centre, level, velocities, offset
+        )
+
+    def start(self) -> gtsam.Pose3 | None:
+        """A motion to begin with; None if the fixes tell none."""
+        if len(self.turns) < _MIN_ORIENTATIONS:
+            try:
+                found = Similarity.of_positions(
+                    self.fixes, self.places, "yaw" if self.level else "se3"
+                )
+            except DataError:
+                return None
+            return gtsam.Pose3(gtsam.Rot3(found.rotation), found.translation)
+        turns = Rotation.from_matrix(self.orientations @ self.turns.transpose(0, 2, 1))
+        # the one nearest to the others: a mean would follow ambiguous ones
+        apart = [float(np.median((turn.inv() * turns).magnitude())) for turn in turns]
+        R = turns[int(np.argmin(apart))].as_matrix()
+        if self.level:
+            R = gtsam.Rot3.Yaw(gtsam.Rot3(R).yaw()).matrix()
+        shift = self.centre - R @ self.centre
+        if len(self.places):
+            shift = np.median(self.fixes - self.places @ R.T, axis=0)
+        return gtsam.Pose3(gtsam.Rot3(R), shift)
+
+    def supported(self, fits: BoolArray) -> bool:
+        """Whether enough fixes (N,) fit, of those that tell the rotation."""
+        among = fits[: len(self.places)]
+        least = MIN_FIXES
+        if len(self.turns) >= _MIN_ORIENTATIONS:
+            turned = fits[len(self.places) :]
+            if np.count_nonzero(turned) < max(2, _LEAST_SHARE * len(turned)):
+                return False
+            least = min(2, len(among))
+        return bool(np.count_nonzero(among) >= max(least, _LEAST_SHARE * len(among)))
+
+    def residuals(self, motion: gtsam.Pose3, late: float) -> FloatArray:
+        """(N, 3) what was measured beyond the moved path, m or rad, not whitened.
+
+        Args:
+            motion: of the world.
+            late: time that is added to the fixes, s.
+        """
+        turned = motion.rotation().matrix() @ self.turns
+        off = Rotation.from_matrix(self.orientations @ turned.transpose(0, 2, 1)).as_rotvec()
+        moved = _moved(motion, self.places + late * self.velocities)
+        return np.concatenate([self.fixes - moved, off.reshape(-1, 3)])
+
+    def distances(self, motion: gtsam.Pose3, late: float) -> FloatArray:
+        """Residuals (N,) in σ."""
+        white = np.einsum("nij,nj->ni", self.roots, self.residuals(motion, late))
+        return np.asarray(np.linalg.norm(white, axis=1))
+
+    def step(
+        self, motion: gtsam.Pose3, late: float, weights: FloatArray
+    ) -> tuple[gtsam.Pose3, float, FloatArray]:
+        """One Gauss-Newton step, and the information on the gauge, and on the time if it is open.
+
+        Args:
+            motion: of the world.
+            late: time that is added to the fixes, s.
+            weights: (N,) of the fixes.
+        """
+        moved, axes = _moved(motion, self.places + late * self.velocities), turned_axes(self.level)
+        middle, count, turned = _moved(motion, self.centre[None])[0], len(moved), 3 + len(axes)
+        timed = self.offset[1] > 0.0
+        J = np.zeros((len(weights), 3, turned + timed))
+        J[:count, :, :3] = np.eye(3)
+        J[:count, :, 3:turned] = np.cross(axes, (moved - middle)[:, None]).transpose(0, 2, 1)
+        J[count:, :, 3:turned] = axes.T
+        if timed:
+            J[:count, :, turned] = self.velocities @ motion.rotation().matrix().T
+        roots = np.sqrt(weights)[:, None, None] * self.roots
+        white = (roots @ J).reshape(-1, J.shape[2])
+        right = np.einsum("nij,nj->ni", roots, self.residuals(motion, late)).reshape(-1)
+        known, of_known = np.zeros((4, J.shape[2])), np.zeros(4)
+        if not count:
+            known[:3, :3] = np.eye(3) / _KEPT_SIGMA_M
+        if timed:
+            known[3, -1] = 1.0 / self.offset[1]
+            of_known[3] = (self.offset[0] - late) / self.offset[1]
+        white, right = np.vstack([white, known]), np.concatenate([right, of_known])
+        delta = np.linalg.lstsq(white, right, rcond=None)[0]
+        turn = gtsam.Rot3.Expmap(axes.T @ delta[3:turned])
+        # x -> turn (x - middle) + middle + shift
+        shift = middle + delta[:3] - turn.rotate(middle)
+        late += float(delta[-1]) if timed else 0.0
+        return gtsam.Pose3(turn, shift).compose(motion), late, white.T @ white
 
 
 def _moved(motion: gtsam.Pose3, places: FloatArray) -> FloatArray:
     """Positions (N, 3) after a motion."""
     moved: FloatArray = places @ motion.rotation().matrix().T + motion.translation()
     return moved
-
-
-def _distances(
-    motion: gtsam.Pose3, places: FloatArray, fixes: FloatArray, roots: FloatArray
-) -> FloatArray:
-    """Residuals (N,) in σ."""
-    residuals = fixes - _moved(motion, places)
-    return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", roots, residuals), axis=1))
-
-
-def _step(
-    motion: gtsam.Pose3,
-    places: FloatArray,
-    fixes: FloatArray,
-    roots: FloatArray,
-    weights: FloatArray,
-    centre: FloatArray,
-    level: bool,
-) -> tuple[gtsam.Pose3, FloatArray]:
-    """One Gauss-Newton step, and the information (4, 4) or (6, 6) on the gauge."""
-    moved, axes = _moved(motion, places), turned_axes(level)
-    middle = _moved(motion, centre[None])[0]
-    J = np.zeros((len(places), 3, 3 + len(axes)))
-    J[:, :, :3] = np.eye(3)
-    J[:, :, 3:] = np.cross(axes, (moved - middle)[:, None]).transpose(0, 2, 1)
-    white = np.sqrt(weights)[:, None, None] * np.einsum("nij,njk->nik", roots, J)
-    rows = np.sqrt(weights)[:, None] * np.einsum("nij,nj->ni", roots, fixes - moved)
-    white, right = white.reshape(-1, J.shape[2]), rows.reshape(-1)
-    delta = np.linalg.lstsq(white, right, rcond=None)[0]
-    turn = gtsam.Rot3.Expmap(axes.T @ delta[3:])
-    # x -> turn (x - middle) + middle + shift
-    shift = middle + delta[:3] - turn.rotate(middle)
-    return gtsam.Pose3(turn, shift).compose(motion), white.T @ white

@@ -59,6 +59,7 @@ class FrameLog:
         rig: the calibration with which the frames were undistorted.
         observations: number of all of them.
         georeferenced: whether the causal estimate is in the world of the position fixes.
+        fix_offset_s: time that was found to be missing from those of the fixes.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class FrameLog:
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
         self.observations = 0
-        self.georeferenced = False
+        self.georeferenced, self.fix_offset_s = False, 0.0
 
     @classmethod
     @contextmanager
@@ -158,9 +159,9 @@ class FrameLog:
 
     @cached_property
     def aiding(self) -> AidingData:
-        """Odometry of the whole run, and position fixes if the estimate is in their world."""
-        data = AidingData.concatenate(self._aiding)
-        return data if self.georeferenced else data.without_fixes()
+        """Odometry of the whole run, and fixes and poses if the estimate is in their world."""
+        data = AidingData.concatenate(self._aiding).shifted(round(self.fix_offset_s * 1e9))
+        return data if self.georeferenced else data.without_fixes().without_poses()
 
     @property
     def frames_ns(self) -> IntArray:

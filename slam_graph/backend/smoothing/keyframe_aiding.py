@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Position fixes and odometry between the keyframes of a segment of a recording."""
+"""Fixes, known poses and odometry between the keyframes of a segment of a recording."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.aiding.fix_factors import antenna_path, fix_factor, pose_key
+from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, fixes_of, on_the_clock, pose_key
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
-from slam_graph.backend.aiding.world_alignment import MIN_FIXES
+from slam_graph.backend.aiding.world_alignment import enough_fixes
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.geometry import Trajectory
+from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.sensors import AidingData
+
+_LONGEST_GAP_S = 1.0
+"""Poses farther apart are not interpolated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +28,7 @@ class KeyframeAiding:
     """Factors on keyframes.
 
     Attributes:
-        fixes: of the position; they determine the world of the segment.
+        fixes: absolute ones; they determine the world of the segment.
         odometry: between consecutive keyframes.
         source: what they were made of; None for nothing.
     """
@@ -41,16 +45,16 @@ class KeyframeAiding:
 def aiding_of_keyframes(
     stamps_ns: IntArray, data: AidingData, causal: Trajectory, config: BackendConfig
 ) -> KeyframeAiding:
-    """The factors of fixes and odometry.
+    """The factors of fixes, known poses and odometry.
 
     A fix counts at the nearest keyframe, moved there by the causal estimate. With too few fixes
-    for a world there are none.
+    for a world there are none, and with orientations alone, as nothing tells the position then.
 
     Args:
         stamps_ns: (K,) of the keyframes.
         data: of the recording; fixes only if the causal estimate is in their world.
         causal: the causal estimate.
-        config: lever arm, time offset, noise.
+        config: lever arms, time offsets, noise.
     """
     if not len(data):
         return KeyframeAiding()
@@ -60,25 +64,31 @@ def aiding_of_keyframes(
         moved = data.odometry_between(*ends) if config.odometry.enabled else None
         if moved is not None:
             odometry.append(odometry_factor((k, k + 1), moved, config.odometry))
-    arm = np.array(config.gnss.lever_arm_m)
-    near = data.shifted(round(config.gnss.time_offset_s * 1e9))
-    near = near.within(int(stamps_ns[0]), int(stamps_ns[-1]))
-    if not config.gnss.enabled or len(near.fix_stamps_ns) < MIN_FIXES:
-        return KeyframeAiding((), tuple(odometry), source)
+    near = on_the_clock(data, config).within(int(stamps_ns[0]), int(stamps_ns[-1]))
+    measured = fixes_of(near, config)
+    fixes_ns = np.array([fix.stamp_ns for fix in measured], dtype=np.int64)
     middles = stamps_ns[:-1] + np.diff(stamps_ns) // 2
-    keyframes = np.searchsorted(middles, near.fix_stamps_ns)
-    then, known = antenna_path(causal, near.fix_stamps_ns, arm)
-    at, also = antenna_path(causal, stamps_ns, arm)
-    used = np.flatnonzero(known & also[keyframes])
-    fixes = [
-        fix_factor(
-            pose_key(int(keyframes[n])),
-            near.fix_positions[n] + at[keyframes[n]] - then[n],
-            near.fix_covariances[n],
-            arm,
-            robust=True,
-        )
-        for n in used
-    ]
-    enough = len(fixes) >= MIN_FIXES
-    return KeyframeAiding(tuple(fixes) if enough else (), tuple(odometry), source)
+    keyframes = np.searchsorted(middles, fixes_ns).tolist()
+    then, at = _poses_at(causal, fixes_ns), _poses_at(causal, stamps_ns)
+    used: list[Fix] = []
+    fixes: list[gtsam.NonlinearFactor] = []
+    for fix, pose, k in zip(measured, then, keyframes, strict=True):
+        here = at[k]
+        if pose is not None and here is not None:
+            used.append(fix)
+            fixes.append(fix.moved(pose, here).factor(pose_key(k), robust=True))
+    located = any(isinstance(fix, PositionFix) for fix in used)
+    if not located or not enough_fixes(used):
+        fixes = []
+    return KeyframeAiding(tuple(fixes), tuple(odometry), source)
+
+
+def _poses_at(trajectory: Trajectory, stamps_ns: IntArray) -> list[gtsam.Pose3 | None]:
+    """Poses at times (N,), ascending or not; None where the trajectory has none near."""
+    order = np.argsort(stamps_ns, kind="stable")
+    near, valid = interpolate(trajectory, stamps_ns[order], _LONGEST_GAP_S)
+    poses: list[gtsam.Pose3 | None] = [None] * len(stamps_ns)
+    rotations = Rotation.from_quat(near.quaternions).as_matrix()
+    for n, R, position in zip(order[valid].tolist(), rotations, near.positions, strict=True):
+        poses[n] = gtsam.Pose3(gtsam.Rot3(R), position)
+    return poses

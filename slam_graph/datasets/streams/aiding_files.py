@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of position fixes and odometry beside a recording, and how packets come to carry them.
+"""Files of fixes, known poses and odometry beside a recording, and how packets come to carry them.
 
 ``gnss.csv`` has a row for each fix, with one of these headers:
 
@@ -12,6 +12,11 @@
 
 ``odometry.csv`` has a row for each sample: ``#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw``, the
 pose of the body in the frame of the odometry.
+
+``poses.csv`` has a row for each known pose: ``#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw,
+sigma_x [m],sigma_y [m],sigma_z [m],sigma_rx [rad],sigma_ry [rad],sigma_rz [rad]``, the pose of the
+sensor in the world, and standard deviations along and about the axes of the world. Where the three
+sigmas of position or orientation are ``inf``, that was not measured.
 """
 
 from __future__ import annotations
@@ -30,10 +35,15 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData, Packet
 
-FIXES, ODOMETRY = "gnss.csv", "odometry.csv"
+FIXES, ODOMETRY, POSES = "gnss.csv", "odometry.csv", "poses.csv"
 
 _FIX_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("sigma", "f8", (3,))]
 _ODOMETRY_ROW = [("stamp", "i8"), ("position", "f8", (3,)), ("quaternion", "f8", (4,))]
+_POSE_ROW = [*_ODOMETRY_ROW, ("sigma", "f8", (6,))]
+_POSE_HEADER = (
+    "#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw,sigma_x [m],sigma_y [m],sigma_z [m],"
+    "sigma_rx [rad],sigma_ry [rad],sigma_rz [rad]"
+)
 _LOCAL_HEADER = (
     "#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]"
 )
@@ -51,11 +61,11 @@ _LARGEST = np.array([90.0, 360.0, 1e6])
 def read_aiding(
     folders: Sequence[Path], named: Mapping[str, str], diagnostics: Diagnostics
 ) -> AidingData:
-    """Fixes and odometry in files; nothing where there are none.
+    """Fixes, known poses and odometry in files; nothing where there are none.
 
     Args:
         folders: where the files are looked for.
-        named: files of ``gnss`` and ``odometry`` instead.
+        named: files of ``gnss``, ``poses`` and ``odometry`` instead.
         diagnostics: as for `read_fixes`.
 
     Raises:
@@ -68,6 +78,9 @@ def read_aiding(
         data = read_fixes(fixes, diagnostics)
     if odometry is not None:
         data = data.with_odometry(*_read_odometry(odometry, diagnostics))
+    poses = _find("poses", POSES, folders, named)
+    if poses is not None:
+        data = data.with_poses(*_read_poses(poses, diagnostics))
     return data
 
 
@@ -255,8 +268,34 @@ def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, Floa
     return table["stamp"], table["position"], table["quaternion"]
 
 
+def _read_poses(
+    path: Path, diagnostics: Diagnostics
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Stamps, positions, quaternions and sigmas of the known poses in a file.
+
+    Raises:
+        DataError: if a row cannot be read, or there is none.
+    """
+    what = "stamp [ns], x, y, z, qx, qy, qz, qw, three sigmas [m], three sigmas [rad]"
+    tables = [rows.parse(_POSE_ROW, what) for rows in read_rows(path)]
+    if not tables:
+        raise DataError(f"{path}: no poses in this file")
+    table = np.concatenate(tables)
+    # what was not measured may have any value
+    measured = np.isfinite(table["sigma"]).reshape(-1, 2, 3).all(axis=2)
+    unknown = np.isposinf(table["sigma"]).reshape(-1, 2, 3).all(axis=2)
+    table["position"][unknown[:, 0]], table["quaternion"][unknown[:, 1]] = 0.0, (0, 0, 0, 1)
+    lengths = np.linalg.norm(table["quaternion"], axis=1)
+    good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
+    good &= (measured | unknown).all(axis=1) & measured.any(axis=1)
+    good &= (table["sigma"] > 0).all(axis=1)
+    good = np.asarray(good, np.bool_)
+    table = table[kept_of(table["stamp"], good, "poses_dropped", f"{path}: pose", diagnostics)]
+    return table["stamp"], table["position"], table["quaternion"], table["sigma"]
+
+
 def aiding_texts(data: AidingData) -> dict[str, str]:
-    """The contents of ``gnss.csv`` and ``odometry.csv`` by name; nothing of what there is not."""
+    """The contents of the files above by their names; nothing of what there is not."""
     texts = {}
     if len(data.fix_stamps_ns):
         lines = [] if data.datum is None else [f"{_DATUM} " + ", ".join(map(repr, data.datum))]
@@ -270,6 +309,10 @@ def aiding_texts(data: AidingData) -> dict[str, str]:
         lines = ["#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw"]
         lines += _rows(data.odometry_stamps_ns, numbers)
         texts[ODOMETRY] = "\n".join(lines) + "\n"
+    if len(data.pose_stamps_ns):
+        numbers = np.hstack([data.pose_positions, data.pose_quaternions, data.pose_sigmas])
+        lines = [_POSE_HEADER, *_rows(data.pose_stamps_ns, numbers)]
+        texts[POSES] = "\n".join(lines) + "\n"
     return texts
 
 
