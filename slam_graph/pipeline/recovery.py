@@ -15,7 +15,7 @@ import numpy as np
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.supervision import Agreement, DivergenceError
+from slam_graph.pipeline.agreement import Agreement, DivergenceError
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 
