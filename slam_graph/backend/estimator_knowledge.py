@@ -11,6 +11,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.engine_protocol import Engine, EngineContext
+from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
@@ -27,6 +28,7 @@ class EstimatorKnowledge:
     window: Window | None
     _engine: Engine
     _context: EngineContext
+    _start_up: StartUp
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The joint covariance (n, n) of variables after the last step.
@@ -66,6 +68,11 @@ class EstimatorKnowledge:
         A mean over the cameras.
         """
         return float(np.mean(self._context.pixels.estimate_px))
+
+    @property
+    def start_is_doubtful(self) -> bool:
+        """Whether what follows the start may still contradict it."""
+        return self._start_up.doubtful
 
     @property
     def assumed_noise_px(self) -> float:

@@ -23,12 +23,22 @@ _GOOD_SHARE = 0.05
 """Share of the features that is rejected while an estimate is good: some percent."""
 _LOOKED_BACK = 3.0
 """Tests are kept for so many further intervals, to find the beginning of a disagreement."""
+_BAD_SHARE = 0.9
+"""Share of a lost estimate, at most, however large the limit."""
+_MOST_UNFIT, _SOONER = 0.75, 2.0 / 3.0
+"""Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
+other one. In the first seconds of one camera more of them do not fit, as the scale is found only
+then, than of those that the gate rejects; after a jump it is nearly all of them."""
 _MOST_WAITING = 100
 """Frames that wait for their states, at most."""
 
 
 class DivergenceError(EstimationError):
     """The estimate is beyond what is physically possible, or contradicts the images."""
+
+
+class JumpError(DivergenceError):
+    """The platform is somewhere else, and the IMU has not measured how it came there."""
 
 
 def check_sane(state: NavState, config: RunConfig) -> None:
@@ -83,12 +93,13 @@ class Disagreement:
     a pause, such as blank images, an estimate has time to recover.
 
     Args:
-        config: has the limits.
+        interval_s: over which the share is taken.
+        limit: largest share of an estimate that is not lost.
         what: happened to what was seen, in a message.
     """
 
-    def __init__(self, config: RunConfig, what: str) -> None:
-        self._limits, self._what = config.limits, what
+    def __init__(self, interval_s: float, limit: float, what: str) -> None:
+        self._interval_s, self._limit, self._what = interval_s, limit, what
         self._tests: deque[_Test] = deque()
         self._tested_s = 0.0
         self._last_ns: int | None = None
@@ -111,19 +122,19 @@ class Disagreement:
         self._last_ns = stamp_ns
         new = _Test(stamp_ns, self._tested_s, tested, rejected)
         self._tests.append(new)
-        begin_s = self._tested_s - self._limits.disagreement_s
-        while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._limits.disagreement_s:
+        begin_s = self._tested_s - self._interval_s
+        while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._interval_s:
             self._earlier_ns = self._tests.popleft().stamp_ns
         if self._tests[0].tested_s > begin_s:
             return
         late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
         recent = list(self._tests)[late[0] - 1 :]
         share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
-        if share > self._limits.max_rejected_share:
+        if share > self._limit:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
-                f"what was seen in {self._limits.disagreement_s:g} s {self._what} (the limit is "
-                f"{self._limits.max_rejected_share:.0%})"
+                f"what was seen in {self._interval_s:g} s {self._what} (the limit is "
+                f"{self._limit:.0%})"
             )
 
     def agreed_until(self) -> int | None:
@@ -132,7 +143,7 @@ class Disagreement:
         The most likely time at which the share of rejected features changed from that of a good
         state to one beyond the limit (a maximum of cumulated log-likelihood ratios: Page 1954).
         """
-        good, bad = _GOOD_SHARE, self._limits.max_rejected_share
+        good, bad = _GOOD_SHARE, min(self._limit, _BAD_SHARE)
         kept, lost = np.log((1.0 - bad) / (1.0 - good)), np.log(bad / good)
         tests = list(self._tests)
         ratio, highest, first = 0.0, 0.0, len(tests)
@@ -158,8 +169,12 @@ class Agreement:
     """
 
     def __init__(self, config: RunConfig) -> None:
-        self._gate = Disagreement(config, "was rejected")
-        self._motion = Disagreement(config, "does not fit the motion")
+        limits = config.limits
+        interval_s, share = limits.disagreement_s, limits.max_rejected_share
+        self._gate = Disagreement(interval_s, share, "was rejected")
+        self._motion = Disagreement(
+            _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
+        )
         self._fit = TrackFit()
         self._waiting: dict[int, FeatureFrame] = {}
 
@@ -174,7 +189,9 @@ class Agreement:
     def check_motion(
         self, estimator: Estimator, frame: FeatureFrame, state: NavState | None
     ) -> None:
-        """Compare the tracks of a frame with the motion.
+        """Compare the tracks of a frame with the motion, where an IMU measures it.
+
+        Without one the state between two images is a guess, and a fast turn may differ from it.
 
         Args:
             estimator: the back end, which has taken the frame.
@@ -183,7 +200,10 @@ class Agreement:
 
         Raises:
             DivergenceError: if too many do not fit for too long.
+            JumpError: if the platform was put somewhere else.
         """
+        if not estimator.rig.has_imu:
+            return
         self._waiting[frame.stamp_ns] = frame
         while len(self._waiting) > _MOST_WAITING:
             self._waiting.pop(next(iter(self._waiting)))
@@ -193,8 +213,14 @@ class Agreement:
         found = self._fit.add(
             state, solved, estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
         )
-        if found is not None:
-            self._motion.check(state.stamp_ns, *found)
+        if found is None or estimator.start_is_doubtful:
+            return
+        self._motion.check(state.stamp_ns, found.tested, found.unfit)
+        if found.jumped:
+            raise JumpError(
+                f"lost at frame {state.stamp_ns}: the tracks fit the motion before and after a "
+                "jump, and not across it"
+            )
 
     def agreed_until(self) -> int | None:
         """Time of the last frame before the images contradicted the state; None if they always did.
