@@ -16,7 +16,7 @@ from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
 from slam_graph.pipeline.estimation import true_state
 from slam_graph.pipeline.run_recording import run
-from slam_graph.pipeline.supervision import DivergenceError, check_sane
+from slam_graph.pipeline.agreement import DivergenceError, check_sane
 from slam_graph.sensors.measurements import Packet
 
 STATIC = "backend.initialization.mode=static"

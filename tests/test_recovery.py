@@ -20,7 +20,7 @@ from slam_graph.datasets.faults.injection import inject
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.pipeline.run_recording import run
-from slam_graph.pipeline.supervision import Agreement
+from slam_graph.pipeline.agreement import Agreement
 from slam_graph.results.run_result import RunResult
 from slam_graph.simulation.simulator import simulate
 
@@ -101,6 +101,22 @@ def test_one_sensor_alone_goes_on_without_the_other(fault: str) -> None:
     assert len(result.segments) == 1
 
 
+@pytest.mark.parametrize("algorithm", ["msckf", "okvis"])
+def test_being_carried_away_is_noticed_whatever_is_in_the_cost(algorithm: str) -> None:
+    result = flown("kidnapped:at_s=6,duration_s=3.7", algorithm=algorithm)
+    assert [segment.joined_by for segment in result.segments] == ["start", "none"]
+    begins_s = (result.segments[1].begin_ns - result.input.start_ns) * 1e-9
+    assert begins_s < FAULT_S + 5.0
+    assert error_m(result, 1) < 0.05
+
+
+def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() -> None:
+    result = flown("kidnapped:at_s=6,duration_s=1")
+    assert [segment.joined_by for segment in result.segments] == ["start", "none"]
+    assert "not across it" in result.segments[0].ended_by
+    assert max(error_m(result, 0), error_m(result, 1)) < 0.02
+
+
 @pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])
 def test_every_engine_starts_again(algorithm: str) -> None:
     result = flown("all_missing:at_s=6,duration_s=2", algorithm=algorithm)
@@ -109,7 +125,7 @@ def test_every_engine_starts_again(algorithm: str) -> None:
     assert error_m(result, 1) < 0.05
 
 
-def test_a_segment_somewhere_else_is_not_joined_and_places_join_it() -> None:
+def test_a_segment_somewhere_else_is_not_joined_and_places_join_it(tmp_path: Path) -> None:
     """A part of the flight is cut out: the IMU knows nothing of it, recognised places do."""
     sequence = simulate(
         trajectory="rooms",
@@ -132,6 +148,22 @@ def test_a_segment_somewhere_else_is_not_joined_and_places_join_it() -> None:
     joined = ape(result.groundtruth, result.loop_closed, alignment="yaw").statistics.rmse
     assert joined < 0.1
     assert apart > 5.0 * joined
+
+    joint = result.segments[1].place_joint
+    assert joint is not None
+    truth = result.groundtruth
+    rows = [int(np.argmin(np.abs(truth.stamps_ns - t))) for t in (joint.first_ns, joint.second_ns)]
+    true = truth.pose(rows[0]).between(truth.pose(rows[1]))
+    off = true.localCoordinates(joint.first_T_second)
+    yaw_and_position = [2, 3, 4, 5]  # the graph takes roll and pitch as they are
+    sigmas = np.sqrt(np.diag(joint.covariance))[yaw_and_position]
+    assert np.all(np.abs(off[yaw_and_position]) < 4.0 * sigmas)
+    assert np.all(sigmas < 0.3)
+    result.save(tmp_path)
+    with (tmp_path / "segments.csv").open(newline="") as file:
+        rows_saved = list(csv.DictReader(file))
+    assert rows_saved[0]["joint_cov_55"] == ""
+    assert float(rows_saved[1]["joint_cov_55"]) == pytest.approx(joint.covariance[5, 5])
 
 
 def test_worlds_that_are_not_joined_are_smoothed_apart() -> None:

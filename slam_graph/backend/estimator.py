@@ -96,6 +96,7 @@ class Estimator(EstimatorKnowledge):
         self.aiding = Aiding(config, rig.has_imu)
         self._given: NavState | None = None
         self._before: NavState | None = None
+        self._measured = True
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
@@ -120,7 +121,7 @@ class Estimator(EstimatorKnowledge):
         )
         self._engine: Engine = self._make_engine(context)
         self._context = context
-        self._start_up = StartUp(context, self._start_mode, self._before)
+        self._start_up = StartUp(context, self._start_mode, self._before, self._measured)
         propagation.aiding = self.aiding
         self.aiding.restart()
         self._standstill = StandstillDetector(config.zero_velocity)
@@ -147,14 +148,15 @@ class Estimator(EstimatorKnowledge):
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
         self.aiding.restart()
 
-    def begin_segment(self, before: NavState | None) -> None:
+    def begin_segment(self, before: NavState | None, measured: bool = True) -> None:
         """Forget the state, which is lost, and start again with the frames that follow.
 
         Args:
             before: the last good state; the new start is put where the IMU predicts it from there.
+            measured: whether the IMU has measured what happened since.
         """
         self._given, self._start_mode = None, "auto"
-        self._before = before
+        self._before, self._measured = before, measured
         if self._held is not None:
             self._held.clear()
         self._check.forget()

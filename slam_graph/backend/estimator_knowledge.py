@@ -11,9 +11,11 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.engine_protocol import Engine, EngineContext
+from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
+from slam_graph.sensors import Rig
 
 
 class EstimatorKnowledge:
@@ -26,6 +28,7 @@ class EstimatorKnowledge:
     window: Window | None
     _engine: Engine
     _context: EngineContext
+    _start_up: StartUp
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The joint covariance (n, n) of variables after the last step.
@@ -65,6 +68,24 @@ class EstimatorKnowledge:
         A mean over the cameras.
         """
         return float(np.mean(self._context.pixels.estimate_px))
+
+    @property
+    def start_is_doubtful(self) -> bool:
+        """Whether what follows the start may still contradict it."""
+        return self._start_up.doubtful
+
+    @property
+    def assumed_noise_px(self) -> float:
+        """Standard deviation of the observations that the cost takes; the largest of all cameras."""
+        return float(np.max(self._context.pixels.sigma_px))
+
+    @property
+    def rig_now(self) -> Rig:
+        """The rig with the parameters that are estimated now."""
+        variables = self._context.calibration
+        if self.window is None or not variables.keys:
+            return variables.nominal
+        return variables.rig(self.window.state.estimate)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

@@ -40,6 +40,9 @@ _BASELINE, _BAD_BASELINE = 0.12, 0.3
 """Logarithms of wrong baselines that are a warning, and an error."""
 _BASELINE_SIGMAS = 6.0
 _FEWEST_WINDOWS = 3
+_ROBUST_WINDOWS = 7
+"""Of fewer windows two may agree by chance, and then the median deviation is much too small: their
+standard deviation counts."""
 _LEAST_SIGMA = 0.025
 """No window knows the baseline better."""
 _UNSURE = 0.15
@@ -162,6 +165,8 @@ def _baseline(solutions: list[WindowSolution], rig: Rig) -> list[Finding]:
     logs = np.log([f for f, _ in factors])
     factor = float(np.exp(np.median(logs)))
     spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+    if len(logs) < _ROBUST_WINDOWS:
+        spread = max(spread, float(np.std(logs, ddof=1)))
     known = float(np.median([sigma for _, sigma in factors]))
     sigma = max(spread, known) * 1.25 / np.sqrt(len(factors))
     one, two = (mounted.body_T_camera for mounted in rig.cameras[:2])

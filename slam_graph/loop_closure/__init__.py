@@ -19,6 +19,7 @@ __all__ = [
     "LoopClosureConfig",
     "LoopClosures",
     "LoopVerifier",
+    "PlaceJoint",
     "Vocabulary",
     "close_loops",
     "correct_keyframes",
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeDescriber, KeyframeLog
     from slam_graph.loop_closure.loop_pose_graph import correct_keyframes
     from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
+    from slam_graph.loop_closure.place_joint import PlaceJoint
     from slam_graph.loop_closure.place_recognition import Vocabulary
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -50,6 +52,7 @@ else:
                 "Loop",
                 "LoopVerifier",
             ),
+            "place_joint": ("PlaceJoint",),
             "place_recognition": ("Vocabulary",),
         },
     )

@@ -10,7 +10,7 @@ The causal and the smoothed trajectory stay as they are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -23,6 +23,7 @@ from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.loop_closure.loop_pose_graph import SegmentBreak, correct_keyframes
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
+from slam_graph.loop_closure.place_joint import PlaceJoint, place_joints
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
 from slam_graph.pose_graph import Poses
 from slam_graph.sensors import Rig
@@ -42,6 +43,8 @@ class LoopClosures:
         accepted: (L,) whether the pose graph kept them.
         poses: K corrected world_T_body.
         breaks: where the trajectory was lost and starts again.
+        joints: how well the place after each break is known relative to that before; None where no
+            accepted loop closure joins them.
     """
 
     keyframes: list[Keyframe]
@@ -49,6 +52,7 @@ class LoopClosures:
     accepted: BoolArray
     poses: Poses
     breaks: Sequence[SegmentBreak] = ()
+    joints: Sequence[PlaceJoint | None] = ()
 
     def correct(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory without its drift: each pose moves with the keyframes around it.
@@ -158,13 +162,18 @@ def correct_by(
     for _ in range(_MAX_PASSES):
         held = np.flatnonzero(accepted)
         kept = [loops[k] for k in held]
-        poses, inliers = correct_keyframes(
+        poses, inliers, solution = correct_keyframes(
             stamps, causal, kept, config, level, diagnostics, breaks=breaks
         )
         accepted[held[~inliers]] = False
         if inliers.all():
             break
-    return LoopClosures(keyframes, loops, accepted, poses, breaks)
+    closures = LoopClosures(keyframes, loops, accepted, poses, breaks)
+    ends_ns = [b.begin_ns - 1 for b in breaks[1:]] + [int(stamps[-1])]
+    across = [closures.across(b.begin_ns, end) > 0 for b, end in zip(breaks, ends_ns, strict=False)]
+    begins_ns = [b.begin_ns for b in breaks]
+    joints = place_joints(stamps, begins_ns, across, poses, solution, level)
+    return replace(closures, joints=joints)
 
 
 def _find_loops(

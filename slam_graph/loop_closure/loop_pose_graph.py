@@ -30,7 +30,13 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
 from slam_graph.loop_closure.loop_verification import Loop
-from slam_graph.pose_graph import PoseGraph, PoseGraphPolicy, Poses, optimize_pose_graph
+from slam_graph.pose_graph import (
+    PoseGraph,
+    PoseGraphPolicy,
+    PoseGraphSolution,
+    Poses,
+    optimize_pose_graph,
+)
 
 _MIN_LOOPS = 10
 """With fewer loop closures drift is not learned."""
@@ -63,7 +69,7 @@ def correct_keyframes(
     diagnostics: Diagnostics | None = None,
     recording_of: IntArray | None = None,
     breaks: Sequence[SegmentBreak] = (),
-) -> tuple[Poses, BoolArray]:
+) -> tuple[Poses, BoolArray, PoseGraphSolution]:
     """Poses of keyframes without their drift, by loop closures some of which may be false.
 
     Args:
@@ -78,7 +84,8 @@ def correct_keyframes(
         breaks: of the trajectory, in the order of time.
 
     Returns:
-        The corrected world_T_body, and (L,) whether the pose graph kept the loop closure.
+        The corrected world_T_body, (L,) whether the pose graph kept the loop closure, and the
+        solution of that graph.
     """
     one = recording_of is None
     segment_of = np.searchsorted([b.begin_ns for b in breaks], stamps_ns, "right")
@@ -88,7 +95,7 @@ def correct_keyframes(
     policy = PoseGraphPolicy.with_gnc("auto" if one else "file")
     solution = optimize_pose_graph(graph, policy, diagnostics)
     kept = solution.weights[len(solution.weights) - len(loops) :] > 0.5
-    return body_poses(solution.poses, poses, level), kept
+    return body_poses(solution.poses, poses, level), kept, solution
 
 
 def loop_graph(

@@ -199,7 +199,7 @@ def _solved(
     # an edge between consecutive numbers would count as odometry, which is never rejected
     usable = [abs(loop.first - loop.second) > 1 for loop in between]
     loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
-    poses, inliers = correct_keyframes(
+    poses, inliers, _ = correct_keyframes(
         joined.stamps_ns, joined.poses, loops, config, level, recording_of=joined.recording_of
     )
     kept = iter(inliers[len(inner) :].tolist())

@@ -17,7 +17,7 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
-from slam_graph.pipeline.supervision import DivergenceError, check_sane
+from slam_graph.pipeline.agreement import DivergenceError, check_sane
 from slam_graph.pipeline.tracking import TrackedPacket
 from slam_graph.results import RunInput, RunResult
 
@@ -218,6 +218,7 @@ class Estimation:
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)
+        self._recovery.agreement.check_motion(estimator, features, state)
         return state
 
     def _note(self, frame: EstimatedFrame, tracked: TrackedPacket) -> None:

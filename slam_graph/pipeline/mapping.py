@@ -142,6 +142,8 @@ class LoopClosing(Stage):
                 self._diagnostics,
                 result.segments.later,
             )
+            for segment, joint in zip(result.segments.later, closures.joints, strict=False):
+                segment.place_joint = joint
             for segment in result.segments.later:
                 segment.loops = closures.across(segment.begin_ns, segment.end_ns)
             logger.info(

@@ -15,7 +15,7 @@ import numpy as np
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.supervision import Agreement, DivergenceError
+from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 
@@ -115,7 +115,7 @@ class Recovery:
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config)
-        self._estimator.begin_segment(before)
+        self._estimator.begin_segment(before, measured=not isinstance(lost, JumpError))
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
 
     def _forget_bad_states(self, good_ns: int | None) -> int | None:

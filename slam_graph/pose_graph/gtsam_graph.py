@@ -65,7 +65,9 @@ def robust_estimator(loss: str, width: float) -> Any:
     return _LOSSES[loss](width)
 
 
-def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.NonlinearFactor]:
+def anchor_factors(
+    graph: PoseGraph, held: bool = False, anchor: int | None = None
+) -> list[gtsam.NonlinearFactor]:
     """Priors on the first pose of each connected component, which fix the gauge.
 
     They are zero at a minimum.
@@ -73,6 +75,7 @@ def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.Nonlinear
     Args:
         graph: the pose graph.
         held: as hard constraints, so that covariances are relative to the first pose.
+        anchor: row of the pose that is held in place of the first ones, if the graph has estimates.
     """
     prior, k = (gtsam.PriorFactorPose2, 3) if graph.dimension == 2 else (gtsam.PriorFactorPose3, 6)
     noise = (
@@ -80,10 +83,12 @@ def anchor_factors(graph: PoseGraph, held: bool = False) -> list[gtsam.Nonlinear
         if held
         else gtsam.noiseModel.Isotropic.Precision(k, _typical_information(graph))
     )
-    poses = gtsam_poses(graph.anchor_poses())
-    return [
-        prior(key, pose, noise) for key, pose in zip(graph.anchors.tolist(), poses, strict=True)
-    ]
+    rows, at = graph.anchors, graph.anchor_poses()
+    if anchor is not None and graph.estimates is not None:
+        rows = np.array([anchor], np.int64)
+        at = graph.estimates.select(rows)
+    poses = gtsam_poses(at)
+    return [prior(key, pose, noise) for key, pose in zip(rows.tolist(), poses, strict=True)]
 
 
 def _typical_information(graph: PoseGraph) -> float:

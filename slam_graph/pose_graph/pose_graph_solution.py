@@ -141,7 +141,9 @@ class PoseGraphSolution(Displayed):
         """The problem as a g2o file, with the estimates or with other poses."""
         return g2o_lines(self.graph, self.poses if poses is None else poses)
 
-    def covariances(self, rows: Sequence[int] | None = None) -> FloatArray:
+    def covariances(
+        self, rows: Sequence[int] | None = None, relative_to: int | None = None
+    ) -> FloatArray:
         """(K, k, k) marginal covariances of some poses, or of all.
 
         In the tangent at each pose, T exp(δ), in the order of files: translation (m), then rotation
@@ -150,13 +152,15 @@ class PoseGraphSolution(Displayed):
 
         Args:
             rows: of the poses; all if not given.
+            relative_to: row of a pose that is fixed in place of the first of all, in a graph of
+                one component.
 
         Raises:
             EstimationError: if a pose is not determined.
         """
         weighted = self.weighted_graph()
         factors = edge_factors(weighted, range(len(weighted.edges)))
-        held = factor_graph([*factors, *anchor_factors(weighted, held=True)])
+        held = factor_graph([*factors, *anchor_factors(weighted, True, relative_to)])
         rows = range(len(self.poses)) if rows is None else rows
         try:
             marginals = gtsam.Marginals(held, values_of(self.poses))

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.geometry import Trajectory
+
+if TYPE_CHECKING:
+    from slam_graph.loop_closure import PlaceJoint
 
 JoinedBy = Literal["start", "imu", "none"]
 """Of the first segment, joined by the IMU, and not joined: its place is not known."""
@@ -22,7 +25,12 @@ JoinedBy = Literal["start", "imu", "none"]
 _COLUMNS = (
     *("segment", "world", "begin_ns", "end_ns", "states", "joined_by"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "loops", "ended_by"),
+    *("joint_first_ns", "joint_second_ns"),
+    *(f"joint_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")),
+    *(f"joint_cov_{i}{j}" for i in range(6) for j in range(i, 6)),
 )
+_OF_PLACES = 2 + 7 + 21
+"""Columns of the joint by places."""
 
 _UNKNOWN = np.diag([1000.0**2] * 3 + [np.pi**2])
 """Covariance of a place of which nothing is known: m², rad²."""
@@ -37,6 +45,7 @@ class Segment:
         joined_by: what puts it into the world of the segment before.
         joint_covariance: (4, 4) of that: position (m) in axes of the world, and yaw (rad).
         loops: number of accepted loop closures to earlier segments, if loops were closed.
+        place_joint: how these join it to the segment before; None without them.
         ended_by: what ended it; empty for the end of the recording.
     """
 
@@ -45,6 +54,7 @@ class Segment:
     joined_by: JoinedBy = "start"
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     loops: int = 0
+    place_joint: PlaceJoint | None = None
     ended_by: str = ""
 
     @property
@@ -163,5 +173,20 @@ class Segments:
                 *(f"{sigma:.6g}" for sigma in sigmas),
                 str(segment.loops),
                 '"{}"'.format(segment.ended_by.replace('"', "'")),
+                *_joint_cells(segment.place_joint),
             ]
             yield ",".join(cells) + "\n"
+
+
+def _joint_cells(joint: PlaceJoint | None) -> list[str]:
+    """The joint by places: times, relative pose, upper triangle of its covariance."""
+    if joint is None:
+        return [""] * _OF_PLACES
+    pose = joint.first_T_second
+    quaternion: Any = pose.rotation().toQuaternion()  # a type that the stubs do not know
+    values = [
+        *pose.translation(),
+        *quaternion.coeffs(),
+        *joint.covariance[np.triu_indices(6)],
+    ]
+    return [str(joint.first_ns), str(joint.second_ns), *(f"{value:.9g}" for value in values)]

@@ -62,21 +62,24 @@ class SegmentJoint:
         return with_unknown_gauge(state, self.covariance, self.predicted.world_T_body.translation())
 
 
-def place(window: Window, before: NavState, context: EngineContext) -> tuple[Window, SegmentJoint]:
+def place(
+    window: Window, before: NavState, context: EngineContext, measured: bool = True
+) -> tuple[Window, SegmentJoint]:
     """A window that has just begun, moved into the world of the segment before, and the joint.
 
     Args:
         window: after a start; its world is its own.
         before: the last good state of the segment before, with its covariance.
         context: shared with the engine; it has the IMU samples from that state on.
+        measured: whether these have measured all that happened since.
     """
     start = window.current(window.prior)
     level = context.rig.has_imu
-    measured = level and context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
+    predictable = level and context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
     predicted = before
-    if measured:
+    if predictable:
         predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
-    holds = measured and not contradict(start, predicted)
+    holds = measured and predictable and not contradict(start, predicted)
     motion = world_motion(start.world_T_body, predicted.world_T_body, level)
     return moved(window, motion), SegmentJoint(before, predicted, holds, level)
 

@@ -27,18 +27,21 @@ class StartUp:
         doubtful: whether the start is still reviewed.
     """
 
-    def __init__(self, context: EngineContext, mode: str, before: NavState | None) -> None:
+    def __init__(
+        self, context: EngineContext, mode: str, before: NavState | None, measured: bool = True
+    ) -> None:
         """Begin without frames.
 
         Args:
             context: shared with the engine.
             mode: which starts are tried, as in `initialization.mode`.
             before: last good state of the segment before; None in the first.
+            measured: whether the IMU has measured what happened since.
         """
         self.outliers: IntArray = np.zeros(0, np.int64)
         self.joint: SegmentJoint | None = None
         self.doubtful = False
-        self._context, self._before = context, before
+        self._context, self._before, self._measured = context, before, measured
         self._inertial = Initializer(context, mode) if context.rig.has_imu else None
         alone = len(context.rig.cameras) == 1
         self._visual = MonocularStart(context) if alone else VisualStart(context)
@@ -100,5 +103,5 @@ class StartUp:
     def _placed(self, window: Window) -> Window:
         """A window that has just begun, in the world of the segment before if there is one."""
         if self._before is not None:
-            window, self.joint = place(window, self._before, self._context)
+            window, self.joint = place(window, self._before, self._context, self._measured)
         return window

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether tracks fit the motion that was estimated meanwhile, whatever the cost made of them.
+
+The χ² gate tests what an algorithm lets into its cost, which differs: features of the state, whole
+tracks once, or every observation of a window. After a jump a window takes new features for those
+that jumped, leaves out what it cannot triangulate, and rejects little of the rest. So here all
+tracks of the last second are triangulated from the poses that were reported meanwhile. Where these
+are right the reprojection errors have the size of the noise; no covariance of a wrong state and no
+choice of features can hide that they are not.
+
+A platform that is put somewhere else moves on there as the IMU says, if it is at rest or its
+velocity and tilt are the same. Then tracks fit before and after, and none fits across.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import TriangulationConfig
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame, Rig
+
+_SPAN_NS, _STEP_NS = 1_000_000_000, 250_000_000
+"""Frames of the last second count, and of those only some: errors of a track change slowly."""
+_LEAST_FRAMES = 3
+"""A track of fewer frames fits most motions."""
+_LARGEST = 2.0
+"""Largest reprojection error of a track that fits, in standard deviations of the observations.
+Reported poses are causal: over a second they are off by a good part of that noise themselves."""
+_UNEVEN_NS = 5_000_000
+"""Frames come earlier or later by up to so much."""
+_POINT_DIM = 3
+_GOOD_SHARE, _JUMPED_SHARE, _JUMPED = 0.3, 0.8, 20
+"""At a jump the share that does not fit was at most the first before; then at least the second does
+not fit across it, and fits after it; of so many tracks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How tracks compare with the motion.
+
+    Attributes:
+        tested: how many tracks were compared.
+        unfit: how many of them do not fit.
+        jumped: whether the platform was put somewhere else three comparisons ago.
+    """
+
+    tested: int
+    unfit: int
+    jumped: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """The pose that was reported for a frame of the window."""
+
+    stamp_ns: int
+    index: int
+    rotation: FloatArray
+    position: FloatArray
+
+
+class TrackFit:
+    """Compares tracks with the poses that were reported for their frames."""
+
+    def __init__(self) -> None:
+        self._tracks = FeatureTracks()
+        self._poses: deque[_Pose] = deque()
+        self._count = 0
+        self._good: int | None = None  # the last frame that was good
+
+    def add(
+        self, state: NavState, frame: FeatureFrame, rig: Rig, sigma_px: float, moving: IntArray
+    ) -> Fit | None:
+        """Take the next frame.
+
+        Args:
+            state: reported for it.
+            frame: its features.
+            rig: the cameras, as they are known now.
+            sigma_px: standard deviation of the observations.
+            moving: ids (N,) of features that move by themselves, ascending.
+
+        Returns:
+            How the tracks compare; None if it is too early for the next comparison.
+        """
+        now_ns = state.stamp_ns
+        if self._poses and now_ns < self._poses[-1].stamp_ns + _STEP_NS - _UNEVEN_NS:
+            return None
+        T, now = state.world_T_body, self._count
+        self._poses.append(_Pose(now_ns, now, T.rotation().matrix(), T.translation()))
+        self._tracks.add(now, frame)
+        self._count += 1
+        while self._poses[0].stamp_ns < now_ns - _SPAN_NS - _UNEVEN_NS:
+            self._poses.popleft()
+        self._tracks.keep_frames([pose.index for pose in self._poses])
+        ids, lengths = self._tracks.lengths()
+        ids = ids[(lengths >= _LEAST_FRAMES) & is_in(ids, self._tracks.seen)]
+        ids = ids[~is_in(ids, moving)]
+        projection = RigProjection(rig)
+        unfit = int(np.count_nonzero(self._errors(ids, projection) >= _LARGEST * sigma_px))
+        jumped = False
+        if self._good == now - _LEAST_FRAMES:
+            jumped = self._jumped(ids, self._good, projection, _LARGEST * sigma_px)
+        if len(ids) >= _JUMPED and unfit <= _GOOD_SHARE * len(ids):
+            self._good = now
+        return Fit(len(ids), unfit, jumped)
+
+    def _jumped(
+        self, ids: IntArray, before: int, projection: RigProjection, limit_px: float
+    ) -> bool:
+        """Whether tracks (ids ascending) fit after a frame, and not across the time after it."""
+        ids = ids[is_in(ids, self._tracks.ids_in(before))]
+        after = range(before + 1, self._count)
+        ids = ids[is_in(ids, self._tracks.ids_in(after[0]))]
+        if len(ids) < _JUMPED:
+            return False
+        across = self._errors(ids, projection) >= limit_px
+        fits = self._errors(ids, projection, after) < limit_px
+        return bool(min(np.mean(across), np.mean(fits)) >= _JUMPED_SHARE)
+
+    def _errors(
+        self, ids: IntArray, projection: RigProjection, frames: Sequence[int] | None = None
+    ) -> FloatArray:
+        """Reprojection errors (J,) of tracks (ids ascending), each as large as its noise, px.
+
+        Args:
+            ids: of them.
+            projection: of the rig.
+            frames: those that count; all if none are given.
+        """
+        obs = self._tracks.observations(ids, frames)
+        if len(obs) == 0:
+            return np.zeros(0)
+        poses = [pose for pose in self._poses if pose.index in obs.frames]
+        R = np.array([pose.rotation for pose in poses])
+        p = np.array([pose.position for pose in poses])
+        found = triangulate(obs, projection, R, p, TriangulationConfig())
+        dof = np.maximum(2 * obs.counts - _POINT_DIM, 1)
+        errors: FloatArray = found.reprojection_px * np.sqrt(obs.counts / dof)
+        return np.where(np.isfinite(errors), errors, np.inf)

@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Is the estimate sane, and do the images agree with it?"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_graph.backend import Estimator, Innovations, TrackFit
+from slam_graph.config import RunConfig
+from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
+
+_LONGEST_GAP_S = 0.5
+"""A gap between two frames whose features were tested counts as at most this much time."""
+
+_GOOD_SHARE = 0.05
+"""Share of the features that is rejected while an estimate is good: some percent."""
+_LOOKED_BACK = 3.0
+"""Tests are kept for so many further intervals, to find the beginning of a disagreement."""
+_BAD_SHARE = 0.9
+"""Share of a lost estimate, at most, however large the limit."""
+_MOST_UNFIT, _SOONER = 0.75, 2.0 / 3.0
+"""Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
+other one. In the first seconds of one camera more of them do not fit, as the scale is found only
+then, than of those that the gate rejects; after a jump it is nearly all of them."""
+_MOST_WAITING = 100
+"""Frames that wait for their states, at most."""
+
+
+class DivergenceError(EstimationError):
+    """The estimate is beyond what is physically possible, or contradicts the images."""
+
+
+class JumpError(DivergenceError):
+    """The platform is somewhere else, and the IMU has not measured how it came there."""
+
+
+def check_sane(state: NavState, config: RunConfig) -> None:
+    """Refuse a state that cannot be true.
+
+    Raises:
+        DivergenceError: naming what is beyond its limit.
+    """
+    limits = config.limits
+    variances = np.zeros(15) if state.covariance is None else np.diag(state.covariance)
+    pose, biases = state.world_T_body.matrix().ravel(), (state.gyro_bias, state.accel_bias)
+    if not np.isfinite(np.concatenate([pose, state.velocity, *biases, variances])).all():
+        raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
+    sigma_m = math.sqrt(max(float(variances[3:6].max()), 0.0))
+    for what, value, limit in (
+        ("speed of {} m/s", float(np.linalg.norm(state.velocity)), limits.max_speed),
+        ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
+        ("gyroscope bias of {} rad/s", float(np.abs(state.gyro_bias).max()), limits.max_gyro_bias),
+        (
+            "accelerometer bias of {} m/s²",
+            float(np.abs(state.accel_bias).max()),
+            limits.max_accel_bias,
+        ),
+    ):
+        if value > limit:
+            raise DivergenceError(
+                f"diverged at frame {state.stamp_ns}: {what.format(f'{value:.3g}')} "
+                f"(the limit is {limit:g})"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """How many features of a frame the gate has tested and rejected.
+
+    Attributes:
+        stamp_ns: of the frame.
+        tested_s: time with tested features up to it.
+        tested, rejected: numbers of features.
+    """
+
+    stamp_ns: int
+    tested_s: float
+    tested: int
+    rejected: int
+
+
+class Disagreement:
+    """The share of the tested features that is rejected, over the last seconds.
+
+    Only time in which features are tested counts, and a gap between two tests counts little: after
+    a pause, such as blank images, an estimate has time to recover.
+
+    Args:
+        interval_s: over which the share is taken.
+        limit: largest share of an estimate that is not lost.
+        what: happened to what was seen, in a message.
+    """
+
+    def __init__(self, interval_s: float, limit: float, what: str) -> None:
+        self._interval_s, self._limit, self._what = interval_s, limit, what
+        self._tests: deque[_Test] = deque()
+        self._tested_s = 0.0
+        self._last_ns: int | None = None
+        self._earlier_ns: int | None = None  # of the newest test that is not kept any more
+
+    def __len__(self) -> int:
+        """How many tests are kept."""
+        return len(self._tests)
+
+    def check(self, stamp_ns: int, tested: int, rejected: int) -> None:
+        """Add the numbers of features of the next frame that were tested and rejected.
+
+        Raises:
+            DivergenceError: if too much was rejected for too long.
+        """
+        if tested == 0:
+            return
+        if self._last_ns is not None:
+            self._tested_s += min((stamp_ns - self._last_ns) * 1e-9, _LONGEST_GAP_S)
+        self._last_ns = stamp_ns
+        new = _Test(stamp_ns, self._tested_s, tested, rejected)
+        self._tests.append(new)
+        begin_s = self._tested_s - self._interval_s
+        while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._interval_s:
+            self._earlier_ns = self._tests.popleft().stamp_ns
+        if self._tests[0].tested_s > begin_s:
+            return
+        late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
+        recent = list(self._tests)[late[0] - 1 :]
+        share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
+        if share > self._limit:
+            raise DivergenceError(
+                f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
+                f"what was seen in {self._interval_s:g} s {self._what} (the limit is "
+                f"{self._limit:.0%})"
+            )
+
+    def agreed_until(self) -> int | None:
+        """Time of the last frame before the images contradicted the state; None if they always did.
+
+        The most likely time at which the share of rejected features changed from that of a good
+        state to one beyond the limit (a maximum of cumulated log-likelihood ratios: Page 1954).
+        """
+        good, bad = _GOOD_SHARE, min(self._limit, _BAD_SHARE)
+        kept, lost = np.log((1.0 - bad) / (1.0 - good)), np.log(bad / good)
+        tests = list(self._tests)
+        ratio, highest, first = 0.0, 0.0, len(tests)
+        for k in reversed(range(len(tests))):
+            rejected = tests[k].rejected
+            ratio += rejected * lost + (tests[k].tested - rejected) * kept
+            if ratio >= highest:
+                highest, first = ratio, k
+        return tests[first - 1].stamp_ns if first else self._earlier_ns
+
+
+class Agreement:
+    """Whether the images still agree with the state.
+
+    Where they contradict it for seconds, the state is wrong and its covariance too small. It cannot
+    recover then: the features that would correct it are those that are rejected. Two tests tell:
+
+    - the χ² gate rejects a few percent of the features if state and covariance are right;
+    - tracks of the last second fit the poses that were reported for their frames (`TrackFit`).
+
+    Args:
+        config: has the limits.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        limits = config.limits
+        interval_s, share = limits.disagreement_s, limits.max_rejected_share
+        self._gate = Disagreement(interval_s, share, "was rejected")
+        self._motion = Disagreement(
+            _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
+        )
+        self._fit = TrackFit()
+        self._waiting: dict[int, FeatureFrame] = {}
+
+    def check(self, stamp_ns: int, innovations: Innovations) -> None:
+        """Add what the gate did with the features of the next frame.
+
+        Raises:
+            DivergenceError: if too much was rejected for too long.
+        """
+        self._gate.check(stamp_ns, innovations.tested, innovations.rejected)
+
+    def check_motion(
+        self, estimator: Estimator, frame: FeatureFrame, state: NavState | None
+    ) -> None:
+        """Compare the tracks of a frame with the motion, where an IMU measures it.
+
+        Without one the state between two images is a guess, and a fast turn may differ from it.
+
+        Args:
+            estimator: the back end, which has taken the frame.
+            frame: its features.
+            state: what the estimator gave for it, or for an earlier frame that has waited.
+
+        Raises:
+            DivergenceError: if too many do not fit for too long.
+            JumpError: if the platform was put somewhere else.
+        """
+        if not estimator.rig.has_imu:
+            return
+        self._waiting[frame.stamp_ns] = frame
+        while len(self._waiting) > _MOST_WAITING:
+            self._waiting.pop(next(iter(self._waiting)))
+        solved = self._waiting.pop(estimator.solved_ns, None)
+        if state is None or solved is None:
+            return
+        found = self._fit.add(
+            state, solved, estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
+        )
+        if found is None or estimator.start_is_doubtful:
+            return
+        self._motion.check(state.stamp_ns, found.tested, found.unfit)
+        if found.jumped:
+            raise JumpError(
+                f"lost at frame {state.stamp_ns}: the tracks fit the motion before and after a "
+                "jump, and not across it"
+            )
+
+    def agreed_until(self) -> int | None:
+        """Time of the last frame before the images contradicted the state; None if they always did.
+
+        The earlier one of what the two tests say.
+        """
+        agreed = [test.agreed_until() for test in (self._gate, self._motion) if len(test)]
+        known = [stamp_ns for stamp_ns in agreed if stamp_ns is not None]
+        return min(known) if agreed and len(known) == len(agreed) else None
