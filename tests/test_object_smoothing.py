@@ -106,7 +106,11 @@ def test_files_of_smoothed_objects(two: RunResult, tmp_path: Path) -> None:
     lines = (tmp_path / "out" / "objects_smoothed.csv").read_text().splitlines()
     assert len(lines) == 1 + len(two.objects.smoothed.all_states())
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert metrics["moving_objects"]["smoothed"]["nees"] is None, "motions have no covariances"
+    assert 0.3 < metrics["moving_objects"]["smoothed"]["nees"] < 1.5
+    states = two.objects.smoothed.all_states()
+    steps = [state.step for state in states if state.step is not None]
+    assert len(steps) > 0.9 * len(states)
+    assert all(np.linalg.eigvalsh(step.covariance)[0] > 0.0 for step in steps)
 
 
 def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:

@@ -89,6 +89,7 @@ class CameraTracker:
         with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(found.points[keep].astype(np.float64))
             after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
+            self._moving.next_frame()
             moves = self._moving.among(after.ids)
             tested = np.flatnonzero(~moves)
             places = self._unrolled(before)[keep][tested], self._unrolled(after)[tested]
@@ -96,9 +97,9 @@ class CameraTracker:
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = np.zeros(len(after), np.bool_)
             inlier[np.concatenate(motions)] = True
-            if self._moving.wanted:
-                self._stats.count(moving=moves)
-                self._moving.add(after.ids[~inlier])
+            if self._moving.keeps:
+                self._moving.suspect(after.ids[~inlier & ~moves])
+                self._stats.count(moving=self._moving.among(after.ids))
                 inlier[:] = True
             in_map = np.ones(len(after), np.bool_)
             in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
@@ -120,7 +121,9 @@ class CameraTracker:
             next_id: id of the first new feature.
         """
         here, there = after.common(before)
-        rest = ~self._moving.among(after.ids[here])  # others would spoil the motion of these
+        moves = self._moving.among(after.ids)
+        self._extractor.count_apart(after.pixels[moves])
+        rest = ~moves[here]  # others would spoil the motion of these
         here, there = here[rest], there[rest]
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
@@ -141,10 +144,10 @@ class CameraTracker:
                 flow = self._predictor.residual_flow(origins, ends, seconds)
             self._stats.count(rejected_new=~good, new=good)
             fits = good.copy()
-            if self._moving.wanted:
+            if self._moving.keeps:
                 good[:] = True
             ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
-            self._moving.add(ids[~fits[good]])
+            self._moving.suspect(ids[~fits[good]])
             self._associator.accept(ids, good)
         new = Tracks.of(after.image, after.stamp_ns, ids, points[good], normalized[good])
         new.residual_flow[:] = flow[good]

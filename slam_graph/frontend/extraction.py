@@ -100,13 +100,21 @@ class FeatureExtractor:
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
         self._half_widths = _disk(round(self._distance_px))
         self._rest = np.zeros(len(self._cells), np.int64)
-        self._share = -(-config.max_features // len(self._cells))
+        self._apart: Pixels = np.zeros((0, 2), np.float32)
 
     def allows(self, points: Pixels) -> BoolArray:
         """Which points (N, 2), all inside the image, the mask allows."""
         u, v = np.rint(points).astype(int).T
         result: BoolArray = self._allowed[v, u] > 0
         return result
+
+    def count_apart(self, points: Pixels) -> None:
+        """Do not count some of the features (N, 2): they move, and say nothing of the platform.
+
+        Without this a moving object that fills the view would leave it few static features. As many
+        as else in the whole image are found in the cells where the static ones are in the majority.
+        """
+        self._apart = points
 
     def extract(self, image: Image, occupied: Pixels, surplus: int = 1) -> _Extracted:
         """Detect new points in the cells that have few features.
@@ -119,7 +127,7 @@ class FeatureExtractor:
         free = self._free(occupied)
         found: list[Pixels] = []
         quotas: list[int] = []
-        missing = self._config.max_features - len(occupied)
+        missing = self._missing(occupied)
         whole: Keypoints | None = None
         for i, share in self._wanted(occupied):
             quota = min(missing, share)
@@ -166,7 +174,7 @@ class FeatureExtractor:
         """Indices of keypoints to add in cells that have few of the `occupied` features (N, 2)."""
         free = self._free(occupied)
         chosen: list[int] = []
-        missing = self._config.max_features - len(occupied)
+        missing = self._missing(occupied)
         for i, share in self._wanted(occupied):
             inside = np.flatnonzero(_inside(keypoints.pixels, self._cells[i]))
             inside = inside[np.argsort(-keypoints.scores[inside], kind="stable")]
@@ -180,17 +188,24 @@ class FeatureExtractor:
     def _wanted(self, occupied: Pixels) -> list[tuple[int, int]]:
         """The cells that need features, emptiest first, and how many each needs."""
         self._rest = np.maximum(self._rest - 1, 0)
-        missing = self._config.max_features - len(occupied)
+        missing = self._missing(occupied)
         if missing <= 0:
             return []
-        counts = self._count(occupied)
+        apart = self._count(self._apart)
+        counts = self._count(occupied) - apart
+        of_the_world = apart <= counts
+        share = -(-self._config.max_features // max(np.count_nonzero(of_the_world), 1))
         # No cell rests while many features are missing, e.g. after the lens was covered
         awake = (self._rest == 0) | (2 * missing > self._config.max_features)
-        wanting = (counts < self._share) & awake
+        wanting = (counts < share) & awake & of_the_world
         cells = np.flatnonzero(wanting)
         emptiest_first = cells[np.argsort(counts[cells], kind="stable")]
-        shares = self._share - counts[emptiest_first]
+        shares = share - counts[emptiest_first]
         return list(zip(emptiest_first.tolist(), shares.tolist(), strict=True))
+
+    def _missing(self, occupied: Pixels) -> int:
+        """How many features are wanted beside those that are there (N, 2)."""
+        return self._config.max_features - len(occupied) + len(self._apart)
 
     def _count(self, points: Pixels) -> IntArray:
         """How many points (N, 2) lie in each cell."""

@@ -197,6 +197,7 @@ class ImageFrontend:
         if feedback.rig is not None:
             for tracker, mounted in zip(self._trackers, feedback.rig.cameras, strict=True):
                 tracker.mount(mounted)
+        self._moving.keeps = self._moving.wanted and feedback.state is not None
         self._moving.add(feedback.moving)
         self._moving.remove(feedback.static)
         self._moving.hulls = list(feedback.hulls) if self._moving.wanted else []

@@ -3,8 +3,10 @@
 """Features that move by themselves: tracked like the others, and reported apart from them.
 
 A track that RANSAC rejects between two images is a wrong match, or it moves. If moving objects are
-estimated it is kept: forward and backward Lucas-Kanade and the stereo test go on to find wrong
-matches, and the back end says in the end which of the tracks move, and which do not.
+estimated it is kept, apart from the others in this frame: forward and backward Lucas-Kanade and the
+stereo test go on to find wrong matches. In the next frame it is tested again. A track that the back
+end says to move stays apart, and is tested no more, until the back end says that it is static.
+Before there is a state nobody could say so, and all outliers are rejected.
 """
 
 from __future__ import annotations
@@ -29,15 +31,18 @@ class MovingTracks:
         wanted: whether they are kept at all.
 
     Attributes:
-        ids: (N,) of them, ascending.
+        ids: (N,) of those that are apart in this frame, ascending.
+        keeps: whether outliers are kept now: not before there is a state.
         hulls: (K, 2) polygons around objects in the first camera, pixels, and how many features are
             wanted in each.
     """
 
     def __init__(self, wanted: bool) -> None:
         self.wanted = wanted
+        self.keeps = False
         self.ids: IntArray = np.zeros(0, np.int64)
         self.hulls: list[tuple[FloatArray, int]] = []
+        self._known = self.ids
 
     def __contains__(self, feature: int) -> bool:
         return bool(np.isin(feature, self.ids))
@@ -48,20 +53,31 @@ class MovingTracks:
             return np.zeros(len(ids), np.bool_)
         return np.isin(ids, self.ids)
 
+    def next_frame(self) -> None:
+        """Features that were outliers in the frame before are tested again."""
+        self.ids = self._known
+
+    def suspect(self, ids: IntArray) -> None:
+        """Features that are outliers in this frame."""
+        self.ids = np.union1d(self.ids, ids)
+
     def add(self, ids: IntArray) -> None:
-        """Features that moved between two images, or that the back end found to move."""
+        """Features that move, by the back end or by where they are."""
         if self.wanted and len(ids):
+            self._known = np.union1d(self._known, ids)
             self.ids = np.union1d(self.ids, ids)
 
     def remove(self, ids: IntArray) -> None:
         """Features that are static after all."""
         if len(ids):
+            self._known = np.setdiff1d(self._known, ids)
             self.ids = np.setdiff1d(self.ids, ids)
 
     def surplus(self, alive: IntArray) -> IntArray:
         """Forget features that are not tracked any more; ids (N,) of those that are too many."""
         self.ids = self.ids[np.isin(self.ids, alive)]
         self.ids, late = self.ids[:MOST], self.ids[MOST:]
+        self._known = self._known[np.isin(self._known, self.ids)]
         return late
 
     def apart(

@@ -109,8 +109,7 @@ class Objects(NoObjects):
                 self._recording.close()
                 calibrated = result.logs.calibration.latest
                 rig = result.causal_rig if calibrated is None else calibrated.rig
-                platform = result.final_ba.history
-                task = self._objects, rig, platform, result.config.final_ba
+                task = self._objects, rig, result.final_ba, result.config.final_ba
                 for failure in self._smoother.smooth(*task):
                     self._diagnostics.warn("object_not_smoothed", failure)
         if self._labels is not None and self._labels.frames == 0:

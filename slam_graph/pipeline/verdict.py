@@ -52,6 +52,7 @@ class _Memory:
         """Begin with nothing; `pairs` says whether images of two cameras are of use."""
         self._objects = objects
         self._frames: deque[tuple[FeatureFrame, ImuData]] = deque()
+        self._unjudged: set[int] = set()  # stamps of frames in which nothing says what moves
         self._since: list[ImuData] = []
         self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
 
@@ -60,8 +61,13 @@ class _Memory:
 
     @property
     def frames(self) -> list[FeatureFrame]:
-        """Features of the frames that are kept, without those that move by themselves."""
-        return [features.without(self._objects.moved) for features, _ in self._frames]
+        """Features of the frames that are kept, without those that move by themselves.
+
+        Where moving objects are estimated, frames before there is a state would have theirs.
+        """
+        frames = [features for features, _ in self._frames]
+        judged = [frame for frame in frames if frame.stamp_ns not in self._unjudged]
+        return [features.without(self._objects.moved) for features in judged or frames]
 
     @property
     def imu(self) -> ImuData:
@@ -87,6 +93,8 @@ class _Memory:
         if frames and stamp_ns - frames[-1][0].stamp_ns < _SPACING_NS:
             return
         frames.append((frame.features, ImuData.concatenate(self._since)))
+        if frame.objects is not None and frame.state is None:
+            self._unjudged.add(stamp_ns)
         self._since = []
         while frames[0][0].stamp_ns < stamp_ns - _KEPT_NS:
             frames.popleft()

@@ -307,6 +307,7 @@ class ObjectTracker:
         moving = [item for item in self.objects if item.moving or not item.confirmed]
         members = {int(i): item.number for item in self.objects for i in item.members}
         own = members_of(self.objects)
+        standing = members_of([item for item in self.objects if item.standing])
         free = ~np.isin(test.ids, own)
         ids = np.concatenate([test.ids[free], own])
         known = np.concatenate(
@@ -319,8 +320,8 @@ class ObjectTracker:
         by_itself = test.ids[free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
         return ObjectFrame(
             states,
-            np.union1d(own, by_itself),
-            np.setdiff1d(test.of(Verdict.STATIC), own),
+            np.setdiff1d(np.union1d(own, by_itself), standing),
+            np.union1d(np.setdiff1d(test.of(Verdict.STATIC), own), standing),
             np.setdiff1d(test.of(Verdict.WRONG), own),
             (ids[order], known[order]),
             members,

@@ -31,6 +31,9 @@ _NEAR = 1.5
 """Parts of one object are no farther apart than the sum of their sizes times this."""
 _MOTION_S = 0.3
 """Time over which it is judged whether an object moves."""
+_AT_REST = 0.5
+"""Probability with which the motion of an object at rest is estimated larger than that which shows
+that it stands: one that moves slowly seldom seems to stand so well."""
 
 
 class TrackedObject:
@@ -50,6 +53,7 @@ class TrackedObject:
         reviewed: how many of them it had when it was reviewed last.
         seen_ns: time of the last frame with a state.
         moving: whether it is known to move.
+        standing: whether it was seen to stand since it moved last.
         reported: whether it has been reported.
         unique: whether its motion is known from the mirror image of it; it is not reported before.
     """
@@ -64,7 +68,8 @@ class TrackedObject:
         config: ObjectsConfig,
     ) -> None:
         self.number, self.label, self.members = number, label, members
-        self.frames, self.reviewed, self.moving = 0, 0, False
+        self.frames, self.reviewed = 0, 0
+        self.moving, self.standing = False, False
         self.reported, self.unique = False, False
         self.seen_ns = ego.stamps_ns[-1]
         self._config = config
@@ -85,7 +90,7 @@ class TrackedObject:
         before = self.state
         self.members, self._motion = members, motion
         self._rejections = deque()
-        self.unique = False
+        self.unique, self.standing = False, False
         if before is not None and before.stamp_ns == ego.stamps_ns[-1]:
             self.continue_from(before.world_T_object, ego)
         else:
@@ -197,6 +202,8 @@ class TrackedObject:
         elif self.moving:
             sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
             self.moving = float(np.linalg.norm(velocity)) + sigma > self._config.min_speed
+        self.standing |= mean.statistic < chdtri(6, _AT_REST)
+        self.standing &= not self.moving
 
     def _frames_back(self, ego: EgoMotion) -> int:
         """How many frames back the motion is taken from, to judge it."""

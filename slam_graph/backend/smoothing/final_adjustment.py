@@ -22,6 +22,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.frame_motions import FrameMotions
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
 from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
@@ -69,12 +70,15 @@ class FinalBa:
             determine no yaw, and of a recording in several segments.
         noise: factors on the noise of the IMU that the covariances were computed with; of the last
             segment.
+        motions: errors of the motions from frame to frame of `history`; None where the recording
+            was adjusted in several segments.
     """
 
     history: StateHistory
     summary: FinalBaSummary
     aligned: FloatArray | None
     noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
+    motions: FrameMotions | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -226,9 +230,9 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     for state in states:
         history.append(state)
     figures = [part.figures for part in solved]
-    aligned = solved[0].aligned if len(solved) == 1 else None
+    aligned, motions = (solved[0].aligned, solved[0].motions) if len(solved) == 1 else (None, None)
     summary = summary_of(figures, len(history), began)
-    return FinalBa(history, summary, aligned, solved[-1].noise)
+    return FinalBa(history, summary, aligned, solved[-1].noise, motions)
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:

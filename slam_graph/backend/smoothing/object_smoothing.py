@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
@@ -26,7 +27,7 @@ from slam_graph.backend.objects.moving_objects import MovingObjects
 from slam_graph.backend.objects.object_history import ObjectHistory
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
-from slam_graph.backend.objects.relative_motion import object_settings
+from slam_graph.backend.objects.relative_motion import RelativeStep, object_settings
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.object_log import ObjectLog
@@ -76,14 +77,14 @@ class ObjectSmoother:
             self._log.add(frame, members)
 
     def smooth(
-        self, objects: MovingObjects, rig: Rig, platform: StateHistory, config: FinalBaConfig
+        self, objects: MovingObjects, rig: Rig, platform: FinalBa, config: FinalBaConfig
     ) -> list[str]:
         """Adjust every object as a whole.
 
         Args:
             objects: as they were estimated on the way; they are given the smoothed ones.
             rig: the best calibration available.
-            platform: its smoothed states.
+            platform: its smoothed trajectory.
             config: settings of the adjustment.
 
         Returns:
@@ -109,14 +110,14 @@ class _ObjectAdjustment:
 
     Attributes:
         rig: the best calibration available.
-        platform: its smoothed states, on the clock of the IMU.
+        platform: its smoothed trajectory, on the clock of the IMU.
         backend: noise and triangulation.
         objects: noise of the object's acceleration.
         config: settings of the adjustment.
     """
 
     rig: Rig
-    platform: StateHistory
+    platform: FinalBa
     backend: BackendConfig
     objects: ObjectsConfig
     config: FinalBaConfig
@@ -132,7 +133,9 @@ class _ObjectAdjustment:
 
         Returns:
             None of them if there are too few observations to improve on these. Covariances of poses
-            are relative to the first one, with that of the platform; motions have none.
+            are relative to the first one, with that of the platform. Those of motions have that of
+            the platform's motion, as if independent; NaN where either was adjusted in several
+            segments. Velocities have none.
 
         Raises:
             EstimationError: if no minimum fits the observations.
@@ -176,7 +179,7 @@ class _ObjectAdjustment:
 
     def _record(self, log: FrameLog, frames: Iterable[FeatureFrame]) -> None:
         """Write the frames at whose time the platform is known, with its motion between them."""
-        path = self.platform.trajectory()
+        path = self.platform.trajectory
         before: NavState | None = None
         for frame in frames:
             stamps_ns = np.array([frame.stamp_ns + self._offset_ns])
@@ -205,28 +208,42 @@ class _ObjectAdjustment:
 
     def _states(self, found: FinalBa, states: Sequence[ObjectState]) -> list[ObjectState]:
         """Smoothed states at the times of those on the way."""
-        relative, platform = _Poses.of(found.history), _Poses.of(self.platform)
+        relative, platform = _Poses.of(found), _Poses.of(self.platform)
         known = []
         for state in states:
             stamp_ns = state.stamp_ns + self._offset_ns
             if stamp_ns in relative.rows and stamp_ns in platform.rows:
                 known.append(_placed(state, *platform.at(stamp_ns), *relative.at(stamp_ns)))
-        return _with_motions(known)
+        return _with_motions(known, relative, platform, self._offset_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """Poses with covariances by their times."""
+    """Poses (N) with covariances, and joint ones (N-1, 12, 12) of neighbours, by their times."""
 
     rows: dict[int, int]
     path: Trajectory
     covariances: FloatArray
+    joint: FloatArray
 
     @staticmethod
-    def of(history: StateHistory) -> _Poses:
-        path = history.trajectory()
+    def of(found: FinalBa) -> _Poses:
+        path = found.trajectory
         rows = {stamp_ns: row for row, stamp_ns in enumerate(path.stamps_ns.tolist())}
-        return _Poses(rows, path, history.pose_covariances())
+        joint = np.full((max(len(path) - 1, 0), 12, 12), np.nan)
+        if found.motions is not None:
+            joint = found.motions.joint_covariances(
+                Rotation.from_quat(path.quaternions).as_matrix()
+            )
+        return _Poses(rows, path, found.history.pose_covariances(), joint)
+
+    def step(self, before_ns: int, now_ns: int) -> RelativeStep:
+        """Two poses; their covariance is NaN unless they are neighbours."""
+        before, now = self.rows[before_ns], self.rows[now_ns]
+        unknown = np.full((12, 12), np.nan)
+        joint = self.joint[before] if now == before + 1 else unknown
+        path = self.path
+        return RelativeStep(before_ns, now_ns, path.pose(before), path.pose(now), joint)
 
     def at(self, stamp_ns: int) -> tuple[gtsam.Pose3, FloatArray]:
         row = self.rows[stamp_ns]
@@ -254,20 +271,30 @@ def _placed(
     )
 
 
-def _with_motions(states: Sequence[ObjectState]) -> list[ObjectState]:
-    """States with the motions and velocities that their poses have."""
-    unknown6, unknown3 = np.full((6, 6), np.nan), np.full((3, 3), np.nan)
+def _with_motions(
+    states: Sequence[ObjectState], relative: _Poses, platform: _Poses, offset_ns: int
+) -> list[ObjectState]:
+    """States with the motions and velocities that their poses have.
+
+    Args:
+        states: smoothed, in the order of time.
+        relative: poses of the platform in the frame of the object.
+        platform: those in the world.
+        offset_ns: from stamps of frames to the clock of these poses.
+    """
     if len(states) < 2:
         return list(states)
-    result = []
+    result, unknown = [], np.full((3, 3), np.nan)
     for k, state in enumerate(states):
+        before, after = states[max(k - 1, 0)], states[min(k + 1, len(states) - 1)]
         step = None
-        if k and state.step is not None and states[k - 1].stamp_ns == state.step.before_ns:
-            motion = states[k - 1].world_T_object.between(state.world_T_object)
-            step = ObjectMotion(states[k - 1].stamp_ns, state.stamp_ns, motion, unknown6)
-        around = states[max(k - 1, 0)], states[min(k + 1, len(states) - 1)]
-        velocity = _velocity(*around)
-        result.append(replace(state, step=step, velocity=velocity, velocity_covariance=unknown3))
+        if k and state.step is not None and before.stamp_ns == state.step.before_ns:
+            stamps = before.stamp_ns + offset_ns, state.stamp_ns + offset_ns
+            ego, covariance = platform.step(*stamps).body_motion()
+            step = ObjectMotion.of(relative.step(*stamps), gtsam.Pose3(), ego, covariance)
+            step = replace(step, before_ns=before.stamp_ns, now_ns=state.stamp_ns)
+        velocity = _velocity(before, after)
+        result.append(replace(state, step=step, velocity=velocity, velocity_covariance=unknown))
     return result
 
 

@@ -26,6 +26,7 @@ from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
+from slam_graph.backend.smoothing.frame_motions import FrameMotions
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import (
     fill_in,
@@ -139,17 +140,18 @@ class AdjustedSegment:
     """The minimum of the cost of a segment.
 
     Attributes:
-        states: of every frame, with covariances relative to position and yaw of the anchor if they
-            could be computed.
+        states: of every frame; covariances, if known, relative to position and yaw of the anchor.
         figures: of the minimum.
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
         noise: factors on the noise of the IMU that the covariances were computed with.
+        motions: errors of the motions from frame to frame, or None.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
     aligned: FloatArray | None
     noise: ImuNoiseFactors
+    motions: FrameMotions | None
 
 
 class BundleAdjustment:
@@ -215,13 +217,14 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned = self._states(self._segment.stamps_ns), None
+        states, aligned, motions = self._states(self._segment.stamps_ns), None, None
         known = self._covariances()
         if known is not None:
             densities = self._factors.densities()
             frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
             states, aligned = with_covariances(states, known, frames)
-        return AdjustedSegment(states, figures, aligned, self.imu_noise)
+            motions = FrameMotions(known, frames)
+        return AdjustedSegment(states, figures, aligned, self.imu_noise, motions)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.

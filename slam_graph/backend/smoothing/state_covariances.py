@@ -198,7 +198,7 @@ def aligned_covariances(
     return _turned(rotations, P.transpose(0, 2, 1), transpose=True)
 
 
-def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
+def with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
     """The joint covariances (K-1, 30, 30) of neighbouring keyframes, with axes of the world."""
     T = np.zeros((len(known.rotations), _ERROR, _ERROR))
     T[:, _ROTATION, _ROTATION] = T[:, _POSITION, _POSITION] = known.rotations
@@ -212,7 +212,7 @@ def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
 
 def _in_world(known: KeyframeCovariances, frames: FrameInterpolation) -> FloatArray:
     """Covariances (N, 15, 15) of all frames, with axes of the world."""
-    a, pairs = frames.part[:, None, None], _with_axes_of_the_world(known)[frames.before]
+    a, pairs = frames.part[:, None, None], with_axes_of_the_world(known)[frames.before]
     first, second = slice(0, _ERROR), slice(_ERROR, 2 * _ERROR)
     cross = pairs[:, first, second]
     P = (1.0 - a) ** 2 * pairs[:, first, first] + a**2 * pairs[:, second, second]
