@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -15,6 +17,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
+from slam_graph.frontend.lost_features import LostFeatures
 from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
@@ -38,6 +41,7 @@ class CameraTracker:
         rng: draws the samples of RANSAC.
         rotation: takes the place of a gyroscope.
         moving: which features move by themselves; without it such are rejected.
+        lost: finds corners again that were lost a few images ago.
 
     Attributes:
         outliers: the features that RANSAC, or the map of the back end, rejected in the last image.
@@ -54,6 +58,7 @@ class CameraTracker:
         rng: np.random.Generator,
         rotation: ImageRotation | None = None,
         moving: MovingTracks | None = None,
+        lost: LostFeatures | None = None,
     ) -> None:
         self._moving = moving or MovingTracks(wanted=False)
         self._camera = mounted.camera
@@ -66,6 +71,7 @@ class CameraTracker:
         self._epipolar = EpipolarTest(mounted.camera, config, rng)
         self._motion_ids: list[IntArray] = []  # of the features of each rigid motion
         self._rotation = rotation
+        self._lost = lost
         self.outliers = Tracks.empty()
 
     def follow(self, before: Tracks, image: Image, stamp_ns: int, feedback: Feedback) -> Tracks:
@@ -80,7 +86,10 @@ class CameraTracker:
         with self._stats.timed("temporal_ms"):
             self._predictor.advance(before.stamp_ns, stamp_ns)
             if self._rotation is not None and before.image is not None:
-                self._predictor.turn(self._rotation.between(before.image, image))
+                turn = self._rotation.between(before.image, image)
+                self._predictor.turn(turn)
+                if self._lost is not None:
+                    self._lost.turn(turn)
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)
             keep = found.good.copy()
@@ -151,7 +160,10 @@ class CameraTracker:
             self._associator.accept(ids, good)
         new = Tracks.of(after.image, after.stamp_ns, ids, points[good], normalized[good])
         new.residual_flow[:] = flow[good]
-        return self._with_corners_of_objects(after.joined(new), next_id + len(ids))
+        found = self._with_corners_of_objects(after.joined(new), next_id + len(ids))
+        if self._lost is not None:
+            self._lost.remember(found)
+        return found
 
     def _with_corners_of_objects(self, tracks: Tracks, next_id: int) -> Tracks:
         """The features, and new ones on objects that have too few."""
@@ -180,6 +192,8 @@ class CameraTracker:
     def forget(self, ids: IntArray) -> None:
         """Do not look for these features any more."""
         self._associator.forget(ids)
+        if self._lost is not None:
+            self._lost.forget(ids)
 
     def _unrolled(self, tracks: Tracks) -> FloatArray:
         """Normalised coordinates (N, 2) of features as all rows would see them at one time."""
@@ -250,7 +264,10 @@ class CameraTracker:
 
     def _recovered(self, before: Tracks, after: Tracks) -> Tracks:
         """The features, and those that were lost and are found again."""
-        ids, points = self._associator.recover(before, after)
+        if self._lost is None:
+            ids, points = self._associator.recover(before, after)
+        else:
+            ids, points = self._lost.found(after, partial(self._epipolar.inliers, after_R_before=None))
         if len(ids) == 0:
             return after
         allowed = self._extractor.allows(points)

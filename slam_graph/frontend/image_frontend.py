@@ -18,6 +18,7 @@ from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, Frontend
 from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
+from slam_graph.frontend.lost_features import LostFeatures
 from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.moving_tracks import MovingTracks
@@ -88,7 +89,7 @@ class ImageFrontend:
         self._references = reference_cameras(rig)
         masks = _masks(rig, config)
         rng = np.random.default_rng(seed)
-        lucas_kanade = LucasKanade(config, images=2 * len(rig.cameras))
+        lucas_kanade = LucasKanade(config, images=2 * len(rig.cameras) + (not rig.has_imu))
         self._moving = MovingTracks(config.keep_moving)
         self._trackers: list[CameraTracker] = []
         self._matchers: dict[int, StereoMatcher] = {}
@@ -113,6 +114,15 @@ class ImageFrontend:
             predictor = PointPredictor(mounted, self._motion, config)
             turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
             rotation = ImageRotation(camera) if turns else None
+            lost = None
+            if rotation is not None and config.method == "klt" and reference == i:
+                lost = LostFeatures(
+                    camera,
+                    rotation,
+                    lucas_kanade,
+                    config.pyramid_levels,
+                    config.forward_backward_px,
+                )
             self._trackers.append(
                 CameraTracker(
                     mounted,
@@ -124,6 +134,7 @@ class ImageFrontend:
                     rng,
                     rotation,
                     self._moving if i == 0 else None,
+                    lost,
                 )
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)

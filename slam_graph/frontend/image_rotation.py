@@ -72,12 +72,19 @@ class ImageRotation:
         enough = _FITTING * float(np.mean(one * one))
         found: list[tuple[float, FloatArray]] = list(zip(costs, guesses, strict=True))
         for k in np.argsort(costs).tolist():
-            aligned = self._aligned(one, other, guesses[k])
-            found.append((self._cost(one, other, aligned), aligned))
+            refined = self._refined(one, other, guesses[k])
+            found.append((self._cost(one, other, refined), refined))
             if found[-1][0] < enough:
                 break
         self._turn = min(found, key=itemgetter(0))[1]
         return self._turn
+
+    def aligned(self, before: Image, after: Image, guess: FloatArray) -> FloatArray:
+        """after_R_before (3, 3) of images that need not follow one another, near a guess."""
+        one, other = self._small(before), self._small(after)
+        found = self._refined(one, other, guess)
+        better = self._cost(one, other, found) < self._cost(one, other, guess)
+        return found if better else guess
 
     def _small(self, image: Image) -> _Small:
         """A small, smooth copy with the mean of its surroundings taken away."""
@@ -109,7 +116,7 @@ class ImageRotation:
             return float("inf")
         return float(np.mean((warped[inside] - one[inside]) ** 2))
 
-    def _aligned(self, one: _Small, other: _Small, R: FloatArray) -> FloatArray:
+    def _refined(self, one: _Small, other: _Small, R: FloatArray) -> FloatArray:
         """The rotation after Gauss-Newton steps."""
         slope_u, slope_v = (
             cv2.Sobel(one, -1, 1, 0, scale=0.125),
