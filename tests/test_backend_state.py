@@ -14,6 +14,7 @@ from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.marginalization.marginalize import marginalize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.stacked_values import stacked_points
 from slam_graph.backend.solve.state import (
     State,
     dim,
@@ -21,7 +22,6 @@ from slam_graph.backend.solve.state import (
     distortion_key,
     imu_state_keys,
     letter_and_index,
-    stacked_points,
 )
 from slam_graph.geometry.trajectory import NavState
 

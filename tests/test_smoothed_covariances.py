@@ -42,7 +42,8 @@ from slam_graph.backend.smoothing.state_elimination import (
     EliminatedStates,
     StateColumns,
 )
-from slam_graph.backend.solve.state import dim, stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_poses
+from slam_graph.backend.solve.state import dim
 from slam_graph.backend.world_gauge import gauge_motion
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import mean_bounds

@@ -298,7 +298,7 @@ class Estimator(EstimatorKnowledge):
         states: list[NavState] = []
         variables = self._context.calibration
         while held:
-            rig = self.rig if self.window is None else variables.rig(self.window.state.estimate)
+            rig = self.rig if self.window is None else variables.rig(self.window.state.frames)
             offset_ns = round(rig.cameras[0].clock_offset_s * 1e9)
             if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break

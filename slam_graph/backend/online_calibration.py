@@ -199,7 +199,7 @@ class CalibrationVariables:
                 block = turn @ block @ turn.T
             blocks[f"{letter}{c}"] = block
             start = stop
-        return CalibrationEstimate(stamp_ns, self.nominal, self.rig(state.estimate), blocks)
+        return CalibrationEstimate(stamp_ns, self.nominal, self.rig(state.frames), blocks)
 
     # --- time offset ------------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class CalibrationVariables:
         if state is None or not (self.estimates_offset or self.rolling):
             return frame_ns + round(offset_s * 1e9)
         if self.estimates_offset:
-            offset_s = float(state.estimate.atVector(T(0))[0]) + self.nominal.cameras[0].middle_s
+            offset_s = float(state.frames.atVector(T(0))[0]) + self.nominal.cameras[0].middle_s
         stamp_ns = frame_ns + round(offset_s * 1e9)
         beyond_ns = stamp_ns - imu.newest_ns()
         return stamp_ns - beyond_ns if 0 < beyond_ns <= MAX_EARLY_NS else stamp_ns

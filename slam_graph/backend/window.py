@@ -15,7 +15,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import State, imu_state_keys, stacked_points
+from slam_graph.backend.solve.state import State, imu_state_keys
 from slam_graph.geometry import NavState
 
 
@@ -90,7 +90,7 @@ class Window:
 
     def points(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of all features that the last step estimated."""
-        in_state = stacked_points(self.state.estimate, self.state_features)
+        in_state = self.state.positions_of(self.state_features)
         ids, points = self.last_points
         other = ~is_in(ids, self.state_features)
         return (

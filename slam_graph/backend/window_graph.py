@@ -26,7 +26,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.gtsam_smoothers.smoother_features import pixel_noise
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import FrameMotion, State, dims_of
+from slam_graph.backend.solve.state import FrameMotion, State, dims_of, letter_and_index
 
 _CALIBRATION_KINDS = frozenset("ekdt")
 """Symbols of the parameters of the rig, which are always linearised at their estimates."""
@@ -112,7 +112,7 @@ class WindowGraph:
 def window_graph(cost: Cost) -> WindowGraph:
     """A cost of the engine as a factor graph."""
     graph = gtsam.NonlinearFactorGraph()
-    values, first = gtsam.Values(cost.state.estimate), gtsam.Values(cost.state.first)
+    values, first = cost.state.estimate, cost.state.first
     losses: list[RobustLoss | None] = []
     if cost.prior.layout.size:
         graph.push_back(_container(cost.prior, first))
@@ -195,8 +195,8 @@ def _projection_error(
         _: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None
     ) -> FloatArray:
         state = State()
-        state.estimate, state.motions = values, motions
-        state.offsets = {key: np.zeros(dim) for key, dim in zip(keys[2:], dims, strict=True)}
+        state.insert_calibration(_calibration_in(values, keys[2:]))
+        state.motions = motions
         now = rig.at(state)
         point = np.asarray(values.atPoint3(keys[1]))[None]
         geometry = Geometry(*now.poses(values, [frame]), point)
@@ -232,6 +232,15 @@ def _turn(jacobian: gtsam.JacobianFactor, tangents: dict[int, FloatArray]) -> No
             A = jacobian.getA()[:, column : column + dim]
             A[:] = A @ tangents[key]
         column += dim
+
+
+def _calibration_in(values: gtsam.Values, keys: list[int]) -> gtsam.Values:
+    """Parameters of the rig alone."""
+    found = gtsam.Values()
+    for key in keys:
+        is_pose = letter_and_index(key)[0] == "e"
+        found.insert(key, values.atPose3(key) if is_pose else values.atVector(key))
+    return found
 
 
 def _copy_calibration(source: gtsam.Values, target: gtsam.Values, key: int) -> None:

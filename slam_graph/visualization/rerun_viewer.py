@@ -236,7 +236,7 @@ class RerunViewer:
         window = estimator.window
         if window is None:
             return
-        rr, values = self._stream.rr, window.state.estimate
+        rr, values = self._stream.rr, window.state.frames
         past = [number for number in window.past if values.exists(X(number))]
         poses = np.array([values.atPose3(X(number)).translation() for number in past])
         held = np.array([number in window.keyframes for number in past], np.bool_)

@@ -97,7 +97,7 @@ class Aiding:
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
         """
         self._data = self._data.within(stamps_ns[0] - _HISTORY_NS, None)
-        first, last = (state.estimate.atPose3(pose_key(i)) for i in frames)
+        first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
         factors: list[gtsam.NonlinearFactor] = []
         if self._config.odometry.enabled:
             moved = self._data.odometry_between(*stamps_ns)

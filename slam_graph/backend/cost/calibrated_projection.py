@@ -13,7 +13,7 @@ with its angular rate and velocity in the body frame then (Li and Mourikis 2014)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -31,7 +31,6 @@ from slam_graph.backend.solve.state import (
     State,
     dims_of,
     distortion_key,
-    stacked_poses,
 )
 
 
@@ -67,7 +66,7 @@ class CalibratedProjection(RigProjection):
 
     def __init__(self, variables: CalibrationVariables, state: State | None = None) -> None:
         """Take the calibration of a state; the nominal one without a state."""
-        rig = variables.nominal if state is None else variables.rig(state.estimate)
+        rig = variables.nominal if state is None else variables.rig(state.frames)
         super().__init__(rig, None if state is None else state.motions)
         self.rolling = variables.rolling
         self.variables = variables
@@ -83,10 +82,10 @@ class CalibratedProjection(RigProjection):
         """The projection with the calibration as it is now, and the motions of frames."""
         return RigProjection(self._rig, motions) if self.rolling else self
 
-    def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
+    def when_taken(
+        self, frames: Sequence[int], rotations: FloatArray, positions: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""
-        frames = list(frames)
-        rotations, positions = stacked_poses(values, frames)
         shift = self._shift(frames)
         if shift is None:
             return rotations, positions
@@ -166,7 +165,7 @@ class CalibratedProjection(RigProjection):
         """
         if self._state is None or not self.variables.estimates_offset or self.rolling:
             return None
-        offset_s = float(self._state.estimate.atVector(T(0))[0])
+        offset_s = float(self._state.frames.atVector(T(0))[0])
         motions = [self._state.motions[i] for i in frames]
         rate = np.array([motion.rate for motion in motions]).reshape(-1, 6)
         late_s = np.array([offset_s - motion.time_offset_s for motion in motions])[:, None]

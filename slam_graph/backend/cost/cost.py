@@ -39,7 +39,7 @@ from slam_graph.backend.cost.gating import (
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
-from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys, stacked_points
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +195,7 @@ class Cost:
         else:
             d = self.prior.d - self.prior.R @ self.state.offset(self.prior.layout)
             total = 0.5 * (float(d @ d) + self.prior.residual)
-            total += sum(factor.error(self.state.estimate) for factor in self.factors)
+            total += sum(factor.error(self.state.frames) for factor in self.factors)
         if linear is not None:
             return total + float(np.sum(self.robust.value(linear.errors)))
         if self.landmarks is not None and len(self.landmarks):
@@ -216,7 +216,7 @@ class Cost:
             points: in the world.
         """
         rig = self.rig.at(self.state)
-        residuals, _ = rig.residuals(obs, self._geometry(rig, self.state.estimate, obs, points))
+        residuals, _ = rig.residuals(obs, self._geometry(rig, obs, points))
         squares = np.einsum("ni,ni->n", residuals, residuals)
         return np.asarray(squares / self.sigmas(obs) ** 2, dtype=np.float64)
 
@@ -241,34 +241,33 @@ class Cost:
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
         rig = self.rig.at(self.state)
-        first, estimate = (
-            self._geometry(rig, values, obs, points)
-            for values in (self.state.first, self.state.estimate)
-        )
+        first = self._geometry(rig, obs, points, first=True)
+        estimate = self._geometry(rig, obs, points)
         return whiten(obs, rig, first, estimate, self.sigmas(obs), self.robust)
 
     def _geometry(
         self,
         rig: RigProjection,
-        values: gtsam.Values,
         obs: Observations,
         points: FloatArray | None,
+        first: bool = False,
     ) -> Geometry:
         """Poses and points of observations; the points of features of the state if not given."""
         if points is None:
-            points = stacked_points(values, obs.ids)
-        return Geometry(*rig.poses(values, obs.frames), points)
+            points = self.state.positions_of(obs.ids, first)
+        poses = self.state.poses(obs.frames, first)
+        return Geometry(*rig.when_taken(obs.frames, *poses), points)
 
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
         rows = []
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
-            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first))
+            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first_frames))
             A, _ = jacobian.jacobian()
             Ab = np.zeros((len(A), layout.size + 1))
             Ab[:, layout.indices(jacobian.keys())] = A
-            Ab[:, -1] = -factor.whitenedError(self.state.estimate)
+            Ab[:, -1] = -factor.whitenedError(self.state.frames)
             rows.append(Ab)
         return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
 
@@ -303,7 +302,7 @@ class Cost:
             points = tracks.points + linear.tracks.point_increments(delta[columns])
             if tracks.in_state.any():
                 ids = tracks.obs.ids[tracks.in_state]
-                points[tracks.in_state] = stacked_points(self.state.estimate, ids)
+                points[tracks.in_state] = self.state.positions_of(ids)
             self.tracks = replace(tracks, points=points)
 
     def snapshot(self) -> tuple[State, TrackFeatures | None]:

@@ -146,12 +146,12 @@ class FeatureSelection:
         good = is_in(obs.ids, known_ids)
         points = np.zeros((len(obs.ids), 3))
         points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
-        here = window.state.estimate.atPose3(X(window.frame)).translation()
+        here = window.state.frames.atPose3(X(window.frame)).translation()
         # steps may have sent a feature with little parallax to infinity
         good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
         if not good.all():
             new, rig = ~good, self.rig.at(window.state)
-            poses = rig.poses(window.state.estimate, obs.frames)
+            poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))
             observed = rig.renormalized(obs.subset(new))
             result = triangulate(observed, rig, *poses, self.config.triangulation)
             noise = float(np.max(self.pixels.sigma_px)) / rig.cameras[0].fx

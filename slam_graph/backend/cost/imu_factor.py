@@ -117,7 +117,7 @@ class Propagation:
         i, j = window.frame, window.frame + 1
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
-        bias = window.state.estimate.atConstantBias(B(i))
+        bias = window.state.frames.atConstantBias(B(i))
         pim = samples.preintegrated(bias, self._params(imu, samples))
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
@@ -152,7 +152,7 @@ class Propagation:
         self._predicted, last = None, self._last
         if last is None or last.covariance is None:
             return
-        transition = _Transition.of(factor, window.state.estimate)
+        transition = _Transition.of(factor, window.state.frames)
         self._predicted = replace(predicted, covariance=transition.predicted(last.covariance))
         if self._counts_vibration():
             dt_s = (window.stamp_ns - last.stamp_ns) * 1e-9
@@ -178,7 +178,7 @@ class Propagation:
         both = State()
         both.insert_imu_state(0, state)
         both.insert_imu_state(1, predicted)
-        transition = _Transition.of(imu_factor(0, 1, pim), both.estimate)
+        transition = _Transition.of(imu_factor(0, 1, pim), both.frames)
         return replace(predicted, covariance=transition.predicted(state.covariance))
 
     def reported(self, state: NavState) -> NavState:

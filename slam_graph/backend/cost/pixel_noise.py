@@ -148,7 +148,7 @@ def _whitened(
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals (N, 2) and derivatives by the points (N, 2, 3), in standard deviations."""
     obs, rig = tracks.obs, cost.rig.at(cost.state)
-    at = Geometry(*rig.poses(cost.state.estimate, obs.frames), tracks.points)
+    at = Geometry(*rig.when_taken(obs.frames, *cost.state.poses(obs.frames)), tracks.points)
     sigma = sigma_px[obs.camera]
     views = rig.views(obs, at)
     by_point = rig.derivatives(obs, at, views)[1]

@@ -28,7 +28,8 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.solve.state import FrameMotion, State, stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_poses
+from slam_graph.backend.solve.state import FrameMotion, State
 from slam_graph.kernels.projection import chain_rule, distort_radtan, to_cameras
 from slam_graph.sensors import Camera, FeatureFrame, Rig
 
@@ -130,7 +131,14 @@ class RigProjection:
 
     def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""
-        return stacked_poses(values, frames)
+        frames = list(frames)
+        return self.when_taken(frames, *stacked_poses(values, frames))
+
+    def when_taken(
+        self, frames: Sequence[int], rotations: FloatArray, positions: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same from the poses of the frames, which may be those of other times."""
+        return rotations, positions
 
     def renormalized(self, obs: Observations) -> Observations:
         """The observations with normalised coordinates by the calibration."""

@@ -100,7 +100,8 @@ def _is_new(
 ) -> bool:
     """Whether a frame sees what the last keyframe did not see, or sees it from elsewhere."""
     body_R_camera = rig.body_R_camera[0]
-    (before, after), _ = rig.poses(window.state.estimate, [keyframe, frame])
+    both = [keyframe, frame]
+    (before, after), _ = rig.when_taken(both, *window.state.poses(both))
     turn = (after @ body_R_camera).T @ before @ body_R_camera
     angles = window.tracks.parallax(keyframe, frame, turn)
     if len(angles) < policy.keyframe_overlap * len(window.tracks.ids_in(frame)):

@@ -25,7 +25,8 @@ from slam_graph.backend.gtsam_smoothers.smoother_features import (
 from slam_graph.backend.gtsam_smoothers.smoother_solvers import SOLVERS, SmootherSolver
 from slam_graph.backend.initialization.first_state import prior_of
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import FrameMotion, State, imu_state_keys, stacked_points
+from slam_graph.backend.solve.stacked_values import stacked_points
+from slam_graph.backend.solve.state import FrameMotion, State, imu_state_keys, nav_state_in
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import ConfigError
@@ -218,17 +219,15 @@ class SmootherEngine:
         assert self._solver is not None
         window.frame, window.stamp_ns = ahead.frame, ahead.stamp_ns
         self._read(ahead)
-        estimate = State()
-        estimate.estimate = self._estimate
         try:
             covariance = self._solver.covariance(imu_state_keys(ahead.frame))
-            state = estimate.nav_state(ahead.frame, ahead.stamp_ns, covariance)
+            state = nav_state_in(self._estimate, ahead.frame, ahead.stamp_ns, covariance)
             window.prior = prior_of(state, ahead.frame)
         except (RuntimeError, np.linalg.LinAlgError):
             self._context.diagnostics.warn(
                 "covariance_predicted", "the graph does not give a covariance"
             )
-            state = estimate.nav_state(ahead.frame, ahead.stamp_ns, predicted.covariance)
+            state = nav_state_in(self._estimate, ahead.frame, ahead.stamp_ns, predicted.covariance)
             window.prior = prior_of(state, ahead.frame)
         window.state = State()
         window.state.insert_imu_state(ahead.frame, state)
@@ -251,7 +250,7 @@ def _values_of(state: State, frame: int) -> gtsam.Values:
     """The pose, velocity and bias of one frame alone."""
     x, v, b = imu_state_keys(frame)
     values = gtsam.Values()
-    values.insert(x, state.estimate.atPose3(x))
-    values.insert(v, state.estimate.atVector(v))
-    values.insert(b, state.estimate.atConstantBias(b))
+    values.insert(x, state.frames.atPose3(x))
+    values.insert(v, state.frames.atVector(v))
+    values.insert(b, state.frames.atConstantBias(b))
     return values

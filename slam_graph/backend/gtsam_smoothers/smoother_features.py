@@ -26,7 +26,8 @@ from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import SmootherPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import FrameMotion, stacked_points, stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_points, stacked_poses
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError
 from slam_graph.sensors import Camera, Rig

@@ -101,7 +101,7 @@ class BatchCost(Cost):
     def triangulated(self, obs: Observations) -> Triangulation:
         """Features from the current estimates of the poses."""
         rig = self.rig.at(self.state)
-        poses = rig.poses(self.state.estimate, obs.frames)
+        poses = rig.when_taken(obs.frames, *self.state.poses(obs.frames))
         return triangulate(rig.renormalized(obs), rig, *poses, self.config.triangulation)
 
 
@@ -216,7 +216,7 @@ class DynamicRefinement:
             needs = f"images and IMU to agree (normalised cost {normalized_cost:.1f})"
             return Refusal("fit", needs)
         velocity_sigma = float(np.sqrt(np.max(np.diag(last.covariance())[6:9])))
-        speed = float(np.linalg.norm(start.state.estimate.atVector(V(start.frame))))
+        speed = float(np.linalg.norm(start.state.frames.atVector(V(start.frame))))
         if velocity_sigma > max(MAX_VELOCITY_SIGMA, self._max_scale_sigma * speed):
             needs = f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
             return Refusal("motion", needs)
@@ -344,7 +344,7 @@ def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInforma
         return float("inf")
     keys = cost.rig.keys_of(features.obs)
     last = X(features.obs.frames[-1])
-    pose = cost.state.estimate.atPose3(last)
+    pose = cost.state.frames.atPose3(last)
     away = features.points - pose.translation()
     distances = np.linalg.norm(away, axis=1)
     toward = away / distances[:, None]

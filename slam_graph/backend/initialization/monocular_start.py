@@ -100,7 +100,7 @@ class MonocularStart:
             self._refusal = outcome
             return None
         world_T_body = self._context.rig.cameras[0].body_T_camera.inverse()
-        there = outcome.state.estimate.atPose3(X(outcome.frame))
+        there = outcome.state.frames.atPose3(X(outcome.frame))
         return moved(outcome, world_T_body.compose(there.inverse()))
 
     def _forget(self) -> None:

@@ -81,7 +81,7 @@ class LandmarkStore:
         for key in conditional.gone.dims:
             symbol = Symbol(key)
             if symbol.chr() == ord("l"):
-                first = np.asarray(state.first.atPoint3(key))
+                (first,) = state.positions_of(np.array([symbol.index()]), first=True)
                 self._places[symbol.index()] = _Place(len(self._conditionals), first)
         offset = np.concatenate([state.offset(part) for part in conditional.layouts])
         self._conditionals.append(conditional.shifted(-offset - self._bases(conditional)))

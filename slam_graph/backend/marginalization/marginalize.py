@@ -95,7 +95,7 @@ def relative_to(
     rest = triangularize(np.hstack([free, prior.Rd]))[4:, 4:]
     fixed, columns = np.zeros((4, count + 1)), layout.indices([pose])
     fixed[:3, columns[3:]] = np.eye(3) / sigmas[0]
-    body_R_world = state.first.atPose3(pose).rotation().matrix().T
+    body_R_world = state.first_frames.atPose3(pose).rotation().matrix().T
     fixed[3, columns[:3]] = body_R_world @ UP / sigmas[1]
     fixed[:, -1] = fixed[:, :-1] @ state.offset(layout)
     return SquareRootInformation(layout, triangularize(np.vstack([rest, fixed])))

@@ -152,8 +152,8 @@ class EgoWindow:
         self._frames = {i: s for i, s in self._frames.items() if s in self._poses}
         past = [i for i in window.past if i in self._frames and i != window.frame]
         for i in past:
-            if window.state.estimate.exists(X(i)):
-                self._poses[self._frames[i]] = window.state.estimate.atPose3(X(i))
+            if window.state.frames.exists(X(i)):
+                self._poses[self._frames[i]] = window.state.frames.atPose3(X(i))
         stamps = tuple(self._poses)
         known = _known(estimator, window.frame, past, self._frames)
         velocity, rate, step = known or _by_state(state, stamps)
@@ -176,7 +176,7 @@ def _known(
         return None
     window = estimator.window
     assert window is not None
-    at = window.state.estimate.atPose3
+    at = window.state.frames.atPose3
     pose = at(X(now))
 
     def relative(i: int) -> FloatArray:

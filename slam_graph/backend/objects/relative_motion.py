@@ -120,7 +120,7 @@ class RelativeMotion:
         for stamp in [s for s in self.poses if s < frame.stamp_ns - self._length_ns]:
             del self.poses[stamp]
             del self._frames[stamp]
-        values, past = window.state.estimate, set(window.past)
+        values, past = window.state.frames, set(window.past)
         for stamp, i in self._frames.items():
             if i in past:
                 self.poses[stamp] = values.atPose3(X(i))

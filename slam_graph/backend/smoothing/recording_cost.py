@@ -24,7 +24,7 @@ from slam_graph.backend.smoothing.state_elimination import (
     EliminatedStates,
     StateColumns,
 )
-from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.kernels.feature_elimination import eliminate_features
 
 

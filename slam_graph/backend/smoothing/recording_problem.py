@@ -61,7 +61,7 @@ from slam_graph.backend.smoothing.state_covariances import (
     with_covariances,
 )
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
-from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import Rig
 

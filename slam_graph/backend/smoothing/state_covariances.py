@@ -28,7 +28,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
-from slam_graph.backend.solve.state import stacked_poses
+from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.world_gauge import gauge_motion
 from slam_graph.geometry import NavState
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -25,6 +26,7 @@ from gtsam.symbol_shorthand import B, D, L, V, X
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.solve.point_table import PointTable
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.geometry import NavState
 
@@ -36,7 +38,7 @@ DIMS = _IMU_STATE_DIMS | _CALIBRATION_DIMS
 number depends on the camera model, and their keys carry it (see `distortion_key`)."""
 
 _LETTER_SHIFT = 56  # GTSAM's symbols: the letter is in the highest of eight bytes
-_INDEX_MASK = (1 << _LETTER_SHIFT) - 1
+INDEX_MASK = (1 << _LETTER_SHIFT) - 1
 _COUNT_SHIFT = 16
 _DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
 _DISTORTION_CODE = ord("d")
@@ -46,7 +48,7 @@ def dim(key: int) -> int:
     """Tangent dimension of the variable of a key."""
     code = key >> _LETTER_SHIFT
     if code == _DISTORTION_CODE:
-        return (key & _INDEX_MASK) >> _COUNT_SHIFT
+        return (key & INDEX_MASK) >> _COUNT_SHIFT
     return _DIMS_BY_CODE[code]
 
 
@@ -65,7 +67,7 @@ def distortion_key(camera: int, coefficients: int) -> int:
 
 def letter_and_index(key: int) -> tuple[str, int]:
     """The letter of a key, and the index of its frame, feature or camera."""
-    letter, index = chr(key >> _LETTER_SHIFT), key & _INDEX_MASK
+    letter, index = chr(key >> _LETTER_SHIFT), key & INDEX_MASK
     return letter, index & ((1 << _COUNT_SHIFT) - 1) if letter == "d" else index
 
 
@@ -119,21 +121,24 @@ class FrameMotion:
 class State:
     """Estimates and linearisation points of all variables in the cost.
 
+    Those of features are in arrays, all others are GTSAM's values.
+
     Attributes:
-        first: linearisation point of every variable.
-        offsets: tangent (dim,) of every variable at its linearisation point; copies share these, so
-            they are replaced and never changed.
-        estimate: current values, first ⊕ offsets.
-        frozen: keys whose linearisation point no longer moves.
+        frames: current values of all variables but features.
+        first_frames: linearisation points of these.
+        points: the features.
         motions: of each frame with a pose, where a time offset is estimated or a shutter rolls.
     """
 
     def __init__(self) -> None:
-        self.first = gtsam.Values()
-        self.estimate = gtsam.Values()
-        self.offsets: dict[int, FloatArray] = {}
-        self.frozen: set[int] = set()
+        self.frames = gtsam.Values()
+        self.first_frames = gtsam.Values()
+        self.points = PointTable.empty()
         self.motions: dict[int, FrameMotion] = {}
+        self._offsets: dict[int, FloatArray] = {}  # arrays are replaced, copies share them
+        self._frozen: set[int] = set()
+        self._poses: dict[int, FloatArray] = {}  # matrices of poses as far as they were asked for
+        self._first_poses: dict[int, FloatArray] = {}
 
     def copy(self) -> State:
         """An independent copy."""
@@ -143,10 +148,74 @@ class State:
 
     def assign(self, other: State) -> None:
         """Take over all values of another state."""
-        self.first, self.estimate = gtsam.Values(other.first), gtsam.Values(other.estimate)
-        self.offsets = dict(other.offsets)
-        self.frozen = set(other.frozen)
-        self.motions = dict(other.motions)
+        self.frames = gtsam.Values(other.frames)
+        self.first_frames = gtsam.Values(other.first_frames)
+        self.points, self.motions = other.points, dict(other.motions)
+        self._offsets, self._frozen = dict(other._offsets), set(other._frozen)
+        self._poses, self._first_poses = dict(other._poses), dict(other._first_poses)
+
+    # --- reading ---------------------------------------------------------------------------------
+
+    @property
+    def estimate(self) -> gtsam.Values:
+        """Current values of all variables, as a new object."""
+        return _joined(self.frames, self.points.ids, self.points.estimate)
+
+    @property
+    def first(self) -> gtsam.Values:
+        """Linearisation points of all variables, as a new object."""
+        return _joined(self.first_frames, self.points.ids, self.points.first)
+
+    @property
+    def offsets(self) -> dict[int, FloatArray]:
+        """Tangent (dim,) of every variable at its linearisation point."""
+        points = zip(landmark_keys(self.points.ids), self.points.offsets, strict=True)
+        return self._offsets | dict(points)
+
+    @property
+    def frozen(self) -> set[int]:
+        """Keys whose linearisation point no longer moves."""
+        return self._frozen.union(landmark_keys(self.points.ids[self.points.frozen]))
+
+    def variables(self) -> list[int]:
+        """Keys of all variables."""
+        return [*self._offsets, *landmark_keys(self.points.ids)]
+
+    def poses(self, frames: Iterable[int], first: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Rotations (F, 3, 3) and positions (F, 3) of some frames, or their first estimates."""
+        values, known = self.frames, self._poses
+        if first:
+            values, known = self.first_frames, self._first_poses
+        matrices = np.empty((len(indices := list(frames)), 4, 4))
+        for row, i in enumerate(indices):
+            matrix = known.get(i)
+            if matrix is None:
+                matrix = known[i] = values.atPose3(X(i)).matrix()
+            matrices[row] = matrix
+        return matrices[:, :3, :3], matrices[:, :3, 3]
+
+    def positions_of(self, features: IntArray, first: bool = False) -> FloatArray:
+        """Positions (N, 3) of some features, or their first estimates.
+
+        Raises:
+            KeyError: if one is not a variable.
+        """
+        rows = self.points.rows(features)
+        return (self.points.first if first else self.points.estimate)[rows]
+
+    def offset(self, layout: Layout) -> FloatArray:
+        """Stacked offset (n,) of the estimates from the linearisation points."""
+        parts, offset = _parts(layout), np.empty(layout.size)
+        for key, columns in parts.others:
+            offset[columns] = self._offsets[key]
+        offset[parts.columns] = self.points.offsets[self.points.rows(parts.features)]
+        return offset
+
+    def nav_state(self, frame: int, stamp_ns: int, covariance: FloatArray | None) -> NavState:
+        """The state of a frame that still has its velocity and bias."""
+        return nav_state_in(self.frames, frame, stamp_ns, covariance)
+
+    # --- which variables there are ---------------------------------------------------------------
 
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
@@ -155,70 +224,73 @@ class State:
         new.insert(X(frame), state.world_T_body)
         new.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
         new.insert(B(frame), bias)
-        self.estimate.insert(new)
-        self.first.insert(new)
-        for key in imu_state_keys(frame):
-            self.offsets[key] = np.zeros(dim(key))
-
-    def insert_point(self, feature: int, point: FloatArray) -> None:
-        """Add a feature at a world position (3,)."""
-        self.estimate.insert(L(feature), point)
-        self.first.insert(L(feature), point)
-        self.offsets[L(feature)] = np.zeros(POINT_DIM)
+        self._insert(new, imu_state_keys(frame))
 
     def insert_calibration(self, values: gtsam.Values) -> None:
         """Add parameters of the rig."""
-        self.estimate.insert(values)
-        self.first.insert(values)
-        for key in values.keys():  # noqa: SIM118
-            self.offsets[key] = np.zeros(dim(key))
+        self._insert(values, values.keys())
 
-    def variables(self) -> list[int]:
-        """Keys of all variables."""
-        return list(self.offsets)
+    def _insert(self, values: gtsam.Values, keys: Iterable[int]) -> None:
+        self.frames.insert(values)
+        self.first_frames.insert(values)
+        for key in keys:
+            self._offsets[key] = np.zeros(dim(key))
+
+    def insert_point(self, feature: int, point: FloatArray) -> None:
+        """Add a feature at a world position (3,)."""
+        self.points = self.points.with_point(feature, point)
 
     def remove(self, keys: Iterable[int]) -> None:
         """Forget variables."""
-        for key in keys:
-            self.estimate.erase(key)
-            self.first.erase(key)
-            del self.offsets[key]
-            self.frozen.discard(key)
+        others, features = _told_apart(keys)
+        self.points = self.points.without(features)
+        for key in others:
+            self.frames.erase(key)
+            self.first_frames.erase(key)
+            del self._offsets[key]
+            self._frozen.discard(key)
+            self._poses.pop(key & INDEX_MASK, None)
+            self._first_poses.pop(key & INDEX_MASK, None)
         if self.motions:
-            self.motions = {i: motion for i, motion in self.motions.items() if X(i) in self.offsets}
+            self.motions = {i: m for i, m in self.motions.items() if X(i) in self._offsets}
+
+    # --- linearisation points --------------------------------------------------------------------
 
     def relinearize(self) -> None:
         """Move the linearisation points of all variables that are not frozen to their estimates."""
+        self.points = self.points.relinearized(self.points.frozen)
         tangents = gtsam.VectorValues()
-        for key, offset in self.offsets.items():
-            if key not in self.frozen and offset.any():
+        for key, offset in self._offsets.items():
+            if key not in self._frozen and offset.any():
                 tangents.insert(key, offset)
-                self.offsets[key] = np.zeros(len(offset))
+                self._offsets[key] = np.zeros(len(offset))
         if tangents.size():  # as the estimates were made, so that they are the same to the bit
-            self.first = self.first.retract(tangents)
+            self.first_frames, self._first_poses = self.first_frames.retract(tangents), {}
 
     def freeze(self, keys: Iterable[int]) -> None:
         """Hold the linearisation points of variables where they are."""
-        self.frozen.update(keys)
+        others, features = _told_apart(keys)
+        self._frozen.update(others)
+        self.points = self.points.with_frozen(features)
 
     def rebase(self) -> None:
         """Move all linearisation points to the estimates, the frozen ones too."""
-        self.frozen.clear()
+        self._frozen.clear()
+        self.points = self.points.relinearized(np.zeros(len(self.points.ids), np.bool_))
         self.relinearize()
 
-    def offset(self, layout: Layout) -> FloatArray:
-        """Stacked offset (n,) of the estimates from the linearisation points."""
-        parts = [self.offsets[key] for key in layout.dims]
-        return np.concatenate(parts) if parts else np.zeros(0)
+    # --- moving ----------------------------------------------------------------------------------
 
     def update(self, layout: Layout, delta: FloatArray) -> None:
         """Add an increment (n,) to the tangents at the linearisation points."""
-        tangents, moved = gtsam.VectorValues(), self.offset(layout) + delta
-        for key, columns in layout.columns.items():
-            self.offsets[key] = moved[columns]
-        for key, offset in self.offsets.items():
+        parts, moved = _parts(layout), self.offset(layout) + delta
+        self.points = self.points.with_offsets(parts.features, moved[parts.columns])
+        for key, columns in parts.others:
+            self._offsets[key] = moved[columns]
+        tangents = gtsam.VectorValues()
+        for key, offset in self._offsets.items():
             tangents.insert(key, offset)
-        self.estimate = self.first.retract(tangents)
+        self.frames, self._poses = self.first_frames.retract(tangents), {}
 
     def moved(self, motion: gtsam.Pose3) -> State:
         """The same state in a world that is moved.
@@ -228,60 +300,76 @@ class State:
                 gravity stays.
         """
         other, turn = self.copy(), motion.rotation().matrix()
-        for values in (other.first, other.estimate):
-            for key in self.offsets:
+        other.points = self.points.transformed(turn, motion.translation())
+        for values in (other.frames, other.first_frames):
+            for key in self._offsets:
                 letter = letter_and_index(key)[0]
                 if letter == "x":
                     values.update(key, motion.compose(values.atPose3(key)))
                 elif letter == "v":
                     values.update(key, turn @ values.atVector(key))
-                elif letter == "l":
-                    values.update(key, motion.transformFrom(values.atPoint3(key)))
-        for key, offset in self.offsets.items():  # those of poses are of the body
-            if letter_and_index(key)[0] in "vl":
-                other.offsets[key] = turn @ offset
+        for key, offset in self._offsets.items():  # those of poses are of the body
+            if letter_and_index(key)[0] == "v":
+                other._offsets[key] = turn @ offset
+        other._poses, other._first_poses = {}, {}
         return other
 
-    def nav_state(self, frame: int, stamp_ns: int, covariance: FloatArray | None) -> NavState:
-        """The state of a frame that still has its velocity and bias."""
-        bias = self.estimate.atConstantBias(B(frame))
-        return NavState(
-            stamp_ns,
-            self.estimate.atPose3(X(frame)),
-            np.asarray(self.estimate.atVector(V(frame))),
-            accel_bias=np.asarray(bias.accelerometer()),
-            gyro_bias=np.asarray(bias.gyroscope()),
-            covariance=covariance,
-        )
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """A layout, with the features apart.
 
-def stacked_poses(values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
-    """Rotations (F, 3, 3) and positions (F, 3) of the poses of some frames."""
-    none = np.zeros((0, 4))
-    matrices = np.concatenate([none, *(values.atPose3(X(i)).matrix() for i in frames)])
-    matrices = matrices.reshape(-1, 4, 4)
-    return matrices[:, :3, :3], matrices[:, :3, 3]
-
-
-def stacked_points(values: gtsam.Values, features: IntArray) -> FloatArray:
-    """Positions (J, 3) of some features.
-
-    Raises:
-        KeyError: if one is not among the values.
+    Attributes:
+        others: keys and columns of all variables but features.
+        features: ids (J,) of the features.
+        columns: (J, 3) of these.
     """
-    if len(features) == 0:
-        return np.zeros((0, 3))
-    keys = np.array(values.keys())
-    first, end = keys.searchsorted((L(0), L(_INDEX_MASK)))
-    known = keys[first:end] - L(0)
-    places = known.searchsorted(features)
-    if len(known) == 0 or (known[np.minimum(places, len(known) - 1)] != features).any():
-        raise KeyError(f"not all of the features {features.tolist()} are variables")
-    # one by one they would take three times as long; these are all variables of three numbers, in
-    # the order of keys
-    before = sum(dim(key) == POINT_DIM for key in keys[:first].tolist())
-    rows = gtsam.utilities.extractPoint3(values)[before + places]
-    return np.ascontiguousarray(rows, dtype=np.float64)
+
+    others: list[tuple[int, slice]]
+    features: IntArray
+    columns: IntArray
+
+
+@lru_cache(maxsize=8)
+def _parts(layout: Layout) -> _Parts:
+    """The parts of a layout: one is asked for several times in a step."""
+    others, features = _told_apart(layout.dims)
+    starts = [layout.starts[key] for key in landmark_keys(features)]
+    columns = np.array(starts, np.int64)[:, None] + np.arange(POINT_DIM)
+    return _Parts([(key, layout.columns[key]) for key in others], features, columns)
+
+
+def _told_apart(keys: Iterable[int]) -> tuple[list[int], IntArray]:
+    """Keys of all variables but features, and ids (J,) of the features."""
+    others, features, lowest = [], [], L(0)
+    for key in keys:
+        if lowest <= key <= lowest + INDEX_MASK:
+            features.append(key - lowest)
+        else:
+            others.append(key)
+    return others, np.array(features, np.int64)
+
+
+def _joined(frames: gtsam.Values, ids: IntArray, points: FloatArray) -> gtsam.Values:
+    values = gtsam.Values(frames)
+    for key, point in zip(landmark_keys(ids), points, strict=True):
+        values.insert(key, point)
+    return values
+
+
+def nav_state_in(
+    values: gtsam.Values, frame: int, stamp_ns: int, covariance: FloatArray | None
+) -> NavState:
+    """The state of a frame whose pose, velocity and bias are among some values."""
+    bias = values.atConstantBias(B(frame))
+    return NavState(
+        stamp_ns,
+        values.atPose3(X(frame)),
+        np.asarray(values.atVector(V(frame))),
+        accel_bias=np.asarray(bias.accelerometer()),
+        gyro_bias=np.asarray(bias.gyroscope()),
+        covariance=covariance,
+    )
 
 
 def landmark_keys(ids: IntArray) -> list[int]:
