@@ -11,7 +11,9 @@ from gtsam.symbol_shorthand import B, E, L, T, V, X
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
+from slam_graph.backend.cost.feature_factors import SummedFeatures
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.triangulation import first_centres
 from slam_graph.backend.marginalization.marginalize import marginalize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.stacked_values import stacked_points
@@ -194,6 +196,31 @@ def test_a_cost_is_restored_with_its_features() -> None:
     assert_same_values(state.estimate, estimate)
     np.testing.assert_array_equal(cost.tracks.points, truth.points)
     assert cost.value() == pytest.approx(error, rel=1e-12)
+
+
+def test_a_feature_that_is_nearer_than_it_was_taken_for_stays_before_the_camera() -> None:
+    """In metres the same increments lead behind it, and the step that is right is refused."""
+    times_s = np.linspace(0.0, 1.0, 6)
+    cameras = rig(1)
+    obs, truth = scene(Flight(), cameras, room(200, np.random.default_rng(0)), times_s)
+    state = State()
+    for frame, t_s in enumerate(times_s):
+        state.insert_imu_state(frame, Flight().nav_state(float(t_s)))
+    cost = Cost(state, RigProjection(cameras), BackendConfig(), SquareRootInformation.empty())
+    cost.prior = cost.prior.extended(dims_of(X(i) for i in range(len(times_s))))
+    centres = first_centres(obs, cost.rig, state.estimate)
+    too_far = centres + 4.0 * (truth.points - centres)
+    cost.tracks = TrackFeatures(obs, too_far, np.zeros(len(obs.ids), np.bool_))
+    linear, layout = cost.linearize(summed=True), cost.layout()
+    assert isinstance(linear.tracks, SummedFeatures)
+    increments = linear.tracks.point_increments(np.zeros(layout.size))
+    rays = truth.points - centres
+    assert np.mean(np.sum((too_far + increments - centres) * rays, axis=1) < 0.0) > 0.5
+    before = cost.value()
+    cost.apply(np.zeros(layout.size), linear, layout)
+    assert cost.value() < 0.1 * before
+    assert cost.tracks is not None
+    assert np.all(np.sum((cost.tracks.points - centres) * rays, axis=1) > 0.0)
 
 
 @pytest.mark.parametrize("first_estimates", [True, False])

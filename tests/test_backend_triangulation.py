@@ -10,7 +10,11 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.cost.triangulation import Triangulation, triangulate
+from slam_graph.backend.cost.triangulation import (
+    Triangulation,
+    moved_in_inverse_depth,
+    triangulate,
+)
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 
@@ -202,3 +206,23 @@ def test_a_flight_straight_at_the_wall_gives_finite_numbers() -> None:
     assert np.isfinite(result.points).all()
     assert np.isfinite(result.reprojection_px).all()
     assert FORWARD[0, 2] == 1.0  # the camera looks along the flight
+
+
+def test_an_increment_in_inverse_depth_is_that_in_metres_to_first_order() -> None:
+    rng = np.random.default_rng(4)
+    points, centres, increments = rng.normal(size=(3, 50, 3))
+    step = 1e-4
+    moved = moved_in_inverse_depth(points, step * increments, centres)
+    size = np.linalg.norm(points - centres, axis=1, keepdims=True)
+    assert np.all(np.abs(moved - points - step * increments) < 100 * step**2 / size)
+
+
+def test_an_increment_along_a_ray_changes_the_inverse_depth_by_what_it_says() -> None:
+    """And never leads through the camera."""
+    centres, ray = np.zeros((4, 3)), np.array([0.6, 0.0, 0.8])
+    depths, increments = np.array([2.0, 2.0, 2.0, 20.0]), np.array([0.5, -0.5, -100.0, 19.0])
+    moved = moved_in_inverse_depth(depths[:, None] * ray, increments[:, None] * ray, centres)
+    found = moved @ ray
+    np.testing.assert_allclose(1.0 / found, 1.0 / depths - increments / depths**2, rtol=1e-12)
+    np.testing.assert_allclose(moved, found[:, None] * ray, atol=1e-12)
+    assert np.all(found > 0.0)

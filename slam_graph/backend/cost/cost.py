@@ -38,6 +38,7 @@ from slam_graph.backend.cost.gating import (
 )
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
@@ -291,15 +292,19 @@ class Cost:
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the estimates by an increment (n,), and the new features with them.
 
-        A new feature goes where it fits the moved poses best. One that becomes a variable of the
-        state goes where the increment says: a damped one is shorter. With two positions its rows
-        would be linearised at one, and its first estimate would be the other.
+        A new feature goes where it fits the moved poses best, in inverse depth: one with little
+        parallax would otherwise jump, and stop a step that is good for all others. One that becomes
+        a variable of the state goes where the increment says: a damped one is shorter. With two
+        positions its rows would be linearised at one, and its first estimate would be the other.
         """
+        before = self.state.estimate
         self.state.update(layout, delta)
         if self.tracks is not None and linear.tracks is not None:
             assert isinstance(linear.tracks, SummedFeatures)
             tracks, columns = self.tracks, layout.indices(self.rig.keys_of(self.tracks.obs))
-            points = tracks.points + linear.tracks.point_increments(delta[columns])
+            increments = linear.tracks.point_increments(delta[columns])
+            centres = first_centres(tracks.obs, self.rig.at(self.state), before)
+            points = moved_in_inverse_depth(tracks.points, increments, centres)
             if tracks.in_state.any():
                 ids = tracks.obs.ids[tracks.in_state]
                 points[tracks.in_state] = self.state.positions_of(ids)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -22,6 +23,10 @@ from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.kernels.ray_triangulation import triangulate_rays
 from slam_graph.sensors import FeatureFrame, Rig
+
+_LEAST_INVERSE_DEPTH = 1e-2
+"""An increment changes an inverse depth by no smaller factor."""
+_TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +85,27 @@ def triangulate(
     return Triangulation(points, good, np.sqrt(squares / np.diff(starts)), depth_error)
 
 
+def moved_in_inverse_depth(
+    points: FloatArray, increments: FloatArray, centres: FloatArray
+) -> FloatArray:
+    """Points (J, 3) moved by increments that are linear in (α, β, ρ), and not in metres.
+
+    Both are the same to first order. The reprojection error of a point with little parallax is
+    nearly linear in its inverse depth and far from linear in its depth, so that an increment in
+    metres may lead through the camera.
+
+    Args:
+        points: (J, 3) in the world.
+        increments: (J, 3) in metres.
+        centres: (J, 3) of the cameras whose inverse depth is meant.
+    """
+    rays = points - centres
+    nearer = -np.sum(increments * rays, axis=1, keepdims=True)
+    nearer /= np.maximum(np.sum(rays**2, axis=1, keepdims=True), _TINY)
+    across = increments + nearer * rays
+    return np.asarray(centres + (rays + across) / np.maximum(1.0 + nearer, _LEAST_INVERSE_DEPTH))
+
+
 def triangulate_frames(
     ids: IntArray,
     frames: Sequence[FeatureFrame],
@@ -119,6 +145,12 @@ def triangulate_frames(
         reprojection_px[seen], depth_error[seen] = found.reprojection_px, found.depth_error
     place = np.searchsorted(ascending, ids)
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
+
+
+def first_centres(obs: Observations, rig: RigProjection, values: gtsam.Values) -> FloatArray:
+    """Positions (J, 3) in the world of the cameras that observed each feature first."""
+    _, positions = _world_cameras(obs, rig, *rig.poses(values, obs.frames))
+    return positions[obs.starts[:-1]]
 
 
 def _world_cameras(
