@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -100,7 +101,7 @@ class Estimator(EstimatorKnowledge):
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
         # the matrices are small: waking threads for them costs many times what they save
-        self._threads = ThreadpoolController()
+        self._blas = ThreadpoolController().select(user_api="blas")
         self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.diagnostics = diagnostics
@@ -190,7 +191,7 @@ class Estimator(EstimatorKnowledge):
             waits; where one has waited, the state may be that of an earlier frame, and `states`
             has all that were found.
         """
-        with self._threads.limit(limits=1, user_api="blas"):
+        with self._one_thread():
             self.replayed = None
             if self._held is None:
                 state = self._take(frame)
@@ -203,10 +204,16 @@ class Estimator(EstimatorKnowledge):
 
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
-        with self._threads.limit(limits=1, user_api="blas"):
+        with self._one_thread():
             self.replayed = None
             self.states = self._take_held(self._held or deque(), MAX_EARLY_NS)
             return self.states
+
+    def _one_thread(self) -> AbstractContextManager[object]:
+        """No more than one thread for BLAS; to set what is set already takes ten times as long."""
+        if all(library.num_threads == 1 for library in self._blas.lib_controllers):
+            return nullcontext()
+        return self._blas.limit(limits=1)
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """The state at a frame; all of them anew once fixes tell where their world is."""

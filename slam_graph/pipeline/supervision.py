@@ -7,10 +7,13 @@ from __future__ import annotations
 import logging
 import math
 import time
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
+from operator import attrgetter
 
 import numpy as np
 
@@ -117,8 +120,8 @@ class Agreement:
             self._earlier_ns = self._tests.popleft().stamp_ns
         if self._tests[0].tested_s > begin_s:
             return
-        late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
-        recent = list(self._tests)[late[0] - 1 :]
+        late = bisect_right(self._tests, begin_s, key=attrgetter("tested_s"))
+        recent = list(islice(self._tests, late - 1, None))
         share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
         if share > self._limits.max_rejected_share:
             raise DivergenceError(
