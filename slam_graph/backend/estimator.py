@@ -11,10 +11,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
@@ -37,6 +35,7 @@ from slam_graph.backend.initialization.start_calibration import FoundCalibration
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.solve.single_thread import SingleThread
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -100,8 +99,7 @@ class Estimator(EstimatorKnowledge):
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
-        # the matrices are small: waking threads for them costs many times what they save
-        self._blas = ThreadpoolController().select(user_api="blas")
+        self._single_thread = SingleThread()
         self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.diagnostics = diagnostics
@@ -191,7 +189,7 @@ class Estimator(EstimatorKnowledge):
             waits; where one has waited, the state may be that of an earlier frame, and `states`
             has all that were found.
         """
-        with self._one_thread():
+        with self._single_thread.held():
             self.replayed = None
             if self._held is None:
                 state = self._take(frame)
@@ -204,16 +202,10 @@ class Estimator(EstimatorKnowledge):
 
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
-        with self._one_thread():
+        with self._single_thread.held():
             self.replayed = None
             self.states = self._take_held(self._held or deque(), MAX_EARLY_NS)
             return self.states
-
-    def _one_thread(self) -> AbstractContextManager[object]:
-        """No more than one thread for BLAS; to set what is set already takes ten times as long."""
-        if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return nullcontext()
-        return self._blas.limit(limits=1)
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """The state at a frame; all of them anew once fixes tell where their world is."""

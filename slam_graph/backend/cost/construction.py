@@ -319,8 +319,8 @@ class CostConstruction:
             self.rejected = ascending_union(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
             cost.tracks = cost.tracks.subset(gate.tracks)
-            for row in np.flatnonzero(cost.tracks.in_state):
-                cost.state.insert_point(int(cost.tracks.obs.ids[row]), cost.tracks.points[row])
+            new = cost.tracks.in_state
+            cost.state.insert_points(cost.tracks.obs.ids[new], cost.tracks.points[new])
         return Linearization.of(landmarks, tracks, cost.tracks.obs if cost.tracks else None)
 
     # --- what stays ------------------------------------------------------------------------------
