@@ -260,16 +260,17 @@ class Cost:
 
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
-        rows = []
+        end, first, now = 0, self.state.first_frames, self.state.frames
+        Ab = np.zeros((sum(factor.dim() for factor in self.factors), layout.size + 1), order="F")
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
-            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first_frames))
+            jacobian = gtsam.JacobianFactor(factor.linearize(first))
             A, _ = jacobian.jacobian()
-            Ab = np.zeros((len(A), layout.size + 1))
-            Ab[:, layout.indices(jacobian.keys())] = A
-            Ab[:, -1] = -factor.whitenedError(self.state.frames)
-            rows.append(Ab)
-        return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
+            rows = slice(end, end + len(A))
+            Ab[rows, layout.indices(jacobian.keys())] = A
+            Ab[rows, -1] = -factor.whitenedError(now)
+            end = rows.stop
+        return Ab
 
     def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of all observations, in the order that LAPACK takes."""

@@ -115,7 +115,9 @@ def _step(
     posterior = _system(cost, linear, layout, predicted)
     delta = posterior.solution()
     cost.apply(delta, linear, layout)
-    return posterior.shifted(delta), delta, _promised(posterior)
+    promised = _promised(posterior)
+    moved = posterior.shifted(delta, overwrite=posterior is not predicted)
+    return moved, delta, promised
 
 
 def linearized(cost: Cost, linear: Linearization | None = None) -> SquareRootInformation:
@@ -138,12 +140,13 @@ def _system(
     rows = cost.rows(linear, layout)
     if predicted is None:
         rows = np.concatenate([cost.factor_rows(layout), rows])
-        return cost.prior_at_estimate().updated(rows)
+        return cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
+    extended = predicted
     if layout is not predicted.layout:
         known = predicted.layout.dims
         new = {key: dim for key, dim in layout.dims.items() if key not in known}
-        predicted = predicted.extended(new)
-    return predicted.updated(rows)
+        extended = predicted.extended(new)
+    return extended.updated(rows, overwrite=extended is not predicted, overwrite_rows=True)
 
 
 def _levenberg_marquardt(

@@ -160,17 +160,27 @@ class SquareRootInformation:
         Rd[m, m] = self.Rd[n, n]
         return SquareRootInformation(layout, Rd)
 
-    def shifted(self, delta: FloatArray) -> SquareRootInformation:
-        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖²."""
-        Rd = self.Rd.copy(order="F")
+    def shifted(self, delta: FloatArray, overwrite: bool = False) -> SquareRootInformation:
+        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖².
+
+        Args:
+            delta: (n,).
+            overwrite: whether this Gaussian, which nobody needs any more, may be changed.
+        """
+        Rd = self.Rd if overwrite else self.Rd.copy(order="F")
         Rd[:-1, -1] -= self.R @ delta
         return SquareRootInformation(self.layout, Rd)
 
-    def updated(self, Ab: FloatArray) -> SquareRootInformation:
+    def updated(
+        self, Ab: FloatArray, overwrite: bool = False, overwrite_rows: bool = False
+    ) -> SquareRootInformation:
         """Fold in measurement rows.
 
         Args:
             Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
+            overwrite: whether this Gaussian, which nobody needs any more, may be changed: copies
+                of large matrices take a good part of the time.
+            overwrite_rows: the same of the rows.
         """
         if len(Ab) == 0:
             return self
@@ -180,7 +190,9 @@ class SquareRootInformation:
         Ab = Ab[:, first:]
         if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
-        triangle, rows = self.Rd[first:, first:].copy(order="F"), Ab.copy(order="F")
+        in_place = overwrite and first == 0
+        triangle = self.Rd if in_place else self.Rd[first:, first:].copy(order="F")
+        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
         block = min(_BLOCK_SIZE, len(triangle))
         # in the copies themselves: new memory costs as much as the arithmetic
         triangle, _, _, info = lapack.dtpqrt(
@@ -190,7 +202,7 @@ class SquareRootInformation:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
         if first == 0:
             return SquareRootInformation(self.layout, triangle)
-        Rd = self.Rd.copy(order="F")
+        Rd = self.Rd if overwrite else self.Rd.copy(order="F")
         Rd[first:, first:] = triangle
         return SquareRootInformation(self.layout, Rd)
 
