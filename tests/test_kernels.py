@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.kernels.ascending import are_among, are_among_numpy
 from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
 from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
 from slam_graph.kernels.epipolar import (
@@ -24,6 +25,8 @@ from slam_graph.kernels.feature_elimination import (
 from slam_graph.kernels.feature_sums import (
     block_sums,
     block_sums_numpy,
+    extents,
+    extents_numpy,
     sum_of_features,
     sum_of_features_numpy,
 )
@@ -207,6 +210,25 @@ def test_block_sums() -> None:
     block_sums_numpy(r, by_point, camera % 2, starts, 3, found[1])
     assert same(*found)
     assert np.any(found[0] == 0.0)
+
+
+def test_extents() -> None:
+    rng = np.random.default_rng(8)
+    *_, camera, starts = tracks(rng, 0)
+    pixels, found = rng.uniform(0.0, 700.0, (len(camera), 2)), np.empty((2, len(starts) - 1, 5))
+    extents(pixels, camera % 4, starts, found[0])
+    extents_numpy(pixels, camera % 4, starts, found[1])
+    assert same(*found)
+    assert np.all(found[0, :, 4] == 0.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_are_among(count: int) -> None:
+    rng = np.random.default_rng(9)
+    values, ascending = rng.integers(0, 60, 100), np.sort(rng.choice(50, count, replace=False))
+    found = are_among(values, ascending)
+    assert np.array_equal(found, are_among_numpy(values, ascending))
+    assert found.any() == (count > 0)
 
 
 def disk(radius: int) -> np.ndarray:

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
@@ -36,6 +35,7 @@ from slam_graph.backend.initialization.start_calibration import FoundCalibration
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.solve.single_thread import SingleThread
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -100,8 +100,7 @@ class Estimator(EstimatorKnowledge):
         self._held: deque[FeatureFrame] | None = None
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
-        # the matrices are small: waking threads for them costs many times what they save
-        self._threads = ThreadpoolController()
+        self._single_thread = SingleThread()
         self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.diagnostics = diagnostics
@@ -192,7 +191,7 @@ class Estimator(EstimatorKnowledge):
             waits; where one has waited, the state may be that of an earlier frame, and `states`
             has all that were found.
         """
-        with self._threads.limit(limits=1, user_api="blas"):
+        with self._single_thread.held():
             self.replayed = None
             if self._held is None:
                 state = self._take(frame)
@@ -205,7 +204,7 @@ class Estimator(EstimatorKnowledge):
 
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
-        with self._threads.limit(limits=1, user_api="blas"):
+        with self._single_thread.held():
             self.replayed = None
             self.states = self._take_held(self._held or deque(), MAX_EARLY_NS)
             return self.states

@@ -15,7 +15,14 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["block_sums", "block_sums_numpy", "sum_of_features", "sum_of_features_numpy"]
+__all__ = [
+    "block_sums",
+    "block_sums_numpy",
+    "extents",
+    "extents_numpy",
+    "sum_of_features",
+    "sum_of_features_numpy",
+]
 
 _REGULARISATION = 1e-15
 """Information that is added to a feature, relative to what its observations say of it."""
@@ -165,6 +172,38 @@ def _orthonormalize_numpy(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
         root = np.linalg.cholesky(squares + _REGULARISATION * np.trace(squares) * np.eye(3)).T
         Q, R = Q @ np.linalg.inv(root), root @ R
     return Q, R
+
+
+@compiled("void(f8[:, :], i8[:], i8[::1], f8[:, ::1])")
+def extents(pixels: FloatArray, camera: IntArray, starts: IntArray, diagonals: FloatArray) -> None:
+    """How far J features move in the image of each camera: diagonals of boxes around them.
+
+    Args:
+        pixels: (N, 2) of the observations, those of one feature after the other.
+        camera: (N,) camera of each observation.
+        starts: (J + 1,) first observation of each feature, and N.
+        diagonals: (J, C), filled; 0 where a camera does not see a feature.
+    """
+    for j in range(len(diagonals)):
+        for c in range(diagonals.shape[1]):
+            left = top = math.inf
+            right = bottom = -math.inf
+            for n in range(starts[j], starts[j + 1]):
+                if camera[n] == c:
+                    left, right = min(left, pixels[n, 0]), max(right, pixels[n, 0])
+                    top, bottom = min(top, pixels[n, 1]), max(bottom, pixels[n, 1])
+            width, height = max(right - left, 0.0), max(bottom - top, 0.0)
+            diagonals[j, c] = math.sqrt(width * width + height * height)
+
+
+def extents_numpy(
+    pixels: FloatArray, camera: IntArray, starts: IntArray, diagonals: FloatArray
+) -> None:
+    """`extents` in NumPy."""
+    for j, c in np.ndindex(diagonals.shape):
+        rows = slice(starts[j], starts[j + 1])
+        seen = pixels[rows][camera[rows] == c]
+        diagonals[j, c] = np.linalg.norm(np.ptp(seen, axis=0)) if len(seen) else 0.0
 
 
 @compiled("void(f8[:, ::1], f8[:, :, ::1], i8[:], i8[::1], i8, f8[:, :, ::1])")

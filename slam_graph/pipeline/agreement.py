@@ -5,8 +5,11 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
+from operator import attrgetter
 
 import numpy as np
 
@@ -127,8 +130,8 @@ class Disagreement:
             self._earlier_ns = self._tests.popleft().stamp_ns
         if self._tests[0].tested_s > begin_s:
             return
-        late = [k for k, test in enumerate(self._tests) if test.tested_s > begin_s]
-        recent = list(self._tests)[late[0] - 1 :]
+        late = bisect_right(self._tests, begin_s, key=attrgetter("tested_s"))
+        recent = list(islice(self._tests, late - 1, None))
         share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
         if share > self._limit:
             raise DivergenceError(

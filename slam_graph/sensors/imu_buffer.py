@@ -57,21 +57,20 @@ class ImuBuffer:
         if len(self.data) == 0:
             return float("inf")
         t = self.data.stamps_ns
-        before = t[: int(np.searchsorted(t, start_ns, side="right"))][-1:]
-        after = t[int(np.searchsorted(t, end_ns)) :][:1]
-        inside = t[(t > start_ns) & (t < end_ns)]
-        first = before if len(before) else [start_ns]
-        last = after if len(after) else [end_ns]
-        return float(np.max(np.diff(np.concatenate([first, inside, last])))) * 1e-9
+        first, last = int(t.searchsorted(start_ns, side="right")), int(t.searchsorted(end_ns))
+        stamps = t[max(first - 1, 0) : last + 1]
+        if first == 0:
+            stamps = np.append(start_ns, stamps)
+        if last == len(t):
+            stamps = np.append(stamps, end_ns)
+        return float((stamps[1:] - stamps[:-1]).max(initial=0)) * 1e-9
 
     def between(self, start_ns: int, end_ns: int) -> ImuData:
         """Samples at both ends (interpolated, or the nearest held) and all in between."""
         t = self.data.stamps_ns
         if len(t) == 0:  # nothing known: the caller asks `largest_gap_s` first
             return ImuData(np.array([start_ns, end_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
-        inside = slice(
-            int(np.searchsorted(t, start_ns, side="right")), int(np.searchsorted(t, end_ns))
-        )
+        inside = slice(int(t.searchsorted(start_ns, side="right")), int(t.searchsorted(end_ns)))
         around = slice(max(inside.start - 1, 0), inside.stop + 1)
         stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
         seconds = (t[around] - start_ns) * 1e-9

@@ -7,6 +7,7 @@ Time is an integer in nanoseconds (`stamp_ns`) on the clock of the IMU.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
 
@@ -220,6 +221,8 @@ class FeatureFrame:
         """
         missing = (FeatureObservations.empty(),) * (cameras - len(self.cameras))
         seen = self.cameras + missing
+        if all(math.isfinite(c.pixels.sum() + c.normalized.sum()) for c in seen):
+            return (FeatureFrame(self.stamp_ns, seen) if missing else self), 0
         good = [np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in seen]
         bad = sum(int(np.sum(~rows)) for rows in good)
         if not bad:

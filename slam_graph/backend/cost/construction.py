@@ -141,7 +141,8 @@ class CostConstruction:
             removals.add_features(Outcome.STANDSTILL, window.state_features)
             return self._constructed(window, cost, poses, window.state_features, removals)
         poses = self._selected_poses(window)
-        predicted = cost.prior_at_estimate().updated(cost.factor_rows(cost.layout()))
+        rows = cost.factor_rows(cost.layout())
+        predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
         waiting = window.tracks.ids_waiting()
         in_state = window.state_features[is_in(window.state_features, waiting)]
         cost.landmarks = window.tracks.observations(in_state)
@@ -319,8 +320,8 @@ class CostConstruction:
             self.rejected = ascending_union(self.rejected, bad_ids)
             removals.add_features(Outcome.GATED, bad_ids)
             cost.tracks = cost.tracks.subset(gate.tracks)
-            for row in np.flatnonzero(cost.tracks.in_state):
-                cost.state.insert_point(int(cost.tracks.obs.ids[row]), cost.tracks.points[row])
+            new = cost.tracks.in_state
+            cost.state.insert_points(cost.tracks.obs.ids[new], cost.tracks.points[new])
         return Linearization.of(landmarks, tracks, cost.tracks.obs if cost.tracks else None)
 
     # --- what stays ------------------------------------------------------------------------------

@@ -22,9 +22,9 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     SummedFeatures,
     WhitenedObservations,
-    new_variable_rows,
-    null_space_rows,
-    state_rows,
+    fill_new_variable_rows,
+    fill_null_space_rows,
+    fill_state_rows,
     sum_features,
     whiten,
 )
@@ -149,7 +149,7 @@ class Cost:
             keys += self.rig.keys_of(tracks.obs)
             keys += landmark_keys(tracks.obs.ids[tracks.in_state])
         known = self.prior.layout
-        new = dims_of(k for k in dict.fromkeys(keys) if k not in known)
+        new = dims_of(k for k in dict.fromkeys(keys) if k not in known.dims)
         layout = self._layout[1] if self._layout is not None else known
         if list(layout.dims) != [*known.dims, *new]:
             layout = known.extended(new)
@@ -261,31 +261,36 @@ class Cost:
 
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
-        rows = []
+        end, first, now = 0, self.state.first_frames, self.state.frames
+        Ab = np.zeros((sum(factor.dim() for factor in self.factors), layout.size + 1), order="F")
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
-            jacobian = gtsam.JacobianFactor(factor.linearize(self.state.first_frames))
+            jacobian = gtsam.JacobianFactor(factor.linearize(first))
             A, _ = jacobian.jacobian()
-            Ab = np.zeros((len(A), layout.size + 1))
-            Ab[:, layout.indices(jacobian.keys())] = A
-            Ab[:, -1] = -factor.whitenedError(self.state.frames)
-            rows.append(Ab)
-        return np.concatenate(rows) if rows else np.zeros((0, layout.size + 1))
+            rows = slice(end, end + len(A))
+            Ab[rows, layout.indices(jacobian.keys())] = A
+            Ab[rows, -1] = -factor.whitenedError(now)
+            end = rows.stop
+        return Ab
 
     def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
-        """Rows [A b] (m, n + 1) of all observations."""
-        landmarks, tracks, parts = linear.landmarks, linear.tracks, []
+        """Rows [A b] (m, n + 1) of all observations, in the order that LAPACK takes."""
+        landmarks, tracks, new = linear.landmarks, linear.tracks, np.zeros(0, np.int64)
+        single = 0 if landmarks is None else 2 * len(landmarks.r)
+        end = single
+        if tracks is not None and self.tracks is not None:
+            assert isinstance(tracks, SummedFeatures)
+            new, end = np.flatnonzero(self.tracks.in_state), single + len(tracks.rows)
+        Ab = np.zeros((end + POINT_DIM * len(new), layout.size + 1), order="F")
         if landmarks is not None and self.landmarks is not None:
-            parts.append(state_rows(landmarks, self._state_columns(self.landmarks, layout), layout))
+            fill_state_rows(Ab[:single], landmarks, self._state_columns(self.landmarks, layout))
         if tracks is not None and self.tracks is not None:
             assert isinstance(tracks, SummedFeatures)
             columns = layout.indices(self.rig.keys_of(self.tracks.obs))
-            parts.append(null_space_rows(tracks, columns, layout))
-            new = np.flatnonzero(self.tracks.in_state)
-            if len(new):
-                keys = landmark_keys(self.tracks.obs.ids[new])
-                parts.append(new_variable_rows(tracks, new, keys, columns, layout))
-        return np.concatenate(parts) if parts else np.zeros((0, layout.size + 1))
+            fill_null_space_rows(Ab[single:end], tracks, columns)
+            own = layout.indices(landmark_keys(self.tracks.obs.ids[new]))
+            fill_new_variable_rows(Ab[end:], tracks, new, own, columns)
+        return Ab
 
     # --- moving --------------------------------------------------------------------------------
 
@@ -337,13 +342,13 @@ class Cost:
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
         innovations, confidence = Innovations(), self.config.gating.confidence
-        keys = self._gated_keys(linear)
-        if not keys:
+        columns, of_poses = self._gated_columns(linear, predicted.layout)
+        first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
+        if first == predicted.layout.size:  # no observations
             return Gate(landmarks, tracks, innovations)
-        layout, root = Layout(dims_of(keys)), predicted.columns_of_root(keys)
+        root = predicted.root_from(first)
         if linear.landmarks is not None and self.landmarks is not None:
-            columns = self._state_columns(self.landmarks, layout)
-            distance = distances_of_observations(linear.landmarks, root, columns)
+            distance = distances_of_observations(linear.landmarks, root, columns - first)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
@@ -355,8 +360,9 @@ class Cost:
             obs, observations = self.tracks.obs, linear.tracks
             if tested is not None:
                 obs, observations = obs.subset(tested), observations.subset(tested[obs.feature])
-            of_poses = root[:, layout.indices(self.rig.keys_of(obs))]
-            distance = distances_of_tracks(obs, observations, of_poses.T @ of_poses)
+            root_of_poses = root[:, of_poses - first]
+            covariance = root_of_poses.T @ root_of_poses
+            distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM
             largest = threshold(dof, confidence)
             passed = distance < largest
@@ -364,15 +370,16 @@ class Cost:
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
         return Gate(landmarks, tracks, innovations)
 
-    def _gated_keys(self, linear: Linearization) -> list[int]:
-        """Keys of all variables that the observations depend on, without the new features."""
-        keys: list[int] = []
+    def _gated_columns(
+        self, linear: Linearization, layout: Layout
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns of observations of features of the state (N, 9 + C), and of those of tracks."""
+        columns, of_poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
         if linear.landmarks is not None and self.landmarks is not None:
-            keys += landmark_keys(self.landmarks.ids[self.landmarks.counts > 0])
-            keys += self.rig.keys_of(self.landmarks)
+            columns = self._state_columns(self.landmarks, layout)
         if linear.tracks is not None and self.tracks is not None:
-            keys += self.rig.keys_of(self.tracks.obs)
-        return list(dict.fromkeys(keys))
+            of_poses = layout.indices(self.rig.keys_of(self.tracks.obs))
+        return columns, of_poses
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""

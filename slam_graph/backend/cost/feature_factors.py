@@ -38,7 +38,6 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
@@ -250,36 +249,39 @@ def eliminate_points(
     return np.triu(A[:, :3]), B
 
 
-def state_rows(
-    linear: WhitenedObservations, columns: NDArray[np.intp], layout: Layout
-) -> FloatArray:
-    """The rows of observations of features of the state."""
-    Ab = np.zeros((len(columns), 2, layout.size + 1))
-    Ab[np.arange(len(columns))[:, None], :, columns] = linear.H.transpose(0, 2, 1)
-    Ab[:, :, -1] = linear.r
-    return Ab.reshape(-1, layout.size + 1)
+def fill_state_rows(
+    Ab: FloatArray, linear: WhitenedObservations, columns: NDArray[np.intp]
+) -> None:
+    """The rows of N observations of features of the state, which have (N, 9 + C) columns."""
+    rows = np.arange(len(Ab)).reshape(-1, 2)
+    Ab[rows[:, :, None], columns[:, None, :]] = linear.H
+    Ab[:, -1] = linear.r.ravel()
 
 
-def null_space_rows(
-    linear: SummedFeatures, columns: NDArray[np.intp], layout: Layout
-) -> FloatArray:
+def fill_null_space_rows(Ab: FloatArray, linear: SummedFeatures, columns: NDArray[np.intp]) -> None:
     """What new features say of all else, at most 6 F + C + 1 rows."""
-    Ab = np.zeros((len(linear.rows), layout.size + 1))
     Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
-    return Ab
 
 
-def new_variable_rows(
+def fill_new_variable_rows(
+    Ab: FloatArray,
     linear: SummedFeatures,
     new: IntArray,
-    keys: list[int],
+    own: NDArray[np.intp],
     columns: NDArray[np.intp],
-    layout: Layout,
-) -> FloatArray:
-    """The three rows that determine each feature (K,) of J that becomes a variable, and its key."""
-    Ab = np.zeros((len(new), POINT_DIM, layout.size + 1))
-    for row, j, key in zip(Ab, new, keys, strict=True):
-        row[:, layout.columns[key]] = linear.R_f[j]
-    Ab[:, :, columns] = linear.T[new]
-    Ab[:, :, -1] = linear.r_1[new]
-    return Ab.reshape(-1, layout.size + 1)
+) -> None:
+    """The three rows that determine each feature (K,) of J that becomes a variable.
+
+    Args:
+        Ab: (3 K, n + 1), filled.
+        linear: of all J features.
+        new: (K,) those that become variables.
+        own: (3 K,) their columns.
+        columns: (6 F + C,) of poses and calibration.
+    """
+    if len(new) == 0:
+        return
+    rows = np.arange(len(Ab)).reshape(-1, POINT_DIM)
+    Ab[rows[:, :, None], own.reshape(-1, 1, POINT_DIM)] = linear.R_f[new]
+    Ab[:, columns] = linear.T[new].reshape(len(Ab), -1)
+    Ab[:, -1] = linear.r_1[new].ravel()

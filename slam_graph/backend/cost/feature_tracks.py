@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import FeatureFrame
 
 
@@ -356,11 +357,7 @@ def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
-    if len(ascending) == 0:
-        return np.zeros(len(values), np.bool_)
-    place = ascending.searchsorted(values)
-    np.minimum(place, len(ascending) - 1, out=place)
-    return np.asarray(ascending[place] == values)
+    return are_among(values, ascending)
 
 
 def sorted_unique(values: IntArray) -> IntArray:
@@ -372,4 +369,7 @@ def sorted_unique(values: IntArray) -> IntArray:
 
 def ascending_union(*parts: IntArray) -> IntArray:
     """The distinct values of some arrays, ascending; NumPy's functions take twice as long."""
-    return sorted_unique(np.sort(np.concatenate([np.zeros(0, np.int64), *parts])))
+    some = [part for part in parts if len(part)]
+    if not some:
+        return np.zeros(0, np.int64)
+    return sorted_unique(np.sort(np.concatenate(some) if len(some) > 1 else some[0]))

@@ -59,9 +59,8 @@ class Innovations:
         entered, counts = distances[passed], np.bincount(dof[passed])
         degrees, limits = np.flatnonzero(counts), np.zeros(len(counts))
         limits[dof[passed]] = largest[passed]
-        k, q = 0.5 * degrees, 0.5 * limits[degrees]
-        # a χ² variable of k degrees of freedom, cut off at q, has the mean k F(k + 2, q) / F(k, q)
-        means = degrees * gammainc(k + 1.0, q) / gammainc(k, q)
+        kinds = zip(degrees.tolist(), limits[degrees].tolist(), strict=True)
+        means = np.array([_mean_below(*kind) for kind in kinds])
         return Innovations(
             len(distances),
             len(distances) - len(entered),
@@ -148,6 +147,13 @@ def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:
     """The χ² quantile for each number of degrees of freedom."""
     table = _quantiles(int(dof.max(initial=1)), confidence)
     return table[dof]
+
+
+@lru_cache(maxsize=1024)
+def _mean_below(dof: int, limit: float) -> float:
+    """The mean k F(k + 2, q) / F(k, q) of a χ² variable of k degrees of freedom, cut off at q."""
+    k, q = 0.5 * dof, 0.5 * limit
+    return float(dof * gammainc(k + 1.0, q) / gammainc(k, q))
 
 
 @lru_cache(maxsize=64)

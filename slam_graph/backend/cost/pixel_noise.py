@@ -32,7 +32,7 @@ from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry
-from slam_graph.kernels.feature_sums import block_sums
+from slam_graph.kernels.feature_sums import block_sums, extents
 
 BLOCK = 8
 """Consecutive observations of a camera that are averaged. Shorter blocks miss what lasts longer."""
@@ -136,11 +136,9 @@ class PixelNoise:
 
 def _extents_px(obs: Observations, cameras: int) -> FloatArray:
     """Diagonals (J,) of the smallest boxes around the tracks, in the camera where it is largest."""
-    least = np.full((len(obs.ids), cameras, 2), np.inf)
-    largest = -least
-    np.minimum.at(least, (obs.feature, obs.camera), obs.pixels)
-    np.maximum.at(largest, (obs.feature, obs.camera), obs.pixels)
-    return np.asarray(np.linalg.norm(np.maximum(largest - least, 0.0), axis=2).max(axis=1))
+    diagonals = np.empty((len(obs.ids), cameras))
+    extents(obs.pixels, obs.camera, obs.starts, diagonals)
+    return np.asarray(diagonals.max(axis=1))
 
 
 def _whitened(

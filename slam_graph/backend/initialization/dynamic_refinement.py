@@ -285,8 +285,7 @@ class DynamicRefinement:
         chosen = np.zeros(len(live), np.bool_)
         chosen[order] = True
         chosen &= live
-        for j in np.flatnonzero(chosen):
-            cost.state.insert_point(int(tracks.obs.ids[j]), tracks.points[j])
+        cost.state.insert_points(tracks.obs.ids[chosen], tracks.points[chosen])
         cost.tracks = replace(tracks, in_state=chosen)
         return tracks.obs.ids[chosen]
 

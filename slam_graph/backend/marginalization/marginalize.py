@@ -194,4 +194,4 @@ def marginalize(
     elif points == "corrected":
         prior = relinearized(prior, state)
     state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
-    return prior.shifted(-state.offset(prior.layout))
+    return prior.shifted(-state.offset(prior.layout), overwrite=True)

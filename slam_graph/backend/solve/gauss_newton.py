@@ -38,7 +38,8 @@ class Minimum:
 
     Attributes:
         posterior: over an increment of the final estimates, linearised where the last step was.
-        costs: the cost before the first step and after each step that was taken.
+        costs: the cost before the first step and after each step that was taken; of a single step
+            that nothing depends on by what it promised, which takes no time.
         repeated: whether there were more steps than the policy has, because one was too large.
     """
 
@@ -74,11 +75,12 @@ def minimize(
         return _levenberg_marquardt(cost, policy, linear)
     linear = linear or cost.linearize(summed=True)
     layout, before = cost.layout(), cost.value(linear, predicted)
-    posterior, delta = _step(cost, linear, layout, predicted)
-    minimum = Minimum(posterior, (before, cost.value()))
+    posterior, delta, promised = _step(cost, linear, layout, predicted)
+    judged = policy.max_steps > 1 or again is not None
+    minimum = Minimum(posterior, (before, cost.value() if judged else before - promised))
     while _another(policy, minimum, delta, again):
         undo = cost.snapshot()
-        posterior, delta = _step(cost, cost.linearize(summed=True), layout)
+        posterior, delta, _ = _step(cost, cost.linearize(summed=True), layout)
         value = cost.value()
         if not value < minimum.costs[-1]:
             cost.restore(undo)
@@ -103,12 +105,19 @@ def _step(
     linear: Linearization,
     layout: Layout,
     predicted: SquareRootInformation | None = None,
-) -> tuple[SquareRootInformation, FloatArray]:
-    """Move a cost by one step: the posterior, at the new estimates, and the step (n,)."""
+) -> tuple[SquareRootInformation, FloatArray, float]:
+    """Move a cost by one step.
+
+    Returns:
+        The posterior, at the new estimates; the step (n,); and by how much the cost falls if it is
+        as linear as it was taken for.
+    """
     posterior = _system(cost, linear, layout, predicted)
     delta = posterior.solution()
     cost.apply(delta, linear, layout)
-    return posterior.shifted(delta), delta
+    promised = _promised(posterior)
+    moved = posterior.shifted(delta, overwrite=posterior is not predicted)
+    return moved, delta, promised
 
 
 def linearized(cost: Cost, linear: Linearization | None = None) -> SquareRootInformation:
@@ -131,9 +140,13 @@ def _system(
     rows = cost.rows(linear, layout)
     if predicted is None:
         rows = np.concatenate([cost.factor_rows(layout), rows])
-        return cost.prior_at_estimate().updated(rows)
-    new = {key: dim for key, dim in layout.dims.items() if key not in predicted.layout}
-    return predicted.extended(new).updated(rows)
+        return cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
+    extended = predicted
+    if layout is not predicted.layout:
+        known = predicted.layout.dims
+        new = {key: dim for key, dim in layout.dims.items() if key not in known}
+        extended = predicted.extended(new)
+    return extended.updated(rows, overwrite=extended is not predicted, overwrite_rows=True)
 
 
 def _levenberg_marquardt(

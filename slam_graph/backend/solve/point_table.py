@@ -54,16 +54,25 @@ class PointTable:
             raise KeyError(f"not all of the features {ids.tolist()} are variables")
         return rows
 
-    def with_point(self, feature: int, point: FloatArray) -> PointTable:
-        """With one more feature, at a position (3,)."""
-        row = int(self.ids.searchsorted(feature))
-        if row < len(self.ids) and self.ids[row] == feature:
-            raise KeyError(f"feature {feature} is a variable already")
+    def with_points(self, ids: IntArray, points: FloatArray) -> PointTable:
+        """With more features, at positions (N, 3).
+
+        Raises:
+            KeyError: if one of them is a variable already.
+        """
+        if len(ids) == 0:
+            return self
+        all_ids = np.concatenate([self.ids, ids])
+        order = np.argsort(all_ids)
+        ascending = all_ids[order]
+        if (ascending[1:] == ascending[:-1]).any():
+            raise KeyError(f"some of the features {ids.tolist()} are variables already")
+        none = np.zeros((len(ids), 3))
         return PointTable(
-            np.insert(self.ids, row, feature),
-            np.insert(self.first, row, point, axis=0),
-            np.insert(self.offsets, row, 0.0, axis=0),
-            np.insert(self.frozen, row, False),
+            ascending,
+            np.concatenate([self.first, points])[order],
+            np.concatenate([self.offsets, none])[order],
+            np.concatenate([self.frozen, np.zeros(len(ids), np.bool_)])[order],
         )
 
     def without(self, ids: IntArray) -> PointTable:

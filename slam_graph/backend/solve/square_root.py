@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.kernels.elimination import eliminate_columns
 
 _BLOCK_SIZE = 16
@@ -160,25 +160,39 @@ class SquareRootInformation:
         Rd[m, m] = self.Rd[n, n]
         return SquareRootInformation(layout, Rd)
 
-    def shifted(self, delta: FloatArray) -> SquareRootInformation:
-        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖²."""
-        Rd = self.Rd.copy(order="F")
+    def shifted(self, delta: FloatArray, overwrite: bool = False) -> SquareRootInformation:
+        """The same cost as a function of δ - delta: ‖R (δ + delta) - d‖².
+
+        Args:
+            delta: (n,).
+            overwrite: whether this Gaussian, which nobody needs any more, may be changed.
+        """
+        Rd = self.Rd if overwrite else self.Rd.copy(order="F")
         Rd[:-1, -1] -= self.R @ delta
         return SquareRootInformation(self.layout, Rd)
 
-    def updated(self, Ab: FloatArray) -> SquareRootInformation:
+    def updated(
+        self, Ab: FloatArray, overwrite: bool = False, overwrite_rows: bool = False
+    ) -> SquareRootInformation:
         """Fold in measurement rows.
 
         Args:
             Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
+            overwrite: whether this Gaussian, which nobody needs any more, may be changed: copies
+                of large matrices take a good part of the time.
+            overwrite_rows: the same of the rows.
         """
         if len(Ab) == 0:
             return self
-        first = int(np.argmax(Ab.any(axis=0)))  # columns to the left are not touched
+        first = 0  # columns to the left are not touched
+        if not Ab[:, 0].any():
+            first = int(np.argmax(Ab.any(axis=0)))
         Ab = Ab[:, first:]
         if len(Ab) > 2 * Ab.shape[1]:
             Ab = triangularize(Ab)
-        triangle, rows = self.Rd[first:, first:].copy(order="F"), Ab.copy(order="F")
+        in_place = overwrite and first == 0
+        triangle = self.Rd if in_place else self.Rd[first:, first:].copy(order="F")
+        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
         block = min(_BLOCK_SIZE, len(triangle))
         # in the copies themselves: new memory costs as much as the arithmetic
         triangle, _, _, info = lapack.dtpqrt(
@@ -188,7 +202,7 @@ class SquareRootInformation:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
         if first == 0:
             return SquareRootInformation(self.layout, triangle)
-        Rd = self.Rd.copy(order="F")
+        Rd = self.Rd if overwrite else self.Rd.copy(order="F")
         Rd[first:, first:] = triangle
         return SquareRootInformation(self.layout, Rd)
 
@@ -216,14 +230,17 @@ class SquareRootInformation:
         first = int(columns.min(initial=self.layout.size))
         size = self.layout.size - first
         if 3 * len(columns) > size:  # the inverse of all is cheaper: it leaves zeros out
-            inverse = _inverse(self.R[first:, first:])
-            return np.ascontiguousarray(inverse[columns - first]).T
+            return self.root_from(first)[:, columns - first]
         right = np.zeros((size, len(columns)), order="F")
         right[columns - first, np.arange(len(columns))] = 1.0
         root, info = lapack.dtrtrs(self.R[first:, first:], right, trans=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(root, dtype=np.float64)
+
+    def root_from(self, first: int) -> FloatArray:
+        """A root (m, m) of the covariance of all columns from one on, R⁻ᵀ of these."""
+        return np.asfortranarray(_inverse(self.R[first:, first:]).T)
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
@@ -310,4 +327,12 @@ def triangularize(Ab: FloatArray) -> FloatArray:
     qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
-    return np.asfortranarray(np.triu(qr[:n]))
+    triangle = np.zeros((n, n), order="F")
+    np.copyto(triangle, qr[:n], where=_upper(n))
+    return triangle
+
+
+@lru_cache(maxsize=64)
+def _upper(n: int) -> BoolArray:
+    """(n, n) where an upper triangle is."""
+    return np.asfortranarray(np.tri(n, dtype=np.bool_).T)

@@ -42,6 +42,8 @@ INDEX_MASK = (1 << _LETTER_SHIFT) - 1
 _COUNT_SHIFT = 16
 _DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
 _DISTORTION_CODE = ord("d")
+_FIRST_POINT = L(0)
+_LAST_POINT = _FIRST_POINT + INDEX_MASK
 
 
 def dim(key: int) -> int:
@@ -238,7 +240,11 @@ class State:
 
     def insert_point(self, feature: int, point: FloatArray) -> None:
         """Add a feature at a world position (3,)."""
-        self.points = self.points.with_point(feature, point)
+        self.insert_points(np.array([feature]), point[None])
+
+    def insert_points(self, features: IntArray, points: FloatArray) -> None:
+        """Add features (N,) at world positions (N, 3)."""
+        self.points = self.points.with_points(features, points)
 
     def remove(self, keys: Iterable[int]) -> None:
         """Forget variables."""
@@ -336,17 +342,15 @@ def _parts(layout: Layout) -> _Parts:
     others, features = _told_apart(layout.dims)
     starts = [layout.starts[key] for key in landmark_keys(features)]
     columns = np.array(starts, np.int64)[:, None] + np.arange(POINT_DIM)
-    return _Parts([(key, layout.columns[key]) for key in others], features, columns)
+    slices = [slice(layout.starts[key], layout.starts[key] + layout.dims[key]) for key in others]
+    return _Parts(list(zip(others, slices, strict=True)), features, columns)
 
 
 def _told_apart(keys: Iterable[int]) -> tuple[list[int], IntArray]:
     """Keys of all variables but features, and ids (J,) of the features."""
-    others, features, lowest = [], [], L(0)
-    for key in keys:
-        if lowest <= key <= lowest + INDEX_MASK:
-            features.append(key - lowest)
-        else:
-            others.append(key)
+    chosen = list(keys)
+    features = [key - _FIRST_POINT for key in chosen if _FIRST_POINT <= key <= _LAST_POINT]
+    others = [key for key in chosen if not _FIRST_POINT <= key <= _LAST_POINT]
     return others, np.array(features, np.int64)
 
 
