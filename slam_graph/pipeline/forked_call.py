@@ -36,6 +36,9 @@ _LARGE = 1 << 15
 _GRACE_S = 2.0
 """Time for the process to end, when it is not wanted any more, before it is killed."""
 
+_END = b""
+"""Message that ends the process."""
+
 A = TypeVar("A")
 R = TypeVar("R")
 
@@ -128,6 +131,8 @@ class ForkedCall(Generic[A, R]):
 
     def close(self) -> None:
         """End the process."""
+        with suppress(OSError):
+            self._connection.send_bytes(_END)  # another fork may hold this end of the socket too
         self._connection.close()
         self._process.join(_GRACE_S)
         self._process.kill()
@@ -203,20 +208,19 @@ def _serve(
     arrays: _SharedArrays,
     diagnostics: Diagnostics,
 ) -> None:
-    """The life of the process: do calls until the other end of the connection is closed."""
+    """The life of the process: do calls until it is told to end, or nobody is there any more."""
     of_parent.close()  # or it would never be closed
     Interrupts.leave_to_parent()
     gc.freeze()  # a collection would copy all memory that is still shared
     held = diagnostics.hold()
     with suppress(EOFError, OSError):
-        while True:
-            argument: A = pickle.loads(connection.recv_bytes())
+        while asked := connection.recv_bytes():
             try:
-                message = arrays.packed(_Outcome(function(argument), None, held))
+                answer = arrays.packed(_Outcome(function(pickle.loads(asked)), None, held))
             except Exception as error:
-                message = arrays.packed(_Outcome(None, _portable(error), held))
+                answer = arrays.packed(_Outcome(None, _portable(error), held))
             held.clear()
-            connection.send_bytes(message)
+            connection.send_bytes(answer)
 
 
 def _portable(error: Exception) -> Exception:
