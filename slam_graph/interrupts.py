@@ -129,10 +129,10 @@ def end_with(pipe: int) -> None:
 
 
 def leave_to_parent() -> None:
-    """Let Ctrl-C and SIGTERM do nothing in this process: its parent gets them too, and ends it."""
+    """Let Ctrl-C do nothing in this process, whose parent gets it too, and SIGTERM end it."""
     signal.set_wakeup_fd(-1)  # of an event loop of the parent
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 class Interrupts:

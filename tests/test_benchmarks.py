@@ -253,6 +253,21 @@ def test_the_parts_of_a_frame_add_up_to_its_cost() -> None:
     assert min(parts.values()) >= 0.0
 
 
+def test_the_least_of_overlapped_runs_counts_in_flows() -> None:
+    def run(wall: float, back: float, front: float) -> dict[str, float]:
+        return {"wall": wall, "cpu": back, "cpu_front_end": front}
+
+    table = {
+        "reference": [2.0, 3.0, 90.0],
+        "in_turn": [run(15.0, 14.0, 0.0), run(12.0, 16.0, 0.0)],
+        "overlapped": [run(9.0, 8.0, 5.0), run(10.0, 7.0, 6.0)],
+    }
+    values = {metric.key: metric.value for metric in speed.overlap_figures(table)}
+    assert values["wall_overlapped"] == pytest.approx(3.0)
+    assert values["wall_ratio"] == pytest.approx(9.0 / 12.0)
+    assert (values["cpu_back_end"], values["cpu_front_end"]) == pytest.approx((7 / 3, 5 / 3))
+
+
 def test_the_reference_flow_takes_time_on_any_image() -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (60, 80), dtype=np.uint8)

@@ -146,6 +146,11 @@ def test_a_process_that_is_killed_ends_the_run_with_one_line(flight: Path) -> No
     assert result.logs.frames == 5
 
 
+def test_sigterm_to_the_process_interrupts_the_run(flight: Path) -> None:
+    result = run_of(flight, lambda: os.kill(os.getpid(), signal.SIGTERM), True)
+    assert (result.status, result.logs.frames) == ("interrupted", 5)
+
+
 def test_results_are_complete_and_of_their_own() -> None:
     """Also arrays for which there is no room in the shared memory, and many results in a row."""
 
@@ -182,7 +187,7 @@ result.check()
 
 @pytest.mark.parametrize(
     ("number", "to_all"),
-    [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGKILL, False)],
+    [(signal.SIGINT, True), (signal.SIGTERM, True), (signal.SIGKILL, False)],
 )
 def test_no_process_is_left(flight: Path, number: signal.Signals, to_all: bool) -> None:
     """After a signal to the whole group, as from a terminal, or to the back end alone."""

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import gc
 import mmap
-import os
 import pickle
 import signal
 import sys
-import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import current_process, get_all_start_methods, get_context
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, Generic, NoReturn, TypeVar
 
@@ -35,6 +35,9 @@ _LARGE = 1 << 15
 
 _GRACE_S = 2.0
 """Time for the process to end, when it is not wanted any more, before it is killed."""
+
+_END = b""
+"""Message that ends the process."""
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -62,7 +65,7 @@ class ForkedCall(Generic[A, R]):
     """A call that is done in a process of its own, while the caller does other work.
 
     The process ends with this one, however that ends: the socket between them is closed then. It
-    leaves signals to this one.
+    leaves Ctrl-C to this one; SIGTERM ends it, and is an interruption of this one.
 
     Args:
         function: called in the process, one call after the other. What it changes is seen by later
@@ -76,20 +79,26 @@ class ForkedCall(Generic[A, R]):
         self._diagnostics = diagnostics
         self._connection, theirs = Pipe()
         self._arrays = _SharedArrays(room)
+        self._process = get_context("fork").Process(
+            target=_serve,
+            args=(function, theirs, self._connection, self._arrays, diagnostics),
+            daemon=True,
+        )
         with warnings.catch_warnings():
             # Python 3.12 warns where there are threads. Those of OpenBLAS end before a fork, OpenCV
             # does without its own, and no other one shares a lock with the function.
             warnings.simplefilter("ignore", DeprecationWarning)
-            self._pid = os.fork()
-        if self._pid == 0:
-            self._connection.close()
-            _serve(function, theirs, self._arrays, diagnostics)
+            self._process.start()
         theirs.close()
 
     @staticmethod
     def is_possible() -> bool:
-        """Whether a process can be forked here: libraries of macOS do not survive it."""
-        return hasattr(os, "fork") and sys.platform != "darwin"
+        """Whether a process can be forked here.
+
+        Libraries of macOS do not survive it, and a daemon of `multiprocessing` may not.
+        """
+        forks = "fork" in get_all_start_methods() and sys.platform != "darwin"
+        return forks and not current_process().daemon
 
     def begin(self, argument: A) -> None:
         """Ask for the next call, after the result of the one before.
@@ -122,28 +131,20 @@ class ForkedCall(Generic[A, R]):
 
     def close(self) -> None:
         """End the process."""
+        with suppress(OSError):
+            self._connection.send_bytes(_END)  # another fork may hold this end of the socket too
         self._connection.close()
-        give_up = time.monotonic() + _GRACE_S
-        while self._pid and not self._has_ended():
-            if time.monotonic() > give_up:
-                os.kill(self._pid, signal.SIGKILL)
-            time.sleep(0.002)
-
-    def _has_ended(self, options: int = getattr(os, "WNOHANG", 0)) -> bool:
-        """Whether the process has ended, or wait until then; `_how` says how."""
-        try:
-            pid, status = os.waitpid(self._pid, options)
-        except ChildProcessError:  # somebody else has waited for it
-            pid, status = self._pid, 0
-        if pid == 0:
-            return False
-        self._pid, self._how = 0, os.waitstatus_to_exitcode(status)
-        return True
+        self._process.join(_GRACE_S)
+        self._process.kill()
+        self._process.join()
 
     def _lost(self) -> NoReturn:
         """The process has ended without being asked to."""
-        self._has_ended(0)
-        how = f"signal {-self._how}" if self._how < 0 else f"exit code {self._how}"
+        self._process.join()
+        code = self._process.exitcode or 0
+        if code == -signal.SIGTERM:
+            raise KeyboardInterrupt from None  # this process is sent it too, perhaps later
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
         raise EstimationError(
             f"the process of the front end has ended ({how}); "
             "overlap=false runs it in the process of the back end"
@@ -203,29 +204,23 @@ class _SharedArrays:
 def _serve(
     function: Callable[[A], R],
     connection: Connection,
+    of_parent: Connection,
     arrays: _SharedArrays,
     diagnostics: Diagnostics,
-) -> NoReturn:
-    """The life of the process: do calls until the other end of the connection is closed.
-
-    It never returns into the code that it was forked from, and runs none of its exit handlers.
-    """
-    try:
-        Interrupts.leave_to_parent()
-        gc.freeze()  # a collection would copy all memory that is still shared
-        held = diagnostics.hold()
-        while True:
-            argument: A = pickle.loads(connection.recv_bytes())
+) -> None:
+    """The life of the process: do calls until it is told to end, or nobody is there any more."""
+    of_parent.close()  # or it would never be closed
+    Interrupts.leave_to_parent()
+    gc.freeze()  # a collection would copy all memory that is still shared
+    held = diagnostics.hold()
+    with suppress(EOFError, OSError):
+        while asked := connection.recv_bytes():
             try:
-                message = arrays.packed(_Outcome(function(argument), None, held))
+                answer = arrays.packed(_Outcome(function(pickle.loads(asked)), None, held))
             except Exception as error:
-                message = arrays.packed(_Outcome(None, _portable(error), held))
+                answer = arrays.packed(_Outcome(None, _portable(error), held))
             held.clear()
-            connection.send_bytes(message)
-    except (EOFError, OSError):
-        os._exit(0)
-    finally:
-        os._exit(1)
+            connection.send_bytes(answer)
 
 
 def _portable(error: Exception) -> Exception:

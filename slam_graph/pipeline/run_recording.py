@@ -234,6 +234,8 @@ def _tracked(
     if not asked.config.overlap or asked.info.content == "tracks":
         return tracking.in_turn()
     if not can_overlap():
-        logger.warning("overlap needs two cores and a system that forks: both ends take turns")
+        logger.warning(
+            "overlap needs a second core and a process that may fork: front and back end take turns"
+        )
         return tracking.in_turn()
     return tracking.beside(asked.rig, sequence.diagnostics)
