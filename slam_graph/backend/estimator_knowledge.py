@@ -12,6 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.engine_protocol import Engine, EngineContext
 from slam_graph.backend.initialization.start_up import StartUp
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
@@ -76,8 +77,14 @@ class EstimatorKnowledge:
 
     @property
     def assumed_noise_px(self) -> float:
-        """Standard deviation of the observations that the cost takes; the largest of all cameras."""
+        """Largest standard deviation of observations over the cameras, as the cost takes it."""
         return float(np.max(self._context.pixels.sigma_px))
+
+    @property
+    def motion(self) -> FrameMotion | None:
+        """The motion of the body within the last frame, where a shutter rolls."""
+        window = self.window
+        return None if window is None else window.state.motions.get(window.frame)
 
     @property
     def rig_now(self) -> Rig:

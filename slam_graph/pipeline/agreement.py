@@ -140,6 +140,11 @@ class Disagreement:
                 f"{self._limit:.0%})"
             )
 
+    def untested(self, stamp_ns: int) -> None:
+        """Note a frame before the first test: nothing is held against it."""
+        if not self._tests:
+            self._earlier_ns = stamp_ns
+
     def agreed_until(self) -> int | None:
         """Time of the last frame before the images contradicted the state; None if they always did.
 
@@ -213,10 +218,12 @@ class Agreement:
         solved = self._waiting.pop(estimator.solved_ns, None)
         if state is None or solved is None:
             return
-        found = self._fit.add(
-            state, solved, estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
-        )
-        if found is None or estimator.start_is_doubtful:
+        known = estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
+        found = self._fit.add(state, solved, *known, estimator.motion)
+        if found is None:
+            return
+        if estimator.start_is_doubtful:
+            self._motion.untested(state.stamp_ns)
             return
         self._motion.check(state.stamp_ns, found.tested, found.unfit)
         if found.jumped:

@@ -15,9 +15,9 @@ from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.pipeline.agreement import DivergenceError, check_sane
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
-from slam_graph.pipeline.agreement import DivergenceError, check_sane
 from slam_graph.pipeline.tracking import TrackedPacket
 from slam_graph.results import RunInput, RunResult
 

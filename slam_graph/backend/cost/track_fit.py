@@ -26,6 +26,7 @@ from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Rig
 
@@ -67,6 +68,7 @@ class _Pose:
     index: int
     rotation: FloatArray
     position: FloatArray
+    motion: FrameMotion | None
 
 
 class TrackFit:
@@ -79,7 +81,13 @@ class TrackFit:
         self._good: int | None = None  # the last frame that was good
 
     def add(
-        self, state: NavState, frame: FeatureFrame, rig: Rig, sigma_px: float, moving: IntArray
+        self,
+        state: NavState,
+        frame: FeatureFrame,
+        rig: Rig,
+        sigma_px: float,
+        moving: IntArray,
+        motion: FrameMotion | None = None,
     ) -> Fit | None:
         """Take the next frame.
 
@@ -89,6 +97,7 @@ class TrackFit:
             rig: the cameras, as they are known now.
             sigma_px: standard deviation of the observations.
             moving: ids (N,) of features that move by themselves, ascending.
+            motion: of the body within the frame, for rolling shutters.
 
         Returns:
             How the tracks compare; None if it is too early for the next comparison.
@@ -97,7 +106,7 @@ class TrackFit:
         if self._poses and now_ns < self._poses[-1].stamp_ns + _STEP_NS - _UNEVEN_NS:
             return None
         T, now = state.world_T_body, self._count
-        self._poses.append(_Pose(now_ns, now, T.rotation().matrix(), T.translation()))
+        self._poses.append(_Pose(now_ns, now, T.rotation().matrix(), T.translation(), motion))
         self._tracks.add(now, frame)
         self._count += 1
         while self._poses[0].stamp_ns < now_ns - _SPAN_NS - _UNEVEN_NS:
@@ -106,7 +115,8 @@ class TrackFit:
         ids, lengths = self._tracks.lengths()
         ids = ids[(lengths >= _LEAST_FRAMES) & is_in(ids, self._tracks.seen)]
         ids = ids[~is_in(ids, moving)]
-        projection = RigProjection(rig)
+        motions = {p.index: p.motion for p in self._poses if p.motion is not None}
+        projection = RigProjection(rig, motions)
         unfit = int(np.count_nonzero(self._errors(ids, projection) >= _LARGEST * sigma_px))
         jumped = False
         if self._good == now - _LEAST_FRAMES:

@@ -75,7 +75,9 @@ def place(
     """
     start = window.current(window.prior)
     level = context.rig.has_imu
-    predictable = level and context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
+    predictable = (
+        level and context.imu.covers(before.stamp_ns) and before.stamp_ns < window.stamp_ns
+    )
     predicted = before
     if predictable:
         predicted = context.propagation.predict(before, context.imu, window.stamp_ns)
