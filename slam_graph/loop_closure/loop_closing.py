@@ -10,13 +10,13 @@ The causal and the smoothed trajectory stay as they are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
@@ -24,6 +24,7 @@ from slam_graph.loop_closure.loop_keyframes import Keyframe
 from slam_graph.loop_closure.loop_pose_graph import SegmentBreak, correct_keyframes
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
+from slam_graph.loop_closure.similarity_graph import correct_up_to_scale
 from slam_graph.pose_graph import Poses
 from slam_graph.sensors import Rig
 
@@ -42,6 +43,7 @@ class LoopClosures:
         accepted: (L,) whether the pose graph kept them.
         poses: K corrected world_T_body.
         breaks: where the trajectory was lost and starts again.
+        scales: (K,) by how much lengths near each keyframe grow; None for not at all.
     """
 
     keyframes: list[Keyframe]
@@ -49,6 +51,7 @@ class LoopClosures:
     accepted: BoolArray
     poses: Poses
     breaks: Sequence[SegmentBreak] = ()
+    scales: FloatArray | None = None
 
     def correct(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory without its drift: each pose moves with the keyframes around it.
@@ -70,7 +73,7 @@ class LoopClosures:
         causal = Poses.from_gtsam([k.world_T_body for k in self.keyframes])
         body = Poses(Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions)
         first, second = (
-            self.poses.select(at).compose(causal.select(at).inverse()).compose(body)
+            self.poses.select(at).compose(self._seen_from(causal, at, body))
             for at in (before, after)
         )
         mixed = _interpolated(first, second, weight)
@@ -79,6 +82,13 @@ class LoopClosures:
             mixed.translations,
             Rotation.from_matrix(mixed.rotations).as_quat(),
         )
+
+    def _seen_from(self, causal: Poses, at: IntArray, body: Poses) -> Poses:
+        """Poses (N) of the body in the frames of keyframes (N,), in corrected lengths."""
+        seen = causal.select(at).inverse().compose(body)
+        if self.scales is None:
+            return seen
+        return Poses(seen.rotations, self.scales[at, None] * seen.translations)
 
     def across(self, begin_ns: int, end_ns: int) -> int:
         """How many accepted loop closures join what is before a segment with the segment.
@@ -102,9 +112,11 @@ class LoopClosures:
     def points(self) -> FloatArray:
         """(P, 3) world points of all features, each from its last keyframe."""
         last: dict[int, FloatArray] = {}
-        for keyframe, R, p in zip(
-            self.keyframes, self.poses.rotations, self.poses.translations, strict=True
+        scales = np.ones(len(self.keyframes)) if self.scales is None else self.scales
+        for keyframe, R, p, scale in zip(
+            self.keyframes, self.poses.rotations, self.poses.translations, scales, strict=True
         ):
+            keyframe = replace(keyframe, points=scale * keyframe.points)
             ids, points = keyframe.world_points(gtsam.Pose3(gtsam.Rot3(R), p))
             last.update(zip(ids.tolist(), points, strict=True))
         return np.array(list(last.values())).reshape(-1, 3)
@@ -138,7 +150,7 @@ def close_loops(
         breaks: where the trajectory was lost and starts again.
     """
     loops = _find_loops(keyframes, rig, config, seed)
-    return correct_by(keyframes, loops, config, diagnostics, breaks)
+    return correct_by(keyframes, loops, config, diagnostics, breaks, rig.has_scale)
 
 
 def correct_by(
@@ -147,24 +159,38 @@ def correct_by(
     config: LoopClosureConfig,
     diagnostics: Diagnostics | None = None,
     breaks: Sequence[SegmentBreak] = (),
+    has_scale: bool = True,
 ) -> LoopClosures:
-    """Correct keyframes by loop closures, some of which may be false."""
+    """Correct keyframes by loop closures, some of which may be false.
+
+    Args:
+        keyframes: in the order of time.
+        loops: between them.
+        config: settings.
+        diagnostics: counts rejected loop closures.
+        breaks: where the trajectory was lost and starts again.
+        has_scale: whether all keyframes have one unit of length; otherwise loops have scales.
+    """
     causal = Poses.from_gtsam([k.world_T_body for k in keyframes])
     if not loops:
         return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal, breaks)
     stamps = np.array([k.stamp_ns for k in keyframes])
     level = config.degrees_of_freedom == 4
     accepted = np.ones(len(loops), np.bool_)
+    scales: FloatArray | None = None
     for _ in range(_MAX_PASSES):
         held = np.flatnonzero(accepted)
         kept = [loops[k] for k in held]
-        poses, inliers = correct_keyframes(
-            stamps, causal, kept, config, level, diagnostics, breaks=breaks
-        )
+        if has_scale:
+            poses, inliers = correct_keyframes(
+                stamps, causal, kept, config, level, diagnostics, breaks=breaks
+            )
+        else:
+            poses, scales, inliers = correct_up_to_scale(stamps, causal, kept, config, breaks)
         accepted[held[~inliers]] = False
         if inliers.all():
             break
-    return LoopClosures(keyframes, loops, accepted, poses, breaks)
+    return LoopClosures(keyframes, loops, accepted, poses, breaks, scales)
 
 
 def _find_loops(
@@ -178,7 +204,7 @@ def _find_loops(
         [k.descriptors for k in keyframes], places.words, np.random.default_rng(seed)
     )
     recognition = PlaceRecognition(vocabulary, places)
-    verifier = LoopVerifier(rig.cameras[0], config.verification)
+    verifier = LoopVerifier(rig.cameras[0], config.verification, rig.has_scale)
     loops = []
     for number, keyframe in enumerate(keyframes):
         for candidate in recognition.add(keyframe).tolist():
