@@ -211,8 +211,10 @@ def error_m(sequence: SimulatedSequence, result: RunResult) -> float:
     return ape(sequence.groundtruth(), result.trajectory, alignment="none").statistics.rmse
 
 
-@pytest.mark.parametrize("imu", [True, False])
-@pytest.mark.parametrize("algorithm", ["msckf", "ekf", "okvis", "fixed_lag_isam2"])
+@pytest.mark.parametrize(
+    ("algorithm", "imu"),
+    [("msckf", True), ("ekf", False), ("okvis", True), ("fixed_lag_isam2", False)],
+)
 def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> None:
     sequence = flight(0, imu)
     result = estimated(sequence, algorithm)

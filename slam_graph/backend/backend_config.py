@@ -144,9 +144,10 @@ class InitializationConfig(Settings):
     """How the first state is found."""
 
     mode: Literal["auto", "static", "motion", "given", "groundtruth"] = "auto"
-    """auto: the state that comes with the data, or else a start from standstill or in motion,
-    whichever is possible first. static, motion: only that one. given: only the state that comes
-    with the data. groundtruth: the true state, to compare algorithms without their starts."""
+    """auto: the state that comes with the data, unless the scale is unknown, or else a start from
+    standstill or in motion, whichever is possible first. static, motion: only that one. given: only
+    the state that comes with the data. groundtruth: the true state, to compare algorithms without
+    their starts."""
     motion_window_s: float = expert(1.5, gt=0)
     """Length of the window from which a start in motion is computed, in seconds. Raise it for slow
     or even motion, which determines scale and gravity only after a while: the start comes later,

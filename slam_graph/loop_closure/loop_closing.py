@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Trajectory
 from slam_graph.loop_closure.loop_config import LoopClosureConfig
@@ -25,7 +25,8 @@ from slam_graph.loop_closure.loop_pose_graph import SegmentBreak, correct_keyfra
 from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_joint import PlaceJoint, place_joints
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
-from slam_graph.pose_graph import Poses
+from slam_graph.loop_closure.similarity_graph import correct_up_to_scale
+from slam_graph.pose_graph import Poses, PoseGraphSolution
 from slam_graph.sensors import Rig
 
 _MAX_PASSES = 3
@@ -45,6 +46,7 @@ class LoopClosures:
         breaks: where the trajectory was lost and starts again.
         joints: how well the place after each break is known relative to that before; None where no
             accepted loop closure joins them.
+        scales: (K,) by how much lengths near each keyframe grow; None for not at all.
     """
 
     keyframes: list[Keyframe]
@@ -53,6 +55,7 @@ class LoopClosures:
     poses: Poses
     breaks: Sequence[SegmentBreak] = ()
     joints: Sequence[PlaceJoint | None] = ()
+    scales: FloatArray | None = None
 
     def correct(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory without its drift: each pose moves with the keyframes around it.
@@ -74,7 +77,7 @@ class LoopClosures:
         causal = Poses.from_gtsam([k.world_T_body for k in self.keyframes])
         body = Poses(Rotation.from_quat(trajectory.quaternions).as_matrix(), trajectory.positions)
         first, second = (
-            self.poses.select(at).compose(causal.select(at).inverse()).compose(body)
+            self.poses.select(at).compose(self._seen_from(causal, at, body))
             for at in (before, after)
         )
         mixed = _interpolated(first, second, weight)
@@ -83,6 +86,13 @@ class LoopClosures:
             mixed.translations,
             Rotation.from_matrix(mixed.rotations).as_quat(),
         )
+
+    def _seen_from(self, causal: Poses, at: IntArray, body: Poses) -> Poses:
+        """Poses (N) of the body in the frames of keyframes (N,), in corrected lengths."""
+        seen = causal.select(at).inverse().compose(body)
+        if self.scales is None:
+            return seen
+        return Poses(seen.rotations, self.scales[at, None] * seen.translations)
 
     def across(self, begin_ns: int, end_ns: int) -> int:
         """How many accepted loop closures join what is before a segment with the segment.
@@ -106,9 +116,11 @@ class LoopClosures:
     def points(self) -> FloatArray:
         """(P, 3) world points of all features, each from its last keyframe."""
         last: dict[int, FloatArray] = {}
-        for keyframe, R, p in zip(
-            self.keyframes, self.poses.rotations, self.poses.translations, strict=True
+        scales = np.ones(len(self.keyframes)) if self.scales is None else self.scales
+        for keyframe, R, p, scale in zip(
+            self.keyframes, self.poses.rotations, self.poses.translations, scales, strict=True
         ):
+            keyframe = replace(keyframe, points=scale * keyframe.points)
             ids, points = keyframe.world_points(gtsam.Pose3(gtsam.Rot3(R), p))
             last.update(zip(ids.tolist(), points, strict=True))
         return np.array(list(last.values())).reshape(-1, 3)
@@ -142,7 +154,7 @@ def close_loops(
         breaks: where the trajectory was lost and starts again.
     """
     loops = _find_loops(keyframes, rig, config, seed)
-    return correct_by(keyframes, loops, config, diagnostics, breaks)
+    return correct_by(keyframes, loops, config, diagnostics, breaks, rig.has_scale)
 
 
 def correct_by(
@@ -151,24 +163,41 @@ def correct_by(
     config: LoopClosureConfig,
     diagnostics: Diagnostics | None = None,
     breaks: Sequence[SegmentBreak] = (),
+    has_scale: bool = True,
 ) -> LoopClosures:
-    """Correct keyframes by loop closures, some of which may be false."""
+    """Correct keyframes by loop closures, some of which may be false.
+
+    Args:
+        keyframes: in the order of time.
+        loops: between them.
+        config: settings.
+        diagnostics: counts rejected loop closures.
+        breaks: where the trajectory was lost and starts again.
+        has_scale: whether all keyframes have one unit of length; otherwise loops have scales.
+    """
     causal = Poses.from_gtsam([k.world_T_body for k in keyframes])
     if not loops:
         return LoopClosures(keyframes, [], np.zeros(0, np.bool_), causal, breaks)
     stamps = np.array([k.stamp_ns for k in keyframes])
     level = config.degrees_of_freedom == 4
     accepted = np.ones(len(loops), np.bool_)
+    scales: FloatArray | None = None
+    solution: PoseGraphSolution | None = None
     for _ in range(_MAX_PASSES):
         held = np.flatnonzero(accepted)
         kept = [loops[k] for k in held]
-        poses, inliers, solution = correct_keyframes(
-            stamps, causal, kept, config, level, diagnostics, breaks=breaks
-        )
+        if has_scale:
+            poses, inliers, solution = correct_keyframes(
+                stamps, causal, kept, config, level, diagnostics, breaks=breaks
+            )
+        else:
+            poses, scales, inliers = correct_up_to_scale(stamps, causal, kept, config, breaks)
         accepted[held[~inliers]] = False
         if inliers.all():
             break
-    closures = LoopClosures(keyframes, loops, accepted, poses, breaks)
+    closures = LoopClosures(keyframes, loops, accepted, poses, breaks, scales=scales)
+    if solution is None:
+        return closures
     ends_ns = [b.begin_ns - 1 for b in breaks[1:]] + [int(stamps[-1])]
     across = [closures.across(b.begin_ns, end) > 0 for b, end in zip(breaks, ends_ns, strict=False)]
     begins_ns = [b.begin_ns for b in breaks]
@@ -187,7 +216,7 @@ def _find_loops(
         [k.descriptors for k in keyframes], places.words, np.random.default_rng(seed)
     )
     recognition = PlaceRecognition(vocabulary, places)
-    verifier = LoopVerifier(rig.cameras[0], config.verification)
+    verifier = LoopVerifier(rig.cameras[0], config.verification, rig.has_scale)
     loops = []
     for number, keyframe in enumerate(keyframes):
         for candidate in recognition.add(keyframe).tolist():

@@ -94,3 +94,6 @@ class LoopClosureConfig(Settings):
     """Drift of the yaw, a random walk, rad/√s; where it is not learned."""
     odometry_position_sigma: float = expert(0.01, gt=0)
     """Drift of the position, a random walk, m/√s; where it is not learned."""
+    odometry_scale_sigma: float = expert(0.01, gt=0)
+    """Drift of the scale of one camera without an IMU, a random walk of its logarithm, 1/√s; where
+    it is not learned."""

@@ -8,6 +8,7 @@ They are further apart than the keyframes of the smoother, and chosen by distanc
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -40,6 +41,15 @@ Descriptors = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A recent frame and its pose."""
+
+    frame: FeatureFrame
+    rotation: FloatArray
+    position: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
     """A frame as place recognition, loop closure and maps use it.
 
@@ -51,6 +61,8 @@ class Keyframe:
         descriptors: (N, B) binary descriptors.
         points: (N, 3) in the body frame, metres; NaN where not triangulated. Drift so moves them
             with the keyframe.
+        views: from which they are triangulated, where the scale is unknown: at other poses the
+            points have another scale.
     """
 
     stamp_ns: int
@@ -59,6 +71,7 @@ class Keyframe:
     normalized: FloatArray
     descriptors: Descriptors
     points: FloatArray
+    views: tuple[View, ...] = ()
 
     def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
         """Ids (M,) and world positions (M, 3) of the known points, from this pose or another."""
@@ -115,15 +128,6 @@ class KeyframeDescriber:
         return found[np.isfinite(self._camera.undistort(found)).all(axis=1)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _View:
-    """A recent frame and its pose."""
-
-    frame: FeatureFrame
-    rotation: FloatArray
-    position: FloatArray
-
-
 class KeyframeLog:
     """Selects the keyframes of a run and triangulates their points.
 
@@ -145,7 +149,7 @@ class KeyframeLog:
         camera = rig.cameras[0].camera
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
-        self._recent: deque[_View] = deque(maxlen=POINT_FRAMES)
+        self._recent: deque[View] = deque(maxlen=POINT_FRAMES)
 
     def add(
         self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
@@ -164,26 +168,36 @@ class KeyframeLog:
                 return None
             self._recent.pop()
         rotation = world_T_body.rotation().matrix()
-        self._recent.append(_View(frame, rotation, world_T_body.translation()))
+        self._recent.append(View(frame, rotation, world_T_body.translation()))
         seen = frame.cameras[0]
         if wanted and image is not None:
             seen = self._describer.describe(image, seen)
         if not wanted or seen.descriptors is None or len(seen) == 0:
             return None
-        points = self._points(seen.ids)
-        body_points = (points - world_T_body.translation()) @ rotation
+        views = tuple(self._recent)
         keyframe = Keyframe(
-            frame.stamp_ns, world_T_body, seen.ids, seen.normalized, seen.descriptors, body_points
+            frame.stamp_ns,
+            world_T_body,
+            seen.ids,
+            seen.normalized,
+            seen.descriptors,
+            self._points(seen.ids, views, world_T_body),
+            () if self._rig.has_scale else views,
         )
         self.keyframes.append(keyframe)
         return keyframe
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
-        """The keyframes at the poses of a trajectory; those outside of it keep their poses."""
+        """The keyframes at the poses of a trajectory; those outside of it keep their poses.
+
+        Where the scale is unknown, their points are triangulated anew from there.
+        """
         found, valid = interpolate(trajectory, np.array([k.stamp_ns for k in self.keyframes]))
         keyframes = list(self.keyframes)
         for row, number in enumerate(np.flatnonzero(valid).tolist()):
-            keyframes[number] = replace(keyframes[number], world_T_body=found.pose(row))
+            pose, was = found.pose(row), keyframes[number]
+            points = self._points_at(was, pose, trajectory) if was.views else was.points
+            keyframes[number] = replace(was, world_T_body=pose, points=points)
         return keyframes
 
     def _is_keyframe(self, frame: FeatureFrame, world_T_body: gtsam.Pose3) -> bool:
@@ -203,15 +217,33 @@ class KeyframeLog:
         common = np.isin(tracked, frame.cameras[0].ids)
         return len(common) > 0 and bool(np.mean(common) < config.min_common_features)
 
-    def _points(self, ids: IntArray) -> FloatArray:
-        """(N, 3) world points of features (N,); NaN where not triangulated."""
+    def _points_at(
+        self, keyframe: Keyframe, pose: gtsam.Pose3, trajectory: Trajectory
+    ) -> FloatArray:
+        """(N, 3) points of a keyframe, triangulated from the poses of a trajectory."""
+        stamps_ns = np.array([view.frame.stamp_ns for view in keyframe.views])
+        found, valid = interpolate(trajectory, stamps_ns)
+        moved = [found.pose(row) for row in range(len(found))]
+        used = [keyframe.views[k] for k in np.flatnonzero(valid).tolist()]
+        views = [
+            View(view.frame, at.rotation().matrix(), at.translation())
+            for view, at in zip(used, moved, strict=True)
+        ]
+        return self._points(keyframe.ids, views, pose) if len(views) > 1 else keyframe.points
+
+    def _points(
+        self, ids: IntArray, views: Sequence[View], world_T_body: gtsam.Pose3
+    ) -> FloatArray:
+        """(N, 3) points of features (N,) in the body frame; NaN where not triangulated."""
         found = triangulate_frames(
             ids,
-            [view.frame for view in self._recent],
-            np.array([view.rotation for view in self._recent]),
-            np.array([view.position for view in self._recent]),
+            [view.frame for view in views],
+            np.array([view.rotation for view in views]),
+            np.array([view.position for view in views]),
             self._rig,
         )
         good = found.good & (found.reprojection_px < MAX_REPROJECTION_PX)
         good &= found.depth_error < MAX_DEPTH_ERROR * self._focal_px
-        return np.where(good[:, None], found.points, np.nan)
+        points = np.where(good[:, None], found.points, np.nan)
+        body: FloatArray = (points - world_T_body.translation()) @ world_T_body.rotation().matrix()
+        return body

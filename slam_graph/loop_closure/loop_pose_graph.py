@@ -38,7 +38,7 @@ from slam_graph.pose_graph import (
     optimize_pose_graph,
 )
 
-_MIN_LOOPS = 10
+MIN_LOOPS = 10
 """With fewer loop closures drift is not learned."""
 _MIN_DRIFT, _MAX_DRIFT = 0.03, 10.0
 """Bounds of the learned drift relative to the configured one."""
@@ -90,7 +90,7 @@ def correct_keyframes(
     one = recording_of is None
     segment_of = np.searchsorted([b.begin_ns for b in breaks], stamps_ns, "right")
     inside = [x for x in loops if segment_of[x.first] == segment_of[x.second]]
-    drift = drift_sigmas(stamps_ns, poses, inside, config) if one else _configured_drift(config)
+    drift = drift_sigmas(stamps_ns, poses, inside, config) if one else configured_drift(config)
     graph = loop_graph(stamps_ns, poses, loops, drift, level, recording_of, breaks)
     policy = PoseGraphPolicy.with_gnc("auto" if one else "file")
     solution = optimize_pose_graph(graph, policy, diagnostics)
@@ -222,8 +222,8 @@ def drift_sigmas(
         loops: between them.
         config: the drift if there are few loops, or it is not to be learned.
     """
-    configured = _configured_drift(config)
-    if len(loops) < _MIN_LOOPS or not config.learn_drift:
+    configured = configured_drift(config)
+    if len(loops) < MIN_LOOPS or not config.learn_drift:
         return configured
     measured = Poses.from_gtsam([x.first_T_second for x in loops])
     first, second = np.array([(x.first, x.second) for x in loops]).T
@@ -238,17 +238,17 @@ def drift_sigmas(
     of_yaw = np.einsum("ni,nij,nj->n", up, covariances[:, :3, :3], up)
     of_shift = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     return (
-        _sigma(yaw**2, of_yaw, seconds, 1, configured[0]),
-        _sigma(np.sum(shift**2, axis=1), of_shift, seconds, 3, configured[1]),
+        walk_sigma(yaw**2, of_yaw, seconds, 1, configured[0]),
+        walk_sigma(np.sum(shift**2, axis=1), of_shift, seconds, 3, configured[1]),
     )
 
 
-def _configured_drift(config: LoopClosureConfig) -> tuple[float, float]:
+def configured_drift(config: LoopClosureConfig) -> tuple[float, float]:
     """The drift of odometry that is set."""
     return config.odometry_rotation_sigma, config.odometry_position_sigma
 
 
-def _sigma(
+def walk_sigma(
     squares: FloatArray, variances: FloatArray, seconds: FloatArray, freedom: int, configured: float
 ) -> float:
     """σ of a random walk that explains squared errors beyond their own variances."""

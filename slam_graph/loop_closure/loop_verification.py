@@ -8,7 +8,7 @@ RANSAC, refined on the inliers (OpenCV).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import gtsam
@@ -25,6 +25,10 @@ SIGMA_PX = 2.0
 """Standard deviation of reprojection errors, the errors of the points included."""
 FLOOR_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3)
 """Least standard deviations of a relative pose, for the common errors of the points: rad, m."""
+FLOOR_SCALE = 2e-3
+"""The same of the logarithm of a scale."""
+_MIN_DEPTHS = 8
+"""Fewest points that both keyframes know from which a scale is taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +41,9 @@ class Loop:
         covariance: (6, 6) of it in GTSAM's tangent: rotation (rad), translation (m).
         inliers, matches: numbers of inliers and of all matches.
         pairs: (inliers, 2) matching rows of the first and the second keyframe.
+        scale: length in the unit of the first keyframe of what has length one in that of the
+            second; one unless the scale of the run is unknown.
+        scale_sigma: standard deviation of its logarithm.
     """
 
     first: int
@@ -46,6 +53,8 @@ class Loop:
     inliers: int
     matches: int
     pairs: IntArray
+    scale: float = 1.0
+    scale_sigma: float = 0.0
 
 
 def _match(first: Descriptors, second: Descriptors, max_bits: int) -> IntArray:
@@ -63,10 +72,13 @@ class LoopVerifier:
     Args:
         mounted: the first camera.
         config: thresholds.
+        has_scale: whether all keyframes have one unit of length.
     """
 
-    def __init__(self, mounted: RigCamera, config: VerificationConfig) -> None:
-        self._config, self._mounted = config, mounted
+    def __init__(
+        self, mounted: RigCamera, config: VerificationConfig, has_scale: bool = True
+    ) -> None:
+        self._config, self._mounted, self._has_scale = config, mounted, has_scale
         self._body_T_camera = mounted.body_T_camera
         self._focal_px = float(np.sqrt(mounted.camera.fx * mounted.camera.fy))
 
@@ -98,7 +110,29 @@ class LoopVerifier:
             return None
         covariance = self._covariance(points[inliers], pose)
         supporting = np.column_stack([known[pairs[inliers, 0]], pairs[inliers, 1]])
-        return Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), supporting)
+        loop = Loop(first, second, pose, covariance, int(inliers.sum()), len(pairs), supporting)
+        return loop if self._has_scale else self._with_scale(loop, a, b)
+
+    def _with_scale(self, loop: Loop, a: Keyframe, b: Keyframe) -> Loop | None:
+        """The loop closure with the ratio of the depths of its points; None if it has too few.
+
+        Args:
+            loop: without it.
+            a: its first keyframe.
+            b: its second keyframe.
+        """
+        rows = loop.pairs[np.isfinite(b.points[loop.pairs[:, 1]]).all(axis=1)]
+        if len(rows) < _MIN_DEPTHS:
+            return None
+        centre = np.asarray(self._body_T_camera.translation())
+        pose = loop.first_T_second
+        of_first = (a.points[rows[:, 0]] - pose.translation()) @ pose.rotation().matrix() - centre
+        of_second = b.points[rows[:, 1]] - centre
+        logs = np.log(np.linalg.norm(of_first, axis=1) / np.linalg.norm(of_second, axis=1))
+        median = float(np.median(logs))
+        # 1.4826 of the median deviation is σ, and a median has π/2 the variance of a mean
+        sigma = 1.4826 * float(np.median(np.abs(logs - median))) * np.sqrt(0.5 * np.pi / len(rows))
+        return replace(loop, scale=float(np.exp(median)), scale_sigma=max(sigma, FLOOR_SCALE))
 
     def _covariance(self, points: FloatArray, pose: gtsam.Pose3) -> FloatArray:
         """(6, 6) covariance of the relative pose from the points (M, 3) of its inliers."""

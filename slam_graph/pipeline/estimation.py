@@ -59,8 +59,8 @@ class KnownStart:
             if asked.truth is None:
                 raise DataError(f"{name}: no ground truth to start from; use another mode")
             return KnownStart(truth=asked.truth)
-        if mode not in ("auto", "given"):
-            return KnownStart()
+        if mode not in ("auto", "given") or (mode == "auto" and not asked.rig.has_scale):
+            return KnownStart()  # a state in metres says nothing where all is up to scale
         state = sequence.initial_state()
         if state is not None and not (asked.start_ns - _LEAD_NS <= state.stamp_ns <= asked.end_ns):
             state = None
