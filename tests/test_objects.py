@@ -28,7 +28,6 @@ from slam_graph.datasets.streams.object_truth import (
 )
 from slam_graph.errors import DataError
 from slam_graph.evaluation.detection import detection
-from slam_graph.frontend.moving_tracks import MOST, MovingTracks
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult
@@ -266,26 +265,6 @@ def test_true_poses_are_read_as_they_were_written(tmp_path: Path) -> None:
     (tmp_path / name).write_text(text + text.splitlines()[-1] + "\n", encoding="utf-8")
     with pytest.raises(DataError, match="times of object 3"):
         read_object_truth(tmp_path / OBJECT_TRUTH)
-
-
-def test_moving_features_are_apart_and_not_too_many() -> None:
-    moving = MovingTracks(wanted=True)
-    seen = [FeatureObservations(np.arange(10), np.zeros((10, 2)), np.zeros((10, 2)))]
-    moving.add(np.array([3, 7]))
-    moving.remove(np.array([7]))
-    static, apart = moving.apart(seen)
-    assert apart[0].ids.tolist() == [3]
-    assert 3 not in static[0].ids
-    moving.add(np.arange(1000))
-    assert len(moving.surplus(np.arange(500))) == 500 - MOST
-    assert len(moving.ids) == MOST
-
-
-def test_without_objects_nothing_is_kept() -> None:
-    moving = MovingTracks(wanted=False)
-    moving.add(np.arange(5))
-    assert len(moving.ids) == 0
-    assert moving.apart([])[1] == ()
 
 
 # --- end to end ----------------------------------------------------------------------------------

@@ -143,6 +143,14 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
 
 def _objects(table: _Table) -> Iterator[tuple[str, str]]:
     """How many objects move, and how well that is known."""
+    if "directions" in table:
+        directions = [
+            f"{number} ({row['frames']} frames, {row['mean_rate_rad_s']:.2f} rad/s)"
+            for number, row in table["directions"].items()
+        ]
+        found = f"{', '.join(directions) or 'nothing'}; {table['ms_per_frame']:.1f} ms a frame"
+        yield "moving", f"{found}; one camera: directions only, the scale is not known"
+        return
     each = [
         f"{number} ({row['moving_frames']} of {row['frames']} frames, "
         f"{row['mean_speed_m_s']:.2f} m/s)"

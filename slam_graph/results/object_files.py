@@ -23,10 +23,17 @@ _Errors = Callable[[Mapping[int, Trajectory], Trajectory], Any]
 """Errors of objects, given their true poses and those of the platform."""
 
 OBJECTS, SMOOTHED = "objects.csv", "objects_smoothed.csv"
+DIRECTIONS = "object_directions.csv"
 
 
 def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
-    """Write `objects.csv`, each trajectory and points; the same smoothed, if objects were."""
+    """Write `objects.csv`, each trajectory and points; the same smoothed, if objects were.
+
+    Of objects before a single camera there are directions only, and no file in metres.
+    """
+    if objects.single_camera:
+        files.text(DIRECTIONS, objects.direction_lines())
+        return
     files.text(OBJECTS, objects.csv_lines())
     if len(objects):
         Files.make_folder(files.folder / "objects")
@@ -60,6 +67,12 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
     """
     if objects is None:
         return None
+    if objects.single_camera:
+        return {
+            "scale": "unknown",
+            "directions": _directions_table(objects),
+            "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
+        }
     table: dict[str, Any] = {}
     smoothed = objects.smoothed
     for number in objects.numbers:
@@ -81,3 +94,18 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
         "smoothed": None if smoothed is None else _accuracy(smoothed.errors, asked),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }
+
+
+def _directions_table(objects: MovingObjects) -> dict[str, dict[str, float | int]]:
+    """The objects before a single camera, by their numbers."""
+    table: dict[str, dict[str, float | int]] = {}
+    for number in sorted({seen.number for seen in objects.directions}):
+        rows = [seen for seen in objects.directions if seen.number == number]
+        table[str(number)] = {
+            "frames": len(rows),
+            "begin_ns": rows[0].stamp_ns,
+            "end_ns": rows[-1].stamp_ns,
+            "mean_rate_rad_s": float(np.mean([np.linalg.norm(seen.rate) for seen in rows])),
+            "points": float(np.mean([seen.points for seen in rows])),
+        }
+    return table

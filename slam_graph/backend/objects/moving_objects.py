@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoWindow
+from slam_graph.backend.objects.object_directions import DirectionTracker
 from slam_graph.backend.objects.object_frame import ObjectFrame
 from slam_graph.backend.objects.object_history import ObjectHistory
 from slam_graph.backend.objects.object_tracker import ObjectTracker
@@ -31,6 +32,8 @@ class MovingObjects(ObjectHistory):
 
     Attributes:
         smoothed: the objects by all of their observations, where they were smoothed.
+        single_camera: whether one camera without depth images sees them: they have directions then,
+            and no states.
     """
 
     def __init__(
@@ -49,9 +52,12 @@ class MovingObjects(ObjectHistory):
 
     def begin(self, rig: Rig) -> None:
         """Begin without objects: the world is another one from now on; states so far stay."""
-        config = self._settings[2]
+        policies, backend, config = self._settings
         self._window = EgoWindow(config.window_s)
-        self._tracker = ObjectTracker(rig, *self._settings, first=max([0, *self.numbers]) + 1)
+        self.single_camera = len(rig.cameras) == 1 and rig.depth is None
+        first = max([0, *self.numbers, *(seen.number for seen in self.directions)]) + 1
+        self._directions = DirectionTracker(rig, backend, config, first)
+        self._tracker = ObjectTracker(rig, policies, backend, config, first)
 
     def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
         """Take a frame, and leave what moves out of the estimate of the platform.
@@ -65,7 +71,11 @@ class MovingObjects(ObjectHistory):
         ego = self._window.add(frame.stamp_ns, state, estimator)
         if ego is None:
             return ObjectFrame()
-        found = self._tracker.add(frame, ego, self._sigma_px, estimator.pixel_noise_px())
+        if self.single_camera:
+            found = self._directions.add(frame, ego, self._sigma_px)
+            self.directions += found.directions
+        else:
+            found = self._tracker.add(frame, ego, self._sigma_px, estimator.pixel_noise_px())
         estimator.exclude(found.moving)
         self.note(found.states, self._tracker.objects)
         self.milliseconds += 1e3 * (time.perf_counter() - began)

@@ -17,6 +17,30 @@ def _no_ids() -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectDirection:
+    """The line of sight from one camera to a moving object, whose distance is not known.
+
+    Attributes:
+        stamp_ns: time of the frame, on the clock of the cameras.
+        number: of the object.
+        direction: (3,) unit vector in the world, the mean of its tracks.
+        rate: (3,) rad/s, its change over the last frames, axes of the world: by the motion of the
+            object and that of the platform.
+        sigma: standard deviation of the direction, rad, by the noise of the images.
+        rate_sigma: the same of the rate, rad/s.
+        points: number of its tracks.
+    """
+
+    stamp_ns: int
+    number: int
+    direction: FloatArray
+    rate: FloatArray
+    sigma: float
+    rate_sigma: float
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
 class ObjectFrame:
     """What became of the tracks of one frame.
 
@@ -30,6 +54,7 @@ class ObjectFrame:
         clouds: (K, 3) points of each object in the world, by its number.
         hulls: number of each object and the (K, 2) polygon around its tracks, pixels of the first
             camera; with the number 0 around tracks that move and are of no object yet.
+        directions: of what moves before a single camera, in place of states.
     """
 
     states: list[ObjectState] = field(default_factory=list)
@@ -42,3 +67,4 @@ class ObjectFrame:
     members: dict[int, int] = field(default_factory=dict)
     clouds: dict[int, FloatArray] = field(default_factory=dict)
     hulls: list[tuple[int, FloatArray]] = field(default_factory=list)
+    directions: list[ObjectDirection] = field(default_factory=list)

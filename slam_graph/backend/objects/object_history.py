@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.objects.object_errors import ObjectErrors, object_errors
+from slam_graph.backend.objects.object_frame import ObjectDirection
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
-from slam_graph.backend.objects.object_table import csv_lines
+from slam_graph.backend.objects.object_table import csv_lines, direction_lines
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.geometry import Trajectory
 
@@ -29,12 +30,14 @@ class ObjectHistory:
         points: (N, 3) by the number of an object: its points, in its own frame, m.
         milliseconds: time that the objects took, of all frames with a state.
         frames: number of these frames.
+        directions: of the objects before a single camera, which have no states, by time.
     """
 
     def __init__(self, classes: Mapping[int, str]) -> None:
         self.classes = classes
         self.points: dict[int, FloatArray] = {}
         self.milliseconds, self.frames = 0.0, 0
+        self.directions: list[ObjectDirection] = []
         self._states: dict[int, list[ObjectState]] = {}
 
     def __len__(self) -> int:
@@ -82,6 +85,10 @@ class ObjectHistory:
     def csv_lines(self) -> Iterator[str]:
         """`objects.csv`: a row for each object and frame."""
         return csv_lines(self.all_states(), self.classes)
+
+    def direction_lines(self) -> Iterator[str]:
+        """`object_directions.csv`: a row for each object and frame, without any length."""
+        return direction_lines(self.directions)
 
     def errors(self, truth: Mapping[int, Trajectory], true_body: Trajectory) -> ObjectErrors:
         """Errors against true poses.

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors import FeatureObservations
 
-_NEIGHBOURS_PX = 80.0
+NEIGHBOURS_PX = 80.0
 """Moving features that are nearer than this may be of one object."""
 _LEAST = 3
 """Moving features that make a region."""
@@ -39,7 +39,7 @@ def regions_of_motion(seen: FeatureObservations, ids: IntArray) -> list[FloatArr
     rows = np.flatnonzero(np.isin(seen.ids, ids))
     if len(rows) < _LEAST:
         return []
-    near = cdist(seen.pixels[rows], seen.pixels[rows]) < _NEIGHBOURS_PX
+    near = cdist(seen.pixels[rows], seen.pixels[rows]) < NEIGHBOURS_PX
     _, cluster = connected_components(near, directed=False)
     groups = (seen.ids[rows[cluster == k]] for k in range(cluster.max() + 1))
     return [region(seen, group) for group in groups if len(group) >= _LEAST]

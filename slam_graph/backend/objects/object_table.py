@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.objects.object_frame import ObjectDirection
 from slam_graph.backend.objects.object_state import ObjectState
 
 _COLUMNS = (
@@ -26,6 +27,8 @@ _COLUMNS = (
     *(f"sigma_step_{axis}_m" for axis in "xyz"),
 )
 
+_VECTORS = (("direction", ""), ("rate", "_rad_s"))
+
 
 def csv_lines(states: Iterable[ObjectState], classes: Mapping[int, str]) -> Iterator[str]:
     """One row for each object and frame. Sigmas of poses and steps are in axes of the object.
@@ -40,6 +43,17 @@ def csv_lines(states: Iterable[ObjectState], classes: Mapping[int, str]) -> Iter
         cells = [str(state.stamp_ns), str(state.number), str(int(state.moving))]
         cells += [str(state.points), str(state.label), named]
         yield ",".join([*cells, *(f"{value:.9g}" for value in _numbers(state))]) + "\n"
+
+
+def direction_lines(directions: Iterable[ObjectDirection]) -> Iterator[str]:
+    """`object_directions.csv`: a row for each object and frame."""
+    axes = [f"{name}_{axis}{unit}" for name, unit in _VECTORS for axis in "xyz"]
+    columns = ["timestamp_ns", "object", "points", *axes, "sigma_direction_rad", "sigma_rate_rad_s"]
+    yield ",".join(columns) + "\n"
+    for seen in directions:
+        numbers = [*seen.direction, *seen.rate, seen.sigma, seen.rate_sigma]
+        cells = [str(seen.stamp_ns), str(seen.number), str(seen.points)]
+        yield ",".join([*cells, *(f"{value:.9g}" for value in numbers)]) + "\n"
 
 
 def _numbers(state: ObjectState) -> Iterator[float]:

@@ -31,9 +31,9 @@ _NEAR = 1.5
 """Parts of one object are no farther apart than the sum of their sizes times this."""
 _MOTION_S = 0.3
 """Time over which it is judged whether an object moves."""
-_AT_REST = 0.5
+_AT_REST = 0.1
 """Probability with which the motion of an object at rest is estimated larger than that which shows
-that it stands: one that moves slowly seldom seems to stand so well."""
+that it stands. That it does not move for certain does not show it: that limit is much larger."""
 
 
 class TrackedObject:
