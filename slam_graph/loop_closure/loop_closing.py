@@ -26,7 +26,7 @@ from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
 from slam_graph.loop_closure.place_joint import PlaceJoint, place_joints
 from slam_graph.loop_closure.place_recognition import PlaceRecognition, Vocabulary
 from slam_graph.loop_closure.similarity_graph import correct_up_to_scale
-from slam_graph.pose_graph import Poses, PoseGraphSolution
+from slam_graph.pose_graph import PoseGraphSolution, Poses
 from slam_graph.sensors import Rig
 
 _MAX_PASSES = 3
