@@ -19,6 +19,7 @@ import importlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
+from threading import RLock
 from typing import Any, Generic, TypeVar
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -27,6 +28,9 @@ from pydantic_core import CoreSchema, core_schema
 from slam_graph.errors import ConfigError, closest
 
 __all__ = ["Choice", "Registry"]
+
+_IMPORTING = RLock()
+"""Held while a home is imported: other threads must not take its parts for unknown meanwhile."""
 
 PartT = TypeVar("PartT")
 RegisteredT = TypeVar("RegisteredT")
@@ -152,13 +156,14 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
 
     def _own(self) -> dict[str, PartT]:
         """What was registered with a decorator, once the package's own parts are there."""
-        if self._home is not None:
-            home, self._home = self._home, None  # none while it is imported: it registers here
-            try:
-                importlib.import_module(home)
-            except BaseException:
-                self._home = home
-                raise
+        with _IMPORTING:
+            if self._home is not None:
+                home, self._home = self._home, None  # none while it is imported: it registers here
+                try:
+                    importlib.import_module(home)
+                except BaseException:
+                    self._home = home
+                    raise
         return self._parts
 
     def _offered(self) -> dict[str, list[EntryPoint]]:

@@ -7,7 +7,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
 import numpy as np
@@ -134,6 +136,24 @@ def test_the_names_that_are_known_without_an_import_are_those_registered() -> No
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT_S
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_threads_that_need_a_part_at_once_all_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one waits while the first one imports the home."""
+    (tmp_path / "slow_shapes.py").write_text(
+        "import time\nfrom registry_of_shapes import REGISTRY\ntime.sleep(0.2)\n"
+        "@REGISTRY.register('disc')\ndef disc(side): return side\n"
+    )
+    registry: Registry[Shape] = Registry(GROUP, "shape", "slow_shapes", ("disc",))
+    module = ModuleType("registry_of_shapes")
+    monkeypatch.setattr(module, "REGISTRY", registry, raising=False)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.syspath_prepend(tmp_path)
+    with ThreadPoolExecutor(4) as pool:
+        parts = list(pool.map(registry.__getitem__, ["disc"] * 4))
+    assert len(set(parts)) == 1
 
 
 # --- a package that is installed ------------------------------------------------------------------
