@@ -307,7 +307,7 @@ class CostConstruction:
         """Leave out what the gate rejects, and make variables of the features that stay."""
         self.diagnostics.counts["feature_rejected_by_gate"] += gate.innovations.rejected
         landmarks, tracks = linear.landmarks, None
-        if landmarks is not None and cost.landmarks is not None:
+        if landmarks is not None and cost.landmarks is not None and not gate.landmarks.all():
             bad = cost.landmarks.rows(~gate.landmarks)
             self.rejected = ascending_union(self.rejected, bad.ids[bad.feature])
             removals.add_observations(Outcome.GATED, bad)
@@ -315,11 +315,13 @@ class CostConstruction:
             landmarks = landmarks.subset(gate.landmarks)
         if linear.tracks is not None and cost.tracks is not None:
             assert isinstance(linear.tracks, WhitenedObservations)
-            tracks = linear.tracks.subset(gate.tracks[cost.tracks.obs.feature])
-            bad_ids = cost.tracks.obs.ids[~gate.tracks]
-            self.rejected = ascending_union(self.rejected, bad_ids)
-            removals.add_features(Outcome.GATED, bad_ids)
-            cost.tracks = cost.tracks.subset(gate.tracks)
+            tracks = linear.tracks
+            if not gate.tracks.all():
+                tracks = tracks.subset(gate.tracks[cost.tracks.obs.feature])
+                bad_ids = cost.tracks.obs.ids[~gate.tracks]
+                self.rejected = ascending_union(self.rejected, bad_ids)
+                removals.add_features(Outcome.GATED, bad_ids)
+                cost.tracks = cost.tracks.subset(gate.tracks)
             new = cost.tracks.in_state
             cost.state.insert_points(cost.tracks.obs.ids[new], cost.tracks.points[new])
         return Linearization.of(landmarks, tracks, cost.tracks.obs if cost.tracks else None)

@@ -121,6 +121,7 @@ class Cost:
     loss: RobustLoss | None = None
     sigma_px: FloatArray | None = None
     _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
+    _columns: tuple[tuple[object, ...], NDArray[np.intp]] | None = field(default=None, init=False)
 
     @property
     def robust(self) -> RobustLoss:
@@ -383,17 +384,19 @@ class Cost:
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
+        if self._columns is not None and _are_same(self._columns[0], (obs, layout)):
+            return self._columns[1]
         poses = np.array([layout.starts[X(i)] for i in obs.frames])
         points = np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)])
         calibration = layout.indices(self.rig.calibration_keys)
-        return np.concatenate(
-            [
-                poses[obs.frame][:, None] + np.arange(6),
-                points[obs.feature][:, None] + np.arange(POINT_DIM),
-                np.broadcast_to(calibration, (len(obs), len(calibration))),
-            ],
-            axis=1,
+        parts = (
+            poses[obs.frame][:, None] + np.arange(6),
+            points[obs.feature][:, None] + np.arange(POINT_DIM),
+            np.broadcast_to(calibration, (len(obs), len(calibration))),
         )
+        columns = np.concatenate(parts, axis=1)
+        self._columns = (obs, layout), columns
+        return columns
 
 
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:

@@ -81,8 +81,9 @@ class PointTable:
             return self
         stays = np.ones(len(self.ids), np.bool_)
         stays[self.rows(ids)] = False
-        parts = self.ids, self.first, self.offsets, self.frozen
-        return PointTable(*(part[stays] for part in parts))
+        return PointTable(
+            self.ids[stays], self.first[stays], self.offsets[stays], self.frozen[stays]
+        )
 
     def with_offsets(self, ids: IntArray, offsets: FloatArray) -> PointTable:
         """With other offsets (N, 3) of some features."""

@@ -19,4 +19,5 @@ class SingleThread:
         """For the time of a block; it is quick where there is but one thread anyway."""
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
             return nullcontext()
-        return self._blas.limit(limits=1)
+        limited: AbstractContextManager[object] = self._blas.limit(limits=1)
+        return limited

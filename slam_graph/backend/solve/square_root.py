@@ -64,7 +64,10 @@ class Layout:
         if not chosen:
             return np.zeros(0, np.intp)
         starts = np.array([self.starts[k] for k in chosen], np.intp)
-        dims = np.array([self.dims[k] for k in chosen], np.intp)
+        sizes = [self.dims[k] for k in chosen]
+        if sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
+            return np.asarray((starts[:, None] + np.arange(sizes[0])).ravel(), np.intp)
+        dims = np.array(sizes, np.intp)
         # numbers that go on by one, but for a jump where a variable begins
         jumps = starts - np.cumsum(dims) + dims
         return np.asarray(np.arange(dims.sum()) + np.repeat(jumps, dims), np.intp)
