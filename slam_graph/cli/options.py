@@ -86,7 +86,8 @@ Sources = Annotated[
         metavar="SENSOR=WHERE",
         help="Where a sensor is, repeatable. Topics of a ROS bag: imu=/imu0, cam0=/cam0, "
         "depth=/depth, groundtruth=/pose; files of a video or image folder: stamps=times.csv, "
-        "imu=imu.csv, or rate=30 instead of stamps; anywhere gnss=fixes.csv, odometry=wheels.csv.",
+        "imu=imu.csv, or rate=30 instead of stamps; anywhere gnss=fixes.csv, poses=poses.csv, "
+        "odometry=wheels.csv.",
         rich_help_panel=_RECORDING,
     ),
 ]

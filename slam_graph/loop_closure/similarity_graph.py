@@ -81,11 +81,11 @@ def similarity_graph(
     """The prior on the first keyframe, odometry, and loop closures, in this order.
 
     Args:
-        stamps_ns: see `correct_up_to_scale`, as are all others.
-        poses: .
-        loops: .
-        config: .
-        breaks: .
+        stamps_ns: (N,) times of the keyframes.
+        poses: drifting estimates world_T_body.
+        loops: between them, with their scales.
+        config: the drift of odometry.
+        breaks: of the trajectory, in the order of time.
     """
     graph = gtsam.NonlinearFactorGraph()
     anchor = gtsam.noiseModel.Isotropic.Sigma(7, _ANCHOR_SIGMA)
@@ -106,7 +106,7 @@ def similarity_graph(
     return graph
 
 
-def loop_factor(loop: Loop) -> gtsam.NoiseModelFactor:
+def loop_factor(loop: Loop) -> gtsam.BetweenFactorSimilarity3:
     """A loop closure that measures the scale, too.
 
     A point x of the second keyframe is at R (s x) + t in the first one.

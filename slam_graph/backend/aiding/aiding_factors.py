@@ -40,6 +40,9 @@ _MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
 _TIMINGS = 3
 """Alignments, each at the times that the one before has found."""
+_UNTIMED, _MOST_UNTIMED = 0.5, 40
+"""How far the path comes in the standard deviation of an estimated offset, in σ of a fix, at most;
+with so many fixes it is taken as it is, as on a straight road at an even speed nothing tells it."""
 _HISTORY_NS = 5_000_000_000
 """How long odometry and states are kept."""
 
@@ -180,7 +183,19 @@ class Aiding:
             if found is None:
                 return None
             offset_s += found.offset_s
-        return replace(found, offset_s=offset_s) if found is not None else None
+        assert found is not None
+        if len(self._fixes) < _MOST_UNTIMED and self._is_untimed(found):
+            return None
+        return replace(found, offset_s=offset_s)
+
+    def _is_untimed(self, found: WorldAlignment) -> bool:
+        """Whether the clock of the fixes is known so badly that it counts beside their noise."""
+        if found.offset_sigma_s == 0.0:
+            return False
+        timed = [pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, 0))]
+        speed = np.mean([np.linalg.norm(pair.velocity) for pair in timed])
+        sigma = np.sqrt(np.mean([np.trace(pair.fix.covariance) / 3.0 for pair in timed]))
+        return bool(found.offset_sigma_s * speed > _UNTIMED * sigma)
 
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""

@@ -282,8 +282,9 @@ def _read_poses(
         raise DataError(f"{path}: no poses in this file")
     table = np.concatenate(tables)
     # what was not measured may have any value
-    measured = np.isfinite(table["sigma"]).reshape(-1, 2, 3).all(axis=2)
-    unknown = np.isposinf(table["sigma"]).reshape(-1, 2, 3).all(axis=2)
+    sigmas: FloatArray = table["sigma"].reshape(-1, 2, 3)
+    measured = np.asarray(np.isfinite(sigmas).all(axis=2), np.bool_)
+    unknown = np.asarray((sigmas == np.inf).all(axis=2), np.bool_)
     table["position"][unknown[:, 0]], table["quaternion"][unknown[:, 1]] = 0.0, (0, 0, 0, 1)
     lengths = np.linalg.norm(table["quaternion"], axis=1)
     good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
