@@ -208,9 +208,7 @@ class CameraTracker:
         moved_px = float(np.median(np.linalg.norm(after - before, axis=1)))
         return 1.0 + BLUR_PER_PX * moved_px / self._config.epipolar_px
 
-    def _rigid_motions(
-        self, before: FloatArray, after: FloatArray, scale: float
-    ) -> list[IntArray]:
+    def _rigid_motions(self, before: FloatArray, after: FloatArray, scale: float) -> list[IntArray]:
         """The rows of the matches (N, 2) that fit each rigid motion, the largest group first."""
         everything = np.arange(len(before))
         if self._config.outliers == "none":
@@ -278,7 +276,8 @@ class CameraTracker:
         if self._lost is None:
             ids, points = self._associator.recover(before, after)
         else:
-            ids, points = self._lost.found(after, partial(self._epipolar.inliers, after_R_before=None))
+            fits = partial(self._epipolar.inliers, after_R_before=None)
+            ids, points = self._lost.found(after, fits)
         if len(ids) == 0:
             return after
         allowed = self._extractor.allows(points)

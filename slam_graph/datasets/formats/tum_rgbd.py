@@ -159,9 +159,7 @@ def _known_rig(path: Path, images: FileImages) -> tuple[Rig, DepthProcess | None
         depth = partial(_nearest, u, v)
     mounted = RigCamera(camera, gtsam.Pose3(), 0.0, images.name)
     if number != "3":
-        mounted = replace(
-            mounted, rolling_shutter=True, readout_s=READOUT_S, stamped_row="middle"
-        )
+        mounted = replace(mounted, rolling_shutter=True, readout_s=READOUT_S, stamped_row="middle")
     return Rig((mounted,)), depth
 
 
