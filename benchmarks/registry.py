@@ -44,6 +44,7 @@ from benchmarks import (
     verdict,
     wheel,
     wide_lenses,
+    without_imu,
 )
 from benchmarks.suite import Benchmark
 
@@ -63,6 +64,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     **mono_real_imu.BENCHMARKS,
     **consistency_real.BENCHMARKS,
     **car.BENCHMARKS,
+    **without_imu.BENCHMARKS,
     **starts.BENCHMARKS,
     **stream_rates.BENCHMARKS,
     **rolling_shutter.BENCHMARKS,

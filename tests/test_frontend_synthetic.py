@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the front end on images whose motion is known exactly."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,6 +37,7 @@ from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.sensors.camera import Camera
+from slam_graph.sensors.depth import DepthSensor
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera
 
@@ -335,3 +337,18 @@ def test_a_shift_is_found_with_any_window_and_image(window_px: int, side: int) -
     assert flow.found.all()
     assert np.abs(flow.points - points - (1.5, -1.0)).max() < 0.1
     assert flow.error_px.max() < 0.1
+
+
+def test_corners_that_were_lost_in_blurred_images_are_found_again(texture: Spline) -> None:
+    without_imu = replace(MONO, has_imu=False, depth=DepthSensor())
+    H = rotation([0.02, -0.03, 0.01])
+    blurred = cv2.GaussianBlur(view(texture, rotation([0.01, -0.015, 0.0])), (0, 0), 12.0)
+    frontend = build_frontend(without_imu, CONFIG)
+    frames = feed(frontend, (view(texture),), (blurred,), (view(texture, H),))
+    first, last = frames[0].cameras[0], frames[2].cameras[0]
+    a, b = common(first, last)
+    lost = ~np.isin(first.ids[a], frames[1].cameras[0].ids)
+    error = np.linalg.norm(transfer(H, first.pixels[a]) - last.pixels[b], axis=1)
+    assert np.count_nonzero(lost) > 0.5 * len(first)
+    assert np.median(error[lost]) < 0.1
+    assert np.max(error[lost]) < 1.0

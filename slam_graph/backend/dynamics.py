@@ -17,6 +17,7 @@ and all of the rotation are what the measurements do not observe.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,9 @@ _ANGULAR_RATE_SIGMA = 3.0
 _STATE_FEATURE_FRAMES = 2
 """Features enter the state when so many frames have seen them: without an IMU they are what holds
 the pose from frame to frame."""
+
+_MORE_FEATURES = 2.5
+"""How many times as many features are held in the state as with an IMU."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,9 @@ class Dynamics:
         if config.dynamics.uses_imu(rig.has_imu):
             return Dynamics(rig, algorithm, config)
         return ConstantVelocity(
-            model_rig(rig, config.dynamics), without_prediction(algorithm), without_imu(config)
+            model_rig(rig, config.dynamics),
+            without_prediction(algorithm, rig.has_scale),
+            without_imu(config),
         )
 
     def extend(self, imu: ImuBuffer, until_ns: int) -> None:
@@ -137,15 +143,24 @@ def without_imu(config: BackendConfig) -> BackendConfig:
     )
 
 
-def without_prediction(algorithm: AlgorithmConfig) -> AlgorithmConfig:
+def without_prediction(algorithm: AlgorithmConfig, has_scale: bool) -> AlgorithmConfig:
     """The policies for frames whose poses nothing but their features tells.
 
-    Features enter early, where nothing else was asked for. In GTSAM's smoothers every frame is a
-    state, and the lag is half as long, so that they hold about as many as with an IMU.
+    Features enter early, where nothing else was asked for. Where their distances are measured, more
+    of them are held, and those that are lost are kept: they are what a turn there and back is
+    measured against. In GTSAM's smoothers every frame is a state, and the lag is half as long, so
+    that they hold about as many as with an IMU.
     """
     cost, smoother = algorithm.cost, algorithm.smoother
     if cost.max_state_features != 0 and cost.state_feature_frames is None:
         cost = cost.model_copy(update={"state_feature_frames": _STATE_FEATURE_FRAMES})
+    if cost.max_state_features != 0 and has_scale:
+        update: dict[str, Any] = {}
+        if "keep_lost_features" not in cost.model_fields_set:
+            update["keep_lost_features"] = True
+        if cost.max_state_features is not None:
+            update["max_state_features"] = round(_MORE_FEATURES * cost.max_state_features)
+        cost = cost.model_copy(update=update)
     asked = smoother.model_fields_set
     early = {
         "spacing_s": 0.0,

@@ -16,8 +16,9 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
-from slam_graph.frontend.keypoints import Image, Tracks
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lost_features import LostFeatures
+from slam_graph.frontend.lucas_kanade import BLUR_PER_PX
 from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
@@ -102,7 +103,8 @@ class CameraTracker:
             moves = self._moving.among(after.ids)
             tested = np.flatnonzero(~moves)
             places = self._unrolled(before)[keep][tested], self._unrolled(after)[tested]
-            motions = [tested[rows] for rows in self._rigid_motions(*places)]
+            scale = self._tolerance_scale(before.pixels[keep], after.pixels)
+            motions = [tested[rows] for rows in self._rigid_motions(*places, scale)]
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = np.zeros(len(after), np.bool_)
             inlier[np.concatenate(motions)] = True
@@ -199,14 +201,24 @@ class CameraTracker:
         """Normalised coordinates (N, 2) of features as all rows would see them at one time."""
         return self._predictor.unrolled(tracks.pixels, tracks.normalized, tracks.stamp_ns)
 
-    def _rigid_motions(self, before: FloatArray, after: FloatArray) -> list[IntArray]:
+    def _tolerance_scale(self, before: Pixels, after: Pixels) -> float:
+        """By how much blur loosens the test of matches (N, 2), in the median; 1 with a gyroscope.
+
+        With one it is as it is, since other features are replaced at no loss.
+        """
+        if self._lost is None or len(before) == 0:
+            return 1.0
+        moved_px = float(np.median(np.linalg.norm(after - before, axis=1)))
+        return 1.0 + BLUR_PER_PX * moved_px / self._config.epipolar_px
+
+    def _rigid_motions(self, before: FloatArray, after: FloatArray, scale: float) -> list[IntArray]:
         """The rows of the matches (N, 2) that fit each rigid motion, the largest group first."""
         everything = np.arange(len(before))
         if self._config.outliers == "none":
             return [everything]
 
         def inliers(rows: IntArray) -> BoolArray:
-            return self._inliers(before[rows], after[rows])
+            return self._inliers(before[rows], after[rows], scale)
 
         largest = inliers(everything)
         return [
@@ -267,7 +279,8 @@ class CameraTracker:
         if self._lost is None:
             ids, points = self._associator.recover(before, after)
         else:
-            ids, points = self._lost.found(after, partial(self._epipolar.inliers, after_R_before=None))
+            fits = partial(self._epipolar.inliers, after_R_before=None)
+            ids, points = self._lost.found(after, fits)
         if len(ids) == 0:
             return after
         allowed = self._extractor.allows(points)

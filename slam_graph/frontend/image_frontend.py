@@ -19,7 +19,7 @@ from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, Fr
 from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lost_features import LostFeatures
-from slam_graph.frontend.lucas_kanade import CornerTracking, LucasKanade
+from slam_graph.frontend.lucas_kanade import BLUR_PER_PX, CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
 from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.prediction import ImuMotion, PointPredictor
@@ -96,7 +96,10 @@ class ImageFrontend:
         for i, (mounted, mask) in enumerate(zip(rig.cameras, masks, strict=True)):
             camera, reference = mounted.camera, self._references[i]
             extractor = FeatureExtractor(config, camera.width, camera.height, mask)
-            associator: Associator = CornerTracking(extractor, lucas_kanade, config)
+            turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
+            seeks = turns and rig.has_scale
+            blur = BLUR_PER_PX if seeks else 0.0
+            associator: Associator = CornerTracking(extractor, lucas_kanade, config, blur)
             if reference == i:
                 if config.method in DESCRIPTORS:
                     associator = DescriptorMatching(camera, extractor, config, mask)
@@ -112,10 +115,9 @@ class ImageFrontend:
                     config,
                 )
             predictor = PointPredictor(mounted, self._motion, config)
-            turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
             rotation = ImageRotation(camera) if turns else None
             lost = None
-            if rotation is not None and config.method == "klt" and reference == i:
+            if seeks and rotation is not None and config.method == "klt" and reference == i:
                 lost = LostFeatures(
                     camera,
                     rotation,

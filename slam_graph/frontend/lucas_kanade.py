@@ -39,6 +39,10 @@ _BACKWARD_LEVELS = 0
 _SURPLUS = 2
 """Corners tried for each new feature that is wanted: not all can be tracked back."""
 
+BLUR_PER_PX = 0.02
+"""By how much a corner is harder to place for each pixel that it moved from image to image: the
+longer the way, the longer its blur, along which its place is uncertain."""
+
 _VERIFICATION = 0.3
 """Errors allowed to a new corner, as a share of those allowed to one that is tracked already. There
 are more corners than are needed, and one that barely passes is soon lost."""
@@ -163,8 +167,21 @@ class CornerTracking:
     """Tracks the corners of one camera by Lucas-Kanade: an `Associator`."""
 
     def __init__(
-        self, extractor: FeatureExtractor, lucas_kanade: LucasKanade, config: FrontendConfig
+        self,
+        extractor: FeatureExtractor,
+        lucas_kanade: LucasKanade,
+        config: FrontendConfig,
+        blur: float = 0.0,
     ) -> None:
+        """Track with the settings of the front end.
+
+        Args:
+            extractor: finds new corners.
+            lucas_kanade: tracks them.
+            config: settings.
+            blur: what `forward_backward_px` grows by, for each pixel that a corner has moved.
+        """
+        self._blur = blur
         self._extractor = extractor
         self._lucas_kanade = lucas_kanade
         self._levels = config.pyramid_levels
@@ -186,7 +203,9 @@ class CornerTracking:
                 before.image, image, before.pixels[rows], guess.points[rows], levels
             )
             points[rows], found[rows] = flow.points, flow.found
-            good[rows] = flow.found & (flow.error_px < self._largest_px)
+            good[rows] = flow.found & (
+                flow.error_px < self._tolerance_px(before.pixels[rows], flow.points)
+            )
         return Association(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
 
     def recover(self, before: Tracks, after: Tracks) -> tuple[IntArray, Pixels]:
@@ -203,9 +222,16 @@ class CornerTracking:
         here, there = after.common(before)
         guess = points + neighbour_flow(after.pixels[here], before.pixels[there], points)
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, _GUIDED_LEVELS)
-        limit_px = _VERIFICATION * self._largest_px
+        limit_px = _VERIFICATION * self._tolerance_px(points, flow.points)
         good = found.within_quotas(flow.found & (flow.error_px < limit_px))
         return Candidates(points[good], flow.points[good], _VERIFICATION)
+
+    def _tolerance_px(self, start: Pixels, end: Pixels) -> Pixels | float:
+        """Errors (N,) allowed to corners, forth and back."""
+        if self._blur == 0.0:
+            return self._largest_px
+        moved = np.linalg.norm(end - start, axis=1)
+        return np.asarray(self._largest_px + self._blur * moved, np.float32)
 
     def accept(self, ids: IntArray, chosen: BoolArray) -> None:
         """Nothing to remember: corners are found again by their image."""
