@@ -106,10 +106,10 @@ class CameraTracker:
             scale = self._tolerance_scale(before.pixels[keep], after.pixels)
             motions = [tested[rows] for rows in self._rigid_motions(*places, scale)]
             self._motion_ids = [after.ids[rows] for rows in motions]
-            inlier = np.zeros(len(after), np.bool_)
+            inlier = moves.copy()
             inlier[np.concatenate(motions)] = True
             if self._moving.keeps:
-                self._moving.suspect(after.ids[~inlier & ~moves])
+                self._moving.suspect(after.ids[~inlier])
                 self._stats.count(moving=self._moving.among(after.ids))
                 inlier[:] = True
             in_map = np.ones(len(after), np.bool_)

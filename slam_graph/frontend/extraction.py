@@ -194,7 +194,7 @@ class FeatureExtractor:
         apart = self._count(self._apart)
         counts = self._count(occupied) - apart
         of_the_world = apart <= counts
-        share = -(-self._config.max_features // max(np.count_nonzero(of_the_world), 1))
+        share = -(-self._config.max_features // max(int(np.count_nonzero(of_the_world)), 1))
         # No cell rests while many features are missing, e.g. after the lens was covered
         awake = (self._rest == 0) | (2 * missing > self._config.max_features)
         wanting = (counts < share) & awake & of_the_world

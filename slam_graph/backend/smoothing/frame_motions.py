@@ -57,7 +57,7 @@ class FrameMotions:
             A[:, rows, :6] = (1.0 - share)[:, None, None] * np.eye(6)
             A[:, rows, 6:] = share[:, None, None] * np.eye(6)
         pairs = with_axes_of_the_world(self.known)[np.ix_(before, _POSES, _POSES)]
-        P = A @ pairs @ A.transpose(0, 2, 1) + self._in_between(a, b)
+        P: FloatArray = A @ pairs @ A.transpose(0, 2, 1) + self._in_between(a, b)
         for first, R in ((0, rotations[:-1]), (6, rotations[1:])):
             for rows in (slice(first, first + 3), slice(first + 3, first + 6)):
                 P[:, rows] = R.transpose(0, 2, 1) @ P[:, rows]
