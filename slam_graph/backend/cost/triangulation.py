@@ -149,8 +149,10 @@ def triangulate_frames(
 
 def first_centres(obs: Observations, rig: RigProjection, values: gtsam.Values) -> FloatArray:
     """Positions (J, 3) in the world of the cameras that observed each feature first."""
-    _, positions = _world_cameras(obs, rig, *rig.poses(values, obs.frames))
-    return positions[obs.starts[:-1]]
+    body_R, body_p = rig.poses(values, obs.frames)
+    first = obs.starts[:-1]
+    frames, mounted = obs.frame[first], rig.mounts(obs)[1][first]
+    return np.asarray(body_p[frames] + np.einsum("jik,jk->ji", body_R[frames], mounted))
 
 
 def _world_cameras(
