@@ -180,7 +180,7 @@ class Agreement:
         self._motion = Disagreement(
             _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
         )
-        self._fit = TrackFit()
+        self._fit = TrackFit(config.backend.noise.pixel_sigma)
         self._waiting: dict[int, FeatureFrame] = {}
 
     def check(self, stamp_ns: int, innovations: Innovations) -> None:
@@ -219,7 +219,7 @@ class Agreement:
         found = self._fit.add(state, solved, *known, estimator.motion)
         if found is None:
             return
-        if estimator.start_is_doubtful:
+        if estimator.start_is_doubtful or not found.telling:
             self._motion.untested(state.stamp_ns)
             return
         self._motion.check(state.stamp_ns, found.tested, found.unfit)
