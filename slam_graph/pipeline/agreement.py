@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.backend import Estimator, Innovations, TrackFit
+from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -180,7 +180,7 @@ class Agreement:
         self._motion = Disagreement(
             _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
         )
-        self._fit = TrackFit(config.backend.noise.pixel_sigma)
+        self._fit = Estimator.track_fit(config.backend)
         self._waiting: dict[int, FeatureFrame] = {}
 
     def check(self, stamp_ns: int, innovations: Innovations) -> None:
