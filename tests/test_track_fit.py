@@ -32,7 +32,7 @@ def fits(flight: RecordedSequence, shift: Shift, scale: float = 1.0) -> list[Fit
     frames = [f for f in flight.frames() if isinstance(f, FeatureFrame)]
     stamps = np.array([frame.stamp_ns for frame in frames])
     near, valid = interpolate(truth, stamps)
-    track_fit, found = TrackFit(), []
+    track_fit, found = TrackFit(scale), []
     for k, frame in enumerate(np.array(frames, object)[valid]):
         t = (frame.stamp_ns - stamps[0]) * 1e-9
         pose = gtsam.Pose3(near.pose(k).rotation(), near.positions[k] + shift(t))

@@ -27,7 +27,6 @@ __all__ = [
     "RigProjection",
     "RobustLoss",
     "TenfoldDamping",
-    "TrackFit",
     "WindowGraph",
     "levenberg_marquardt",
     "triangulate_frames",
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
         FeaturePolicy,
         PoseSelection,
     )
-    from slam_graph.backend.cost.track_fit import TrackFit
     from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
@@ -78,7 +76,6 @@ else:
                 "FeaturePolicy",
                 "PoseSelection",
             ),
-            "cost.track_fit": ("TrackFit",),
             "cost.triangulation": ("triangulate_frames",),
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),

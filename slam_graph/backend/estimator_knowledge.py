@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.track_fit import TrackFit
 from slam_graph.backend.engine_protocol import Engine, EngineContext
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.solve.state import FrameMotion
@@ -69,6 +71,11 @@ class EstimatorKnowledge:
         A mean over the cameras.
         """
         return float(np.mean(self._context.pixels.estimate_px))
+
+    @staticmethod
+    def track_fit(config: BackendConfig) -> TrackFit:
+        """A comparison of tracks with the states that an estimator reports, without frames yet."""
+        return TrackFit(config.noise.pixel_sigma)
 
     @property
     def start_is_doubtful(self) -> bool:

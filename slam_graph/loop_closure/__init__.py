@@ -19,7 +19,6 @@ __all__ = [
     "LoopClosureConfig",
     "LoopClosures",
     "LoopVerifier",
-    "PlaceJoint",
     "Vocabulary",
     "close_loops",
     "correct_keyframes",
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeDescriber, KeyframeLog
     from slam_graph.loop_closure.loop_pose_graph import correct_keyframes
     from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
-    from slam_graph.loop_closure.place_joint import PlaceJoint
     from slam_graph.loop_closure.place_recognition import Vocabulary
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -52,7 +50,6 @@ else:
                 "Loop",
                 "LoopVerifier",
             ),
-            "place_joint": ("PlaceJoint",),
             "place_recognition": ("Vocabulary",),
         },
     )

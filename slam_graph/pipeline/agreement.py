@@ -13,7 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from slam_graph.backend import Estimator, Innovations, TrackFit
+from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -183,7 +183,7 @@ class Agreement:
         self._motion = Disagreement(
             _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
         )
-        self._fit = TrackFit()
+        self._fit = Estimator.track_fit(config.backend)
         self._waiting: dict[int, FeatureFrame] = {}
 
     def check(self, stamp_ns: int, innovations: Innovations) -> None:
@@ -222,7 +222,7 @@ class Agreement:
         found = self._fit.add(state, solved, *known, estimator.motion)
         if found is None:
             return
-        if estimator.start_is_doubtful:
+        if estimator.start_is_doubtful or not found.telling:
             self._motion.untested(state.stamp_ns)
             return
         self._motion.check(state.stamp_ns, found.tested, found.unfit)

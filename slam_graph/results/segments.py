@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.geometry import Trajectory
-
-if TYPE_CHECKING:
-    from slam_graph.loop_closure import PlaceJoint
 
 JoinedBy = Literal["start", "imu", "none"]
 """Of the first segment, joined by the IMU, and not joined: its place is not known."""
@@ -34,6 +32,30 @@ _OF_PLACES = 2 + 7 + 21
 
 _UNKNOWN = np.diag([1000.0**2] * 3 + [np.pi**2])
 """Covariance of a place of which nothing is known: m², rad²."""
+
+
+class PlaceJoint(Protocol):
+    """What recognised places say of the pose of a segment relative to the one before."""
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the last keyframe before the segment."""
+        ...
+
+    @property
+    def second_ns(self) -> int:
+        """Time of its first keyframe."""
+        ...
+
+    @property
+    def first_T_second(self) -> gtsam.Pose3:
+        """Pose of the second in the first."""
+        ...
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6) of it in GTSAM's tangent: rotation (rad), translation (m)."""
+        ...
 
 
 @dataclass(eq=False)

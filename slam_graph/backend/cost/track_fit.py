@@ -53,11 +53,13 @@ class Fit:
         tested: how many tracks were compared.
         unfit: how many of them do not fit.
         jumped: whether the platform was put somewhere else three comparisons ago.
+        telling: whether tracks have fitted before, with noise of the size that was expected.
     """
 
     tested: int
     unfit: int
-    jumped: bool = False
+    jumped: bool
+    telling: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,13 +74,21 @@ class _Pose:
 
 
 class TrackFit:
-    """Compares tracks with the poses that were reported for their frames."""
+    """Compares tracks with the poses that were reported for their frames.
 
-    def __init__(self) -> None:
+    Args:
+        usual_px: standard deviation of the observations by the settings. Where they showed a larger
+            one while tracks fitted, such as under a wrong calibration, the estimate itself may
+            jump and be off, and that tracks do not fit says nothing.
+    """
+
+    def __init__(self, usual_px: float) -> None:
+        self._usual_px = usual_px
         self._tracks = FeatureTracks()
         self._poses: deque[_Pose] = deque()
         self._count = 0
         self._good: int | None = None  # the last frame that was good
+        self._telling = False
 
     def add(
         self,
@@ -123,7 +133,8 @@ class TrackFit:
             jumped = self._jumped(ids, self._good, projection, _LARGEST * sigma_px)
         if len(ids) >= _JUMPED and unfit <= _GOOD_SHARE * len(ids):
             self._good = now
-        return Fit(len(ids), unfit, jumped)
+            self._telling = sigma_px <= self._usual_px
+        return Fit(len(ids), unfit, jumped and self._telling, self._telling)
 
     def _jumped(
         self, ids: IntArray, before: int, projection: RigProjection, limit_px: float
