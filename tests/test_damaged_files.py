@@ -274,10 +274,14 @@ def test_true_poses_of_objects(tmp_path: Path) -> None:
     tried(path, lambda: read_object_truth(path))
 
 
-@pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv"])
+@pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv", "poses.csv"])
 def test_aiding(tmp_path: Path, name: str) -> None:
     root = tmp_path / "flight"
-    with_aiding = {"gnss": {"sigma_m": 1.0, "rate_hz": 5.0}, "odometry": {"enabled": True}}
+    with_aiding = {
+        "gnss": {"sigma_m": 1.0, "rate_hz": 5.0},
+        "known_poses": {"rotation_sigma_rad": 0.1},
+        "odometry": {"enabled": True},
+    }
     simulate(kind="images", duration_s=0.5, rate_hz=4.0, cameras=1, **with_aiding).save(root)
     file = next(root.rglob(name))
     tried(file, lambda: read_all(root), 50)
