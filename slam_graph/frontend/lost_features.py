@@ -30,6 +30,9 @@ _SHARE = 0.6
 """An image is remembered when fewer than this part of the corners of the last one are left."""
 _LEAST = 10
 """Fewer missing corners that should be in view are not looked for."""
+_FITTING = 0.7
+"""Part of the corners that must fit the motion. A wrong one is on its epipolar line by chance once
+in some twenty times; where few fit, those that do are such."""
 
 Inliers = Callable[[FloatArray, FloatArray], BoolArray]
 """Which matches (N, 2), on the plane z = 1 of two images, are of one rigid motion."""
@@ -118,8 +121,10 @@ class LostFeatures:
         end = np.concatenate([ends, after.normalized[here]])
         if len(good) < MIN_POINTS or len(start) < 2 * MIN_POINTS:
             return nothing
-        good = good[inliers(start, end)[: len(good)]]
-        return missing.ids[good], flow.points[good]
+        fits = inliers(start, end)[: len(good)]
+        if np.count_nonzero(fits) < max(MIN_POINTS, _FITTING * len(good)):
+            return nothing
+        return missing.ids[good[fits]], flow.points[good[fits]]
 
     def _places(self, turn: FloatArray, tracks: Tracks) -> Pixels:
         """Where the rotation puts corners (N, 2); far outside of the image if behind it."""
