@@ -99,7 +99,7 @@ class EstimatorKnowledge:
         variables = self._context.calibration
         if self.window is None or not variables.keys:
             return variables.nominal
-        return variables.rig(self.window.state.estimate)
+        return variables.rig(self.window.state.frames)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

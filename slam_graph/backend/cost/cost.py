@@ -303,14 +303,16 @@ class Cost:
         a variable of the state goes where the increment says: a damped one is shorter. With two
         positions its rows would be linearised at one, and its first estimate would be the other.
         """
-        before = self.state.estimate
-        self.state.update(layout, delta)
-        if self.tracks is not None and linear.tracks is not None:
+        tracks, points = self.tracks, None
+        if tracks is not None and linear.tracks is not None:
             assert isinstance(linear.tracks, SummedFeatures)
-            tracks, columns = self.tracks, layout.indices(self.rig.keys_of(self.tracks.obs))
+            columns = layout.indices(self.rig.keys_of(tracks.obs))
             increments = linear.tracks.point_increments(delta[columns])
-            centres = first_centres(tracks.obs, self.rig.at(self.state), before)
+            rig, poses = self.rig.at(self.state), self.state.poses(tracks.obs.frames)
+            centres = first_centres(tracks.obs, rig, *rig.when_taken(tracks.obs.frames, *poses))
             points = moved_in_inverse_depth(tracks.points, increments, centres)
+        self.state.update(layout, delta)
+        if tracks is not None and points is not None:
             if tracks.in_state.any():
                 ids = tracks.obs.ids[tracks.in_state]
                 points[tracks.in_state] = self.state.positions_of(ids)

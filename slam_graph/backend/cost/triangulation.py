@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -147,12 +146,20 @@ def triangulate_frames(
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
 
 
-def first_centres(obs: Observations, rig: RigProjection, values: gtsam.Values) -> FloatArray:
-    """Positions (J, 3) in the world of the cameras that observed each feature first."""
-    body_R, body_p = rig.poses(values, obs.frames)
+def first_centres(
+    obs: Observations, rig: RigProjection, rotations: FloatArray, positions: FloatArray
+) -> FloatArray:
+    """Positions (J, 3) in the world of the cameras that observed each feature first.
+
+    Args:
+        obs: observations of J features.
+        rig: where the cameras are in the body.
+        rotations: (F, 3, 3) of the body at the frames of `obs`.
+        positions: (F, 3) of it, m.
+    """
     first = obs.starts[:-1]
     frames, mounted = obs.frame[first], rig.mounts(obs)[1][first]
-    return np.asarray(body_p[frames] + np.einsum("jik,jk->ji", body_R[frames], mounted))
+    return np.asarray(positions[frames] + np.einsum("jik,jk->ji", rotations[frames], mounted))
 
 
 def _world_cameras(

@@ -206,8 +206,8 @@ class SmootherEngine:
         ids = window.state_features[: self._policy.max_features]
         self._solver = self._begin(window)
         factors = features_given_pose(window.prior, window.state.first, ids, X(window.frame))
-        for j in ids.tolist():
-            self._estimate.insert(L(j), window.state.estimate.atPoint3(L(j)))
+        for j, point in zip(ids.tolist(), window.state.positions_of(ids), strict=True):
+            self._estimate.insert(L(j), point)
         stamps = {L(j): self._seconds(window.stamp_ns) for j in ids.tolist()}
         self._solver.update(factors, self._estimate, stamps)
         self._features.active = ids
