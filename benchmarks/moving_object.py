@@ -31,7 +31,7 @@ OBJECTS: dict[str, dict[str, float]] = {
 
 ALGORITHMS = ("msckf", "swf", "okvis")
 JUDGED = ("msckf", "swf")
-"""The others are only shown."""
+"""Without `--objects` the others are only shown."""
 WITH_OBJECTS = "objects"
 """Variants with two cameras in which moving objects are estimated (`--objects`)."""
 GROWTH_BAR, GROWTH_BAR_WITH_OBJECTS = 2.0, 1.1

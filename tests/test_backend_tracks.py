@@ -7,10 +7,11 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome, is_in
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))
@@ -37,6 +38,15 @@ def test_parallax_is_of_the_place_and_not_of_the_direction() -> None:
     cosine = np.sum(both * (both - there), axis=1)
     cosine /= np.linalg.norm(both, axis=1) * np.linalg.norm(both - there, axis=1)
     np.testing.assert_allclose(tracks.parallax(0, 2, turn.T), np.arccos(cosine), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint16])
+def test_ids_of_any_integers_can_be_compared(kind: type) -> None:
+    """Also those of a file in memory, which cannot be written to."""
+    values = np.frombuffer(np.array([7, 3, 9], kind).tobytes(), kind)
+    ascending = np.frombuffer(np.array([3, 4, 9], kind).tobytes(), kind)
+    assert not values.flags.writeable
+    assert is_in(values, ascending).tolist() == [False, True, True]
 
 
 def test_the_table_of_outcomes_is_the_code() -> None:

@@ -220,7 +220,7 @@ def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> N
     result = estimated(sequence, algorithm)
     assert result.status == "ok"
     assert result.georeferenced
-    assert error_m(sequence, result) < 0.06
+    assert error_m(sequence, result) < 0.04
 
 
 def test_positions_alone_and_orientations_alone() -> None:

@@ -7,16 +7,19 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from flight import Flight
 from gtsam.symbol_shorthand import L, V, X
 from scipy.spatial.transform import Rotation
 
 from slam_graph import run
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.fix_factors import FixGate, PositionFix
 from slam_graph.backend.aiding.regauging import gauge_directions, with_free_gauge
 from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.state import dims_of
+from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.datasets.streams.geodesy import geodetic_positions, local_positions
@@ -207,6 +210,23 @@ def test_the_gate_rejects_multipath_and_few_good_fixes() -> None:
     assert np.mean(good) > 0.95
     for _ in range(2):
         assert gate.weight(fix_of(np.array([10.0, 0.0, 0.0])), pose, known) == 0.0
+
+
+def test_a_frame_that_is_not_kept_takes_no_fix_away() -> None:
+    """GTSAM's smoothers predict every frame, and keep only some."""
+    aiding = Aiding(BackendConfig(), level=True)
+    aiding.aligned, state = True, State()
+    for frame in range(4):
+        state.insert_imu_state(frame, Flight().nav_state(0.0))
+    covariances = np.tile(np.eye(3), (6, 1, 1))
+    aiding.add(AidingData.of_fixes(np.arange(1, 7) * 10, np.zeros((6, 3)), covariances))
+
+    def counted(first: int, last: int, frames: tuple[int, int]) -> int:
+        return len(aiding.factors(state, frames, (first, last), None))
+
+    assert counted(0, 20, (0, 1)) == 2  # not kept: the next frame follows the same one
+    assert counted(0, 40, (0, 2)) == 4
+    assert counted(40, 60, (2, 3)) == 2
 
 
 def test_the_gate_gives_in_if_all_fixes_say_the_same() -> None:

@@ -122,7 +122,8 @@ def test_a_depth_sensor_takes_the_place_of_a_second_camera(depth: str) -> None:
     assert result.smoothed is not None
     causal = ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse
     smoothed = ape(result.groundtruth, result.smoothed, "trans_part", "se3").statistics.rmse
-    assert smoothed < 0.8 * causal < 0.016
+    assert smoothed < causal < 0.009
+    assert smoothed < 0.006
 
 
 def test_what_is_known_without_an_imu_is_what_the_covariance_says() -> None:

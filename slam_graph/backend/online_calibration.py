@@ -195,7 +195,7 @@ class CalibrationVariables:
             block = covariance[start:stop, start:stop]
             letter, c = letter_and_index(key)
             if letter == "e":  # from the first estimate's tangent to this one's
-                turn = gtsam.Pose3.ExpmapDerivative(state.offsets[key])
+                turn = gtsam.Pose3.ExpmapDerivative(state.offset_of(key))
                 block = turn @ block @ turn.T
             blocks[f"{letter}{c}"] = block
             start = stop

@@ -171,7 +171,7 @@ def correct_by(
         keyframes: in the order of time.
         loops: between them.
         config: settings.
-        diagnostics: counts rejected loop closures.
+        diagnostics: counts rejected loop closures where there is a scale.
         breaks: where the trajectory was lost and starts again.
         has_scale: whether all keyframes have one unit of length; otherwise loops have scales.
     """

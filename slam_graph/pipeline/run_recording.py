@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _NO_SCALE = (
-    "one camera without an IMU: all lengths are up to scale, and fixes and odometry are not used"
+    "one camera without an IMU: all lengths are up to scale; "
+    "fixes, known poses and odometry are not used"
 )
 
 
@@ -235,7 +236,8 @@ def _tracked(
         return tracking.in_turn()
     if not can_overlap():
         logger.warning(
-            "overlap needs a second core and a process that may fork: front and back end take turns"
+            "overlap needs a second core, the main thread and a system that forks; "
+            "front and back end take turns (overlap=false avoids this warning)"
         )
         return tracking.in_turn()
     return tracking.beside(asked.rig, sequence.diagnostics)

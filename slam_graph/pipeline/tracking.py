@@ -9,6 +9,7 @@ frame k reaches the front end before frame k + 2, in either mode: results are th
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
@@ -201,7 +202,12 @@ def _milliseconds(frame_stats: Mapping[str, float]) -> dict[str, float]:
 
 
 def can_overlap() -> bool:
-    """Whether a process beside this one can be started here, and has a core of its own."""
+    """Whether a process beside this one can be started here, and has a core of its own.
+
+    Not from a thread beside the main one: another run may hold a lock then, for ever in the copy.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return False
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return ForkedCall.is_possible() and (cores or 1) > 1
 

@@ -84,7 +84,9 @@ def anchor_factors(
         else gtsam.noiseModel.Isotropic.Precision(k, _typical_information(graph))
     )
     rows, at = graph.anchors, graph.anchor_poses()
-    if anchor is not None and graph.estimates is not None:
+    if anchor is not None:
+        if graph.estimates is None:
+            raise ValueError("the pose of an anchor is known by estimates only")
         rows = np.array([anchor], np.int64)
         at = graph.estimates.select(rows)
     poses = gtsam_poses(at)

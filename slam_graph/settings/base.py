@@ -11,15 +11,16 @@ not a setting but a constant beside its use.
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from inspect import cleandoc, getsource
 from itertools import pairwise
 from sys import modules
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -27,6 +28,22 @@ from slam_graph.display import Displayed
 
 expert = partial(Field, json_schema_extra={"expert": True})
 """A pydantic field of the second tier; it works like any other."""
+
+_UNIT = 1e-2
+"""A quaternion's length differs from one by less."""
+
+
+def _of_unit_length(
+    quaternion: tuple[float, float, float, float],
+) -> tuple[float, float, float, float]:
+    length = math.hypot(*quaternion)
+    if not abs(length - 1.0) < _UNIT:
+        raise ValueError(f"a rotation as x y z w has length 1; this one has {length:g}")
+    return quaternion
+
+
+UnitQuaternion = Annotated[tuple[float, float, float, float], AfterValidator(_of_unit_length)]
+"""A rotation as a setting, x y z w."""
 
 
 class Settings(Displayed, BaseModel):

@@ -72,7 +72,8 @@ class Aiding:
         """The estimate begins anew, in another world."""
         self.aligned = False
         self._path = EstimatedPath()
-        self._waiting = AidingData.empty()
+        self._waiting = self._offered = AidingData.empty()
+        self._offered_ns = 0
         self._fixes: list[Fix] = []
 
     def add(self, data: AidingData) -> None:
@@ -108,7 +109,7 @@ class Aiding:
                 factors.append(odometry_factor(frames, moved, self._config.odometry))
         if not self.aligned:
             return factors
-        for fix in self._due(stamps_ns[1]):
+        for fix in self._due(stamps_ns):
             share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
             then = (
                 pose_between(first, last, share) if share > 0.0 else self._path.pose(fix.stamp_ns)
@@ -121,11 +122,17 @@ class Aiding:
                 factors.append(here.factor(pose_key(frames[1]), weight))
         return factors
 
-    def _due(self, stamp_ns: int) -> list[Fix]:
-        """The fixes up to a time that were not taken yet."""
-        due = self._waiting.within(None, stamp_ns)
+    def _due(self, stamps_ns: tuple[int, int]) -> list[Fix]:
+        """The fixes up to a new frame that no frame up to the last one has taken.
+
+        GTSAM's smoothers predict frames that they do not keep: what was due for one is due again.
+        """
+        since_ns, stamp_ns = stamps_ns
+        if self._offered_ns > since_ns:
+            self._waiting = AidingData.concatenate([self._offered, self._waiting])
+        self._offered, self._offered_ns = self._waiting.within(None, stamp_ns), stamp_ns
         self._waiting = self._waiting.within(stamp_ns, None)
-        return fixes_of(due, self._config)
+        return fixes_of(self._offered, self._config)
 
     def _of_unsure_time(
         self, fix: Fix, poses: tuple[gtsam.Pose3, gtsam.Pose3], stamps_ns: tuple[int, int]
@@ -166,7 +173,7 @@ class Aiding:
             if state.stamp_ns - self._path.states[0].stamp_ns > 2 * _HISTORY_NS:
                 self._path.forget_before(state.stamp_ns - _HISTORY_NS)
             return None
-        due = self._due(state.stamp_ns)
+        due = self._due((state.stamp_ns, state.stamp_ns))
         self._fixes = [*self._fixes, *due][-_MOST_FIXES:]
         return self._aligned(state) if due else None
 
@@ -179,20 +186,25 @@ class Aiding:
             pairs = [self._path.at(fix, round(offset_s * 1e9)) for fix in self._fixes]
             # older fixes tell less of the world: the path has drifted since
             drifted = [pair.after_drift(*variances_of(state)) for pair in pairs if pair is not None]
-            found = align_world(drifted, now, self._level, (-offset_s, sigma_s))
+            expected_s = -self.offset_s - offset_s
+            found = align_world(drifted, now, self._level, (expected_s, sigma_s))
             if found is None:
                 return None
             offset_s += found.offset_s
         assert found is not None
-        if len(self._fixes) < _MOST_UNTIMED and self._is_untimed(found):
+        if self._is_untimed(found, round(offset_s * 1e9)):
             return None
         return replace(found, offset_s=offset_s)
 
-    def _is_untimed(self, found: WorldAlignment) -> bool:
+    def _is_untimed(self, found: WorldAlignment, offset_ns: int) -> bool:
         """Whether the clock of the fixes is known so badly that it counts beside their noise."""
         if found.offset_sigma_s == 0.0:
             return False
-        timed = [pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, 0))]
+        timed = [
+            pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, offset_ns))
+        ]
+        if not 0 < len(timed) < _MOST_UNTIMED:
+            return False
         speed = np.mean([np.linalg.norm(pair.velocity) for pair in timed])
         sigma = np.sqrt(np.mean([np.trace(pair.fix.covariance) / 3.0 for pair in timed]))
         return bool(found.offset_sigma_s * speed > _UNTIMED * sigma)

@@ -156,7 +156,7 @@ class CalibratedProjection(RigProjection):
         """Derivative (6, 6) of the pose of a camera by its offset from its first estimate."""
         if self._state is None:
             return np.eye(6)
-        return np.asarray(gtsam.Pose3.ExpmapDerivative(self._state.offsets[E(c)]))
+        return np.asarray(gtsam.Pose3.ExpmapDerivative(self._state.offset_of(E(c))))
 
     def _shift(self, frames: Iterable[int]) -> _Shift | None:
         """From the poses of frames to when they were taken; None if no offset is estimated.

@@ -357,7 +357,10 @@ def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
-    return are_among(values, ascending)
+    try:
+        return are_among(values, ascending)
+    except TypeError:  # arrays that cannot be written to, or of other integers
+        return are_among(np.array(values, np.int64), np.array(ascending, np.int64))
 
 
 def sorted_unique(values: IntArray) -> IntArray:

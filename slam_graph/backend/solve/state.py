@@ -174,6 +174,10 @@ class State:
         points = zip(landmark_keys(self.points.ids), self.points.offsets, strict=True)
         return self._offsets | dict(points)
 
+    def offset_of(self, key: int) -> FloatArray:
+        """Tangent (dim,) of a variable that is no feature, at its linearisation point."""
+        return self._offsets[key]
+
     @property
     def frozen(self) -> set[int]:
         """Keys whose linearisation point no longer moves."""

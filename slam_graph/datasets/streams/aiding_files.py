@@ -56,6 +56,8 @@ _VERTICAL = 2.0
 """Heights are so much less accurate."""
 _LARGEST = np.array([90.0, 360.0, 1e6])
 """Latitudes and longitudes (degrees) and heights (m) are no larger."""
+_FARTHEST_M, _LEAST_SIGMA = 1e6, 1e-9
+"""Bounds on known poses: coordinates, and standard deviations in m and rad."""
 
 
 def read_aiding(
@@ -79,7 +81,7 @@ def read_aiding(
     if odometry is not None:
         data = data.with_odometry(*_read_odometry(odometry, diagnostics))
     poses = _find("poses", POSES, folders, named)
-    if poses is not None:
+    if poses is not None and ("poses" in named or "sigma" in _header(poses)[0]):
         data = data.with_poses(*_read_poses(poses, diagnostics))
     return data
 
@@ -289,7 +291,8 @@ def _read_poses(
     lengths = np.linalg.norm(table["quaternion"], axis=1)
     good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     good &= (measured | unknown).all(axis=1) & measured.any(axis=1)
-    good &= (table["sigma"] > 0).all(axis=1)
+    good &= (np.abs(table["position"]) <= _FARTHEST_M).all(axis=1)
+    good &= (table["sigma"] >= _LEAST_SIGMA).all(axis=1)
     good = np.asarray(good, np.bool_)
     table = table[kept_of(table["stamp"], good, "poses_dropped", f"{path}: pose", diagnostics)]
     return table["stamp"], table["position"], table["quaternion"], table["sigma"]
