@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -80,7 +81,7 @@ class Stock:
             "path/to/dataset-room1_512_16": self._tum_vi,
             "path/to/2011_09_26": write_kitti_raw,
             "path/to/dataset": lambda to: write_kitti_odometry(to, number="00"),
-            "path/to/rgbd_dataset_freiburg1_xyz": write_tum_rgbd,
+            "path/to/rgbd_dataset_freiburg1_xyz": partial(write_tum_rgbd, frames=15),
             "path/to/recordings": self._recordings,
             "monday": self._tracks,
             "tuesday": self._tracks,

@@ -208,7 +208,7 @@ def test_a_feature_that_is_nearer_than_it_was_taken_for_stays_before_the_camera(
         state.insert_imu_state(frame, Flight().nav_state(float(t_s)))
     cost = Cost(state, RigProjection(cameras), BackendConfig(), SquareRootInformation.empty())
     cost.prior = cost.prior.extended(dims_of(X(i) for i in range(len(times_s))))
-    centres = first_centres(obs, cost.rig, *state.poses(obs.frames))
+    centres = first_centres(obs, cost.rig, state)
     too_far = centres + 4.0 * (truth.points - centres)
     cost.tracks = TrackFeatures(obs, too_far, np.zeros(len(obs.ids), np.bool_))
     linear, layout = cost.linearize(summed=True), cost.layout()

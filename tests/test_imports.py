@@ -50,7 +50,7 @@ with loading():
     from slam_graph.pipeline import Tracking
 def track(self):
     raise SystemExit
-Tracking.run = track
+Tracking.in_turn = track
 """
 """Ends a run where its first frame would be read."""
 

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
-from slam_graph.settings import Settings, UnitQuaternion, expert
+from slam_graph.settings import Settings, expert
 
 
 class AdaptiveNoiseConfig(Settings):
@@ -287,7 +287,7 @@ class KnownPosesConfig(Settings):
     to compare."""
     lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
     """Position in the body frame of the sensor whose poses are known, in metres."""
-    quaternion: UnitQuaternion = expert((0.0, 0.0, 0.0, 1.0))
+    quaternion: tuple[float, float, float, float] = expert((0.0, 0.0, 0.0, 1.0))
     """Orientation of that sensor in the body frame, body_R_sensor as x y z w."""
     time_offset_s: float = expert(0.0, ge=-10, le=10)
     """Added to the times of the poses to get them on the clock of the IMU, or of the cameras where

@@ -40,7 +40,7 @@ _BASELINE, _BAD_BASELINE = 0.12, 0.3
 """Logarithms of wrong baselines that are a warning, and an error."""
 _BASELINE_SIGMAS = 6.0
 _FEWEST_WINDOWS = 3
-_ROBUST_WINDOWS = 7
+_ROBUST_WINDOWS = 5
 """Of fewer windows two may agree by chance, and then the median deviation is much too small: their
 standard deviation counts."""
 _LEAST_SIGMA = 0.025

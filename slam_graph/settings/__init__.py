@@ -9,18 +9,17 @@ from slam_graph.lazy import lazy_exports
 __all__ = [
     "ConfigTree",
     "Settings",
-    "UnitQuaternion",
     "expert",
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.settings.base import Settings, UnitQuaternion, expert
+    from slam_graph.settings.base import Settings, expert
     from slam_graph.settings.tree import ConfigTree
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "base": ("Settings", "UnitQuaternion", "expert"),
+            "base": ("Settings", "expert"),
             "tree": ("ConfigTree",),
         },
     )

@@ -17,10 +17,10 @@ from functools import cache, partial
 from inspect import cleandoc, getsource
 from itertools import pairwise
 from sys import modules
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, field_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -31,19 +31,6 @@ expert = partial(Field, json_schema_extra={"expert": True})
 
 _UNIT = 1e-2
 """A quaternion's length differs from one by less."""
-
-
-def _of_unit_length(
-    quaternion: tuple[float, float, float, float],
-) -> tuple[float, float, float, float]:
-    length = math.hypot(*quaternion)
-    if not abs(length - 1.0) < _UNIT:
-        raise ValueError(f"a rotation as x y z w has length 1; this one has {length:g}")
-    return quaternion
-
-
-UnitQuaternion = Annotated[tuple[float, float, float, float], AfterValidator(_of_unit_length)]
-"""A rotation as a setting, x y z w."""
 
 
 class Settings(Displayed, BaseModel):
@@ -57,6 +44,17 @@ class Settings(Displayed, BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     moved: ClassVar[Mapping[str, str]] = {}
+
+    @field_validator("quaternion", check_fields=False)
+    @classmethod
+    def _is_a_rotation(
+        cls, value: tuple[float, float, float, float]
+    ) -> tuple[float, float, float, float]:
+        """A rotation, x y z w, wherever a table has one."""
+        length = math.hypot(*value)
+        if not abs(length - 1.0) < _UNIT:
+            raise ValueError(f"a rotation as x y z w has length 1; this one has {length:g}")
+        return value
 
     @classmethod
     def meanings(cls) -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
-from slam_graph.settings import ConfigTree, Settings, UnitQuaternion, expert
+from slam_graph.settings import ConfigTree, Settings, expert
 
 TRAJECTORIES = ("figure8", "rooms", "random", "car")
 """Names of the generated trajectories; any other text is the path of a recorded one."""
@@ -178,7 +178,7 @@ class SimulatedPosesConfig(Settings):
     """Share of poses that are off by a metre, and by a rad, in any direction."""
     lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
     """Position of the sensor in the body frame, in metres; a run must be told the same."""
-    quaternion: UnitQuaternion = expert((0.0, 0.0, 0.0, 1.0))
+    quaternion: tuple[float, float, float, float] = expert((0.0, 0.0, 0.0, 1.0))
     """Orientation of the sensor in the body frame, x y z w; a run must be told the same."""
 
 

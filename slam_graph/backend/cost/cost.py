@@ -293,30 +293,24 @@ class Cost:
             fill_new_variable_rows(Ab[end:], tracks, new, own, columns)
         return Ab
 
-    # --- moving --------------------------------------------------------------------------------
-
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
-        """Move the estimates by an increment (n,), and the new features with them.
+        """Move the estimates by an increment (n,), and new features with them, in inverse depth.
 
-        A new feature goes where it fits the moved poses best, in inverse depth: one with little
-        parallax would otherwise jump, and stop a step that is good for all others. One that becomes
-        a variable of the state goes where the increment says: a damped one is shorter. With two
-        positions its rows would be linearised at one, and its first estimate would be the other.
+        In metres one with little parallax would jump, and stop a step that is good for all others.
+        One that becomes a variable goes where the increment says: there its rows are linearised.
         """
-        tracks, points = self.tracks, None
-        if tracks is not None and linear.tracks is not None:
-            assert isinstance(linear.tracks, SummedFeatures)
-            columns = layout.indices(self.rig.keys_of(tracks.obs))
-            increments = linear.tracks.point_increments(delta[columns])
-            rig, poses = self.rig.at(self.state), self.state.poses(tracks.obs.frames)
-            centres = first_centres(tracks.obs, rig, *rig.when_taken(tracks.obs.frames, *poses))
-            points = moved_in_inverse_depth(tracks.points, increments, centres)
-        self.state.update(layout, delta)
-        if tracks is not None and points is not None:
-            if tracks.in_state.any():
-                ids = tracks.obs.ids[tracks.in_state]
-                points[tracks.in_state] = self.state.positions_of(ids)
-            self.tracks = replace(tracks, points=points)
+        tracks, state = self.tracks, self.state
+        if tracks is None or linear.tracks is None:
+            state.update(layout, delta)
+            return
+        assert isinstance(linear.tracks, SummedFeatures)
+        columns, own = layout.indices(self.rig.keys_of(tracks.obs)), tracks.in_state
+        centres = first_centres(tracks.obs, self.rig.at(state), state)
+        increments = linear.tracks.point_increments(delta[columns])
+        points = moved_in_inverse_depth(tracks.points, increments, centres)
+        state.update(layout, delta)
+        points[own] = state.positions_of(tracks.obs.ids[own])
+        self.tracks = replace(tracks, points=points)
 
     def snapshot(self) -> tuple[State, TrackFeatures | None]:
         """What `apply` changes, to be given back to `restore`."""

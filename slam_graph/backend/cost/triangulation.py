@@ -20,6 +20,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.solve.state import State
 from slam_graph.kernels.ray_triangulation import triangulate_rays
 from slam_graph.sensors import FeatureFrame, Rig
 
@@ -146,17 +147,9 @@ def triangulate_frames(
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
 
 
-def first_centres(
-    obs: Observations, rig: RigProjection, rotations: FloatArray, positions: FloatArray
-) -> FloatArray:
-    """Positions (J, 3) in the world of the cameras that observed each feature first.
-
-    Args:
-        obs: observations of J features.
-        rig: where the cameras are in the body.
-        rotations: (F, 3, 3) of the body at the frames of `obs`.
-        positions: (F, 3) of it, m.
-    """
+def first_centres(obs: Observations, rig: RigProjection, state: State) -> FloatArray:
+    """Positions (J, 3), in the world, of the cameras that observed each of J features first."""
+    rotations, positions = rig.when_taken(obs.frames, *state.poses(obs.frames))
     first = obs.starts[:-1]
     frames, mounted = obs.frame[first], rig.mounts(obs)[1][first]
     return np.asarray(positions[frames] + np.einsum("jik,jk->ji", rotations[frames], mounted))
