@@ -212,7 +212,7 @@ def test_an_increment_in_inverse_depth_is_that_in_metres_to_first_order() -> Non
     rng = np.random.default_rng(4)
     points, centres, increments = rng.normal(size=(3, 50, 3))
     step = 1e-4
-    moved = moved_in_inverse_depth(points, step * increments, centres)
+    moved = moved_in_inverse_depth(points, step * increments, centres, centres)
     size = np.linalg.norm(points - centres, axis=1, keepdims=True)
     assert np.all(np.abs(moved - points - step * increments) < 100 * step**2 / size)
 
@@ -221,7 +221,9 @@ def test_an_increment_along_a_ray_changes_the_inverse_depth_by_what_it_says() ->
     """And never leads through the camera."""
     centres, ray = np.zeros((4, 3)), np.array([0.6, 0.0, 0.8])
     depths, increments = np.array([2.0, 2.0, 2.0, 20.0]), np.array([0.5, -0.5, -100.0, 19.0])
-    moved = moved_in_inverse_depth(depths[:, None] * ray, increments[:, None] * ray, centres)
+    moved = moved_in_inverse_depth(
+        depths[:, None] * ray, increments[:, None] * ray, centres, centres
+    )
     found = moved @ ray
     np.testing.assert_allclose(1.0 / found, 1.0 / depths - increments / depths**2, rtol=1e-12)
     np.testing.assert_allclose(moved, found[:, None] * ray, atol=1e-12)

@@ -170,7 +170,8 @@ def test_features_used_once_say_of_the_calibration_what_variables_would() -> Non
     # the same increments, which features that are no variables take in inverse depth
     centres = first_centres(obs, CalibratedProjection(variables, state), state)
     moved = np.array([second.state.estimate.atPoint3(L(j)) for j in obs.ids.tolist()])
-    expected = moved_in_inverse_depth(points, moved - points, centres)
+    after = first_centres(obs, CalibratedProjection(variables, first.state), first.state)
+    expected = moved_in_inverse_depth(points, moved - points, centres, after)
     np.testing.assert_allclose(first.tracks.points, expected, atol=1e-6)
     for key in variables.keys:
         np.testing.assert_allclose(first.state.offsets[key], second.state.offsets[key], atol=1e-7)

@@ -305,10 +305,11 @@ class Cost:
             return
         assert isinstance(linear.tracks, SummedFeatures)
         columns, own = layout.indices(self.rig.keys_of(tracks.obs)), tracks.in_state
-        centres = first_centres(tracks.obs, self.rig.at(state), state)
         increments = linear.tracks.point_increments(delta[columns])
-        points = moved_in_inverse_depth(tracks.points, increments, centres)
+        before = first_centres(tracks.obs, self.rig.at(state), state)
         state.update(layout, delta)
+        after = first_centres(tracks.obs, self.rig.at(state), state)
+        points = moved_in_inverse_depth(tracks.points, increments, before, after)
         points[own] = state.positions_of(tracks.obs.ids[own])
         self.tracks = replace(tracks, points=points)
 
@@ -320,8 +321,6 @@ class Cost:
         """Undo what was applied since a snapshot."""
         self.state.assign(before[0])
         self.tracks = before[1]
-
-    # --- gating --------------------------------------------------------------------------------
 
     def gate(
         self,

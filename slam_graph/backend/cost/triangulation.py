@@ -86,24 +86,25 @@ def triangulate(
 
 
 def moved_in_inverse_depth(
-    points: FloatArray, increments: FloatArray, centres: FloatArray
+    points: FloatArray, increments: FloatArray, before: FloatArray, after: FloatArray
 ) -> FloatArray:
     """Points (J, 3) moved by increments that are linear in (α, β, ρ), and not in metres.
 
     Both are the same to first order. The reprojection error of a point with little parallax is
     nearly linear in its inverse depth and far from linear in its depth, so that an increment in
-    metres may lead through the camera.
+    metres may lead through the camera. What moves the camera and the point alike changes no depth.
 
     Args:
         points: (J, 3) in the world.
         increments: (J, 3) in metres.
-        centres: (J, 3) of the cameras whose inverse depth is meant.
+        before: (J, 3) of the cameras whose inverse depth is meant.
+        after: (J, 3) the same where the step has moved them.
     """
-    rays = points - centres
+    rays, increments = points - before, increments - (after - before)
     nearer = -np.sum(increments * rays, axis=1, keepdims=True)
     nearer /= np.maximum(np.sum(rays**2, axis=1, keepdims=True), _TINY)
     across = increments + nearer * rays
-    return np.asarray(centres + (rays + across) / np.maximum(1.0 + nearer, _LEAST_INVERSE_DEPTH))
+    return np.asarray(after + (rays + across) / np.maximum(1.0 + nearer, _LEAST_INVERSE_DEPTH))
 
 
 def triangulate_frames(
