@@ -99,6 +99,12 @@ def in_place(step: Step) -> Step:
     return Step(step.place, " ".join(words))
 
 
+def can_take_screenshots() -> bool:
+    """Whether the viewer of Rerun finds a driver of Vulkan here."""
+    folders = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"))
+    return any(True for folder in folders for _ in folder.glob("*.json"))
+
+
 def is_skipped(step: Step) -> bool:
     return not step.is_python and any(re.match(pattern, step.text) for pattern in SKIPPED)
 
@@ -119,6 +125,8 @@ class Session:
 
     def fault(self, step: Step) -> str:
         """What went wrong with a step; empty if nothing."""
+        if "screenshot" in step.text and not can_take_screenshots():
+            return ""  # as tests/test_rerun_viewers.py, which looks at the pictures
         if step.is_python:
             return self._python(step)
         words = shlex.split(step.text)
