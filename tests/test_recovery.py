@@ -101,7 +101,7 @@ def test_one_sensor_alone_goes_on_without_the_other(fault: str) -> None:
     assert len(result.segments) == 1
 
 
-@pytest.mark.parametrize("algorithm", ["okvis"])
+@pytest.mark.parametrize("algorithm", ["msckf", "swf", "okvis"])
 def test_being_carried_away_is_noticed_whatever_is_in_the_cost(algorithm: str) -> None:
     result = flown("kidnapped:at_s=6,duration_s=2", algorithm=algorithm)
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]

@@ -28,10 +28,9 @@ _LOOKED_BACK = 3.0
 """Tests are kept for so many further intervals, to find the beginning of a disagreement."""
 _BAD_SHARE = 0.9
 """Share of a lost estimate, at most, however large the limit."""
-_MOST_UNFIT, _SOONER = 0.75, 2.0 / 3.0
+_MOST_UNFIT, _SOONER = 0.9, 5.0 / 6.0
 """Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
-other one. In the first seconds of one camera more of them do not fit, as the scale is found only
-then, than of those that the gate rejects; after a jump it is nearly all of them."""
+other one. Most of the tracks may be on a wall that moves; nearly all do not fit a lost state."""
 _MOST_WAITING = 100
 """Frames that wait for their states, at most."""
 
@@ -225,13 +224,16 @@ class Agreement:
         if estimator.start_is_doubtful or not found.telling:
             self._motion.untested(state.stamp_ns)
             return
-        if estimator.algorithm.cost.features == "every_step":
-            # the gate of the others notices it, and goes on beside a wall that moves
-            self._motion.check(state.stamp_ns, found.tested, found.unfit)
+        self._motion.check(state.stamp_ns, found.tested, found.unfit)
         if found.jumped:
             raise JumpError(
                 f"lost at frame {state.stamp_ns}: the tracks fit the motion before and after a "
                 "jump, and not across it"
+            )
+        if found.lost:
+            raise DivergenceError(
+                f"diverged at frame {state.stamp_ns}: images contradict the state, at once no "
+                "track fits the motion any more"
             )
 
     def agreed_until(self) -> int | None:

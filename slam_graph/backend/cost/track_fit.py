@@ -43,6 +43,10 @@ _POINT_DIM = 3
 _GOOD_SHARE, _JUMPED_SHARE, _JUMPED = 0.3, 0.8, 20
 """At a jump the share that does not fit was at most the first before; then at least the second does
 not fit across it, and fits after it; of so many tracks."""
+_LOST_SHARE, _LOST = 0.95, 2
+"""The state is lost where at least this share does not fit, so many times in a row, right after a
+time at which tracks fitted: a body that moves and comes into view covers the image gradually. It is
+said when a jump could be told from it, whose way nothing has measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +57,14 @@ class Fit:
         tested: how many tracks were compared.
         unfit: how many of them do not fit.
         jumped: whether the platform was put somewhere else three comparisons ago.
+        lost: whether tracks fitted three comparisons ago, and at once nearly none did any more.
         telling: whether tracks have fitted before, with noise of the size that was expected.
     """
 
     tested: int
     unfit: int
     jumped: bool
+    lost: bool
     telling: bool
 
 
@@ -88,6 +94,7 @@ class TrackFit:
         self._poses: deque[_Pose] = deque()
         self._count = 0
         self._good: int | None = None  # the last frame that was good
+        self._bad = 0  # in how many frames right after it nearly no track fitted
         self._telling = False
 
     def add(
@@ -128,13 +135,18 @@ class TrackFit:
         motions = {p.index: p.motion for p in self._poses if p.motion is not None}
         projection = RigProjection(rig, motions)
         unfit = int(np.count_nonzero(self._errors(ids, projection) >= _LARGEST * sigma_px))
-        jumped = False
+        enough = len(ids) >= _JUMPED
+        if enough and unfit >= _LOST_SHARE * len(ids) and self._good == now - 1 - self._bad:
+            self._bad += 1
+        jumped = lost = False
         if self._good == now - _LEAST_FRAMES:
             jumped = self._jumped(ids, self._good, projection, _LARGEST * sigma_px)
-        if len(ids) >= _JUMPED and unfit <= _GOOD_SHARE * len(ids):
-            self._good = now
+            lost = self._bad >= _LOST
+        told = self._telling
+        if enough and unfit <= _GOOD_SHARE * len(ids):
+            self._good, self._bad = now, 0
             self._telling = sigma_px <= self._usual_px
-        return Fit(len(ids), unfit, jumped and self._telling, self._telling)
+        return Fit(len(ids), unfit, jumped and told, lost and told, self._telling)
 
     def _jumped(
         self, ids: IntArray, before: int, projection: RigProjection, limit_px: float
