@@ -29,6 +29,7 @@ class Stock:
     """Recordings and results to begin with."""
 
     def __init__(self, folder: Path) -> None:
+        self.kernels = folder / "kernels"
         self.images, self.tracks, self.run = folder / "images", folder / "tracks", folder / "runs"
         images = ["--kind", "images", "--duration", "1", "--rate", "4"]
         tracks = ["--duration", "2.5", "--set", "tracks.descriptors=true"]
@@ -37,8 +38,9 @@ class Stock:
             ["simulate", str(self.images), "--no-progress", *images],
             ["simulate", str(self.tracks), "--no-progress", *tracks],
             ["run", str(self.tracks), "--output", str(self.run), *short],
+            ["frontend", "run", str(self.images), "--picture", os.devnull],
         ):
-            done = command(arguments, folder)
+            done = self.command(arguments, folder)
             assert done.returncode == 0, done.stderr
         self.run = self.run / "tracks" / "latest"
         self.map = self.run / "map.slam"
@@ -49,26 +51,25 @@ class Stock:
             + "".join(f"EDGE_SE2 {k} {k + 1} 1 0 0 9 0 0 9 0 9\n" for k in poses[:-1])
         )
 
+    def command(
+        self, arguments: list[str], folder: Path, limit: int | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command; its files may have so many bytes. Kernels are compiled once for all."""
 
-def command(
-    arguments: list[str], folder: Path, limit: int | None = None
-) -> subprocess.CompletedProcess[str]:
-    """Run a command; its files may have so many bytes."""
+        def bound() -> None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    def bound() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
-        if limit is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-    return subprocess.run(
-        [sys.executable, "-m", "slam_graph.cli.launch", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=HANG_S,
-        preexec_fn=bound,
-        env={**os.environ, "MPLCONFIGDIR": str(folder), "NUMBA_CACHE_DIR": str(folder / "numba")},
-    )
+        return subprocess.run(
+            [sys.executable, "-m", "slam_graph.cli.launch", *arguments],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=HANG_S,
+            preexec_fn=bound,
+            env={**os.environ, "MPLCONFIGDIR": str(folder), "NUMBA_CACHE_DIR": str(self.kernels)},
+        )
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +123,7 @@ def check_refused(done: subprocess.CompletedProcess[str]) -> None:
 def test_a_file_in_the_place_of_a_folder(stock: Stock, tmp_path: Path, name: str) -> None:
     place = tmp_path / "place"
     place.write_text("kept")
-    check_refused(command(COMMANDS[name](stock, place), tmp_path))
+    check_refused(stock.command(COMMANDS[name](stock, place), tmp_path))
     assert place.read_text() == "kept"
 
 
@@ -131,7 +132,7 @@ def test_a_full_disk_leaves_nothing_half_written(stock: Stock, tmp_path: Path, n
     """Rerun writes by itself and knows no limit to the size of files; localize writes like run."""
     place = tmp_path / "place"
     place.mkdir()
-    done = command(COMMANDS[name](stock, place), tmp_path, limit=SMALL)
+    done = stock.command(COMMANDS[name](stock, place), tmp_path, limit=SMALL)
     check_refused(done)
     assert not [path for path in place.rglob("*") if path.name.startswith(".")]
     assert not list(place.rglob("latest"))
@@ -143,7 +144,9 @@ def test_dev_full(stock: Stock, tmp_path: Path, name: str) -> None:
     before = os.stat("/dev/full")
     arguments = COMMANDS[name](stock, tmp_path)
     arguments[-1] = "/dev/full"
-    check_refused(command([*arguments, *(["--force"] if name.startswith("opt") else [])], tmp_path))
+    check_refused(
+        stock.command([*arguments, *(["--force"] if name.startswith("opt") else [])], tmp_path)
+    )
     assert os.stat("/dev/full").st_rdev == before.st_rdev  # it is not replaced by a file
 
 
@@ -163,7 +166,7 @@ def test_an_output_that_cannot_be_written(tmp_path: Path) -> None:
 def test_what_was_there_stays_where_the_new_cannot_be_written(stock: Stock, tmp_path: Path) -> None:
     old = tmp_path / "a.tum"
     old.write_text("older results\n")
-    check_refused(command(COMMANDS["export"](stock, tmp_path), tmp_path, limit=200))
+    check_refused(stock.command(COMMANDS["export"](stock, tmp_path), tmp_path, limit=200))
     assert old.read_text() == "older results\n"
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".tum"] == ["a.tum"]
 
