@@ -127,6 +127,16 @@ class BagWriter:
         header = self.header(stamp_ns, "odom")
         return self.make("nav_msgs/msg/Odometry", header, child, known, moved)
 
+    def known_pose(self, stamp_ns: int, t: Any, q: Any, covariance: Any) -> Any:
+        """A `PoseWithCovarianceStamped`; q is x, y, z, w."""
+        place = self.make("geometry_msgs/msg/Point", *map(float, t))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        pose = self.make("geometry_msgs/msg/Pose", place, turn)
+        numbers = np.array(covariance, np.float64).ravel()
+        known = self.make("geometry_msgs/msg/PoseWithCovariance", pose, numbers)
+        header = self.header(stamp_ns, "world")
+        return self.make("geometry_msgs/msg/PoseWithCovarianceStamped", header, known)
+
     def transform(self, stamp_ns: int, parent: str, child: str, t: Any, q: Any) -> Any:
         """q is x, y, z, w."""
         move = self.make("geometry_msgs/msg/Vector3", *map(float, t))

@@ -8,6 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
+from recordings import FRAME_PERIOD_NS, START_NS
+from recordings_ros import KINDS, LAG_NS, BagWriter, write_bag
 from scipy.spatial.transform import Rotation
 
 from slam_graph import run
@@ -15,6 +17,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.fix_factors import OrientationFix, PositionFix, fixes_of
 from slam_graph.backend.aiding.world_alignment import PathFix, align_world
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.datasets import open_dataset
 from slam_graph.datasets.streams.aiding_files import aiding_texts, read_aiding
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -251,3 +254,33 @@ def test_the_estimate_is_as_sure_as_it_should_be() -> None:
         found.append(np.array([errors.orientation[20::20], errors.position[20::20]]).mean(axis=1))
     for mean in np.mean(found, axis=0).tolist():
         assert 1.0 < mean < 4.6  # eight runs, 3 degrees of freedom each: 99.9 % of χ²(24) / 8
+
+
+# --- bags ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("known", [True, False])
+def test_known_poses_of_a_bag(tmp_path: Path, kind: str, known: bool) -> None:
+    """With the variances of each message, or the documented ones; what is no pose is left out."""
+    rng = np.random.default_rng(5)
+    stamps = [START_NS + k * FRAME_PERIOD_NS for k in range(4)]
+    places, turns = rng.normal(size=(4, 3)), Rotation.random(4, random_state=5).as_quat()
+    places[2, 0] = np.nan
+    covariance = np.diag(np.square(SIGMAS)) if known else np.zeros((6, 6))
+
+    def write(bag: BagWriter) -> None:
+        for stamp, place, turn in zip(stamps, places, turns, strict=True):
+            bag.write("/vicon", bag.known_pose(stamp, place, turn, covariance), stamp + LAG_NS)
+
+    path = write_bag(tmp_path, kind, 4, extra=write)
+    assert len(open_dataset(path).aiding) == 0  # such a topic may be the ground truth
+    sequence = open_dataset(path, sources={"poses": "/vicon"})
+    data, kept = sequence.aiding, [0, 1, 3]
+    assert data.pose_stamps_ns.tolist() == [stamps[k] for k in kept]
+    np.testing.assert_allclose(data.pose_positions, places[kept])
+    np.testing.assert_allclose(data.pose_quaternions, turns[kept])
+    np.testing.assert_allclose(data.pose_sigmas, [SIGMAS if known else [0.05] * 6] * 3)
+    assert sequence.diagnostics.counts["poses_dropped"] == 1
+    with pytest.raises(DataError, match=r"'/cam0.*' is of type .*; expected geometry_msgs"):
+        _ = open_dataset(path, sources={"poses": "/cam0/image_raw"}).aiding

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.streams.images import Fault, Image, decode_grey
 
 IMU = "sensor_msgs/msg/Imu"
@@ -94,6 +95,18 @@ def inertial_of(message: Any) -> list[float]:
     """Angular rate [rad/s] and specific force [m/s²] of an `Imu`: six numbers."""
     rate, force = message.angular_velocity, message.linear_acceleration
     return [rate.x, rate.y, rate.z, force.x, force.y, force.z]
+
+
+def pose_sigmas_of(message: Any) -> FloatArray | None:
+    """(6,) standard deviations of a pose, m along and rad about the axes of its frame.
+
+    None where its type has no covariance, or none was set: no variance, or a negative one.
+    """
+    matrix = getattr(getattr(message, "pose", None), "covariance", None)
+    if matrix is None:
+        return None
+    variances = np.asarray(matrix, np.float64).reshape(6, 6).diagonal()
+    return np.sqrt(variances) if (variances > 0.0).all() else None
 
 
 def pose_of(message: Any, msgtype: str) -> list[float]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Position fixes and odometry in a bag: `NavSatFix` and `Odometry`."""
+"""Position fixes, known poses and odometry in a bag: `NavSatFix`, poses of any type, `Odometry`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.rosbag.bag import Bag, Message
-from slam_graph.datasets.rosbag.messages import pose_of
+from slam_graph.datasets.rosbag.messages import POSES, pose_of, pose_sigmas_of
 from slam_graph.datasets.rosbag.ros_topics import frame_of, path_between
-from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of
+from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of, known_poses_from
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData
@@ -32,19 +32,23 @@ _SMALLEST_RATIO = 1e-12
 """Of the eigenvalues of a covariance: matrices beyond that are not positive definite in numbers."""
 _SHORTEST_QUATERNION = 0.5
 """Quaternions that are shorter were never set."""
+_POSE_SIGMAS = np.array([0.05] * 3 + [0.05] * 3)
+"""Of known poses (m and rad) where a message has none."""
+_TYPES = {"gnss": (NAV_SAT_FIX,), "odometry": (ODOMETRY,), "poses": tuple(POSES)}
+"""Of the messages of each sensor."""
 
 Messages = Callable[[list[str]], Iterable[Message]]
 
 
 class BagAiding:
-    """Finds the topics of fixes and odometry.
+    """Finds the topics of fixes, known poses and odometry.
 
-    Fixes are taken from the only topic of `NavSatFix` where none is named; odometry only if its
-    topic is named, as a message of this type may as well be the ground truth.
+    Fixes are taken from the only topic of `NavSatFix` where none is named; known poses and odometry
+    only if their topic is named, as messages of these types may as well be the ground truth.
 
     Args:
         bag: the bag.
-        named: topics or files of ``gnss`` and ``odometry``; others are left as they are.
+        named: topics or files of ``gnss``, ``poses`` and ``odometry``; others are left as they are.
         body: the topic whose frame is the body.
         diagnostics: counts fixes and samples that are dropped, and fixes on several topics of
             which none was named (`gnss_left_out`).
@@ -62,11 +66,11 @@ class BagAiding:
         self._bag, self._body, self._diagnostics = bag, body, diagnostics
         topics = {sensor: place for sensor, place in named.items() if place in bag.topics}
         self.in_files = {s: place for s, place in named.items() if place not in bag.topics}
-        for sensor, kind in (("gnss", NAV_SAT_FIX), ("odometry", ODOMETRY)):
-            if sensor in topics and bag.topics[topics[sensor]] != kind:
-                other = bag.topics[topics[sensor]]
+        for sensor, kinds in _TYPES.items():
+            if sensor in topics and bag.topics[topics[sensor]] not in kinds:
+                other, known = bag.topics[topics[sensor]], " or ".join(kinds)
                 raise DataError(
-                    f"{bag.path}: '{topics[sensor]}' is of type {other}; expected {kind}"
+                    f"{bag.path}: '{topics[sensor]}' is of type {other}; expected {known}"
                 )
             place = self.in_files.get(sensor)
             if place is not None and not Path(place).is_file():
@@ -93,6 +97,8 @@ class BagAiding:
         if "gnss" in self._topics:
             fixes = self._fixes(messages([self._topics["gnss"]]), stamp_ns)
             files = AidingData.concatenate([fixes, files.without_fixes()])
+        if "poses" in self._topics:
+            files = self._with_poses(files, messages([self._topics["poses"]]), stamp_ns)
         if "odometry" in self._topics:
             files = self._with_odometry(files, messages([self._topics["odometry"]]), stamp_ns)
         return files
@@ -114,6 +120,31 @@ class BagAiding:
             self._bag.path,
             self._diagnostics,
         )
+
+    def _with_poses(
+        self, data: AidingData, messages: Iterable[Message], stamp_ns: Callable[[Message], int]
+    ) -> AidingData:
+        """With the poses of the sensor that `backend.known_poses` mounts on the body."""
+        kind = self._bag.topics[self._topics["poses"]]
+        stamps: list[int] = []
+        rows: list[list[float]] = []
+        sigmas: list[FloatArray] = []
+        for message in messages:
+            stamps.append(stamp_ns(message))
+            found = _decoded(message)
+            rows.append([np.nan] * 7 if found is None else pose_of(found, kind))
+            known = None if found is None else pose_sigmas_of(found)
+            sigmas.append(_POSE_SIGMAS if known is None else known)
+        poses = np.array(rows).reshape(-1, 7)
+        known_poses = known_poses_from(
+            np.array(stamps, np.int64),
+            poses[:, :3],
+            poses[:, 3:],
+            np.array(sigmas).reshape(-1, 6),
+            f"{self._bag.path}: pose",
+            self._diagnostics,
+        )
+        return data.with_poses(*known_poses)
 
     def _with_odometry(
         self, data: AidingData, messages: Iterable[Message], stamp_ns: Callable[[Message], int]

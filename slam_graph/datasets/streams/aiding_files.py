@@ -283,19 +283,46 @@ def _read_poses(
     if not tables:
         raise DataError(f"{path}: no poses in this file")
     table = np.concatenate(tables)
+    columns = (table["stamp"], table["position"], table["quaternion"], table["sigma"])
+    return known_poses_from(*columns, f"{path}: pose", diagnostics)
+
+
+def known_poses_from(
+    stamps_ns: IntArray,
+    positions: FloatArray,
+    quaternions: FloatArray,
+    sigmas: FloatArray,
+    what: str,
+    diagnostics: Diagnostics,
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Those of some known poses that can be used, in the order of time.
+
+    Args:
+        stamps_ns: (N,) of the poses.
+        positions: (N, 3) world, m.
+        quaternions: (N, 4) x, y, z, w.
+        sigmas: (N, 6) standard deviations, m along and rad about the axes of the world; three of
+            them are infinite where the position, or the orientation, was not measured.
+        what: they are and where, for messages.
+        diagnostics: counts the others (`poses_dropped`).
+
+    Returns:
+        The same four arrays without the others.
+    """
+    positions, quaternions = positions.copy(), quaternions.copy()
+    parts = sigmas.reshape(-1, 2, 3)
+    measured = np.asarray(np.isfinite(parts).all(axis=2), np.bool_)
+    unknown = np.asarray((parts == np.inf).all(axis=2), np.bool_)
     # what was not measured may have any value
-    sigmas: FloatArray = table["sigma"].reshape(-1, 2, 3)
-    measured = np.asarray(np.isfinite(sigmas).all(axis=2), np.bool_)
-    unknown = np.asarray((sigmas == np.inf).all(axis=2), np.bool_)
-    table["position"][unknown[:, 0]], table["quaternion"][unknown[:, 1]] = 0.0, (0, 0, 0, 1)
-    lengths = np.linalg.norm(table["quaternion"], axis=1)
-    good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
+    positions[unknown[:, 0]], quaternions[unknown[:, 1]] = 0.0, (0, 0, 0, 1)
+    lengths = np.linalg.norm(quaternions, axis=1)
+    good = np.isfinite(positions).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     good &= (measured | unknown).all(axis=1) & measured.any(axis=1)
-    good &= (np.abs(table["position"]) <= _FARTHEST_M).all(axis=1)
-    good &= (table["sigma"] >= _LEAST_SIGMA).all(axis=1)
+    good &= (np.abs(positions) <= _FARTHEST_M).all(axis=1)
+    good &= (sigmas >= _LEAST_SIGMA).all(axis=1)
     good = np.asarray(good, np.bool_)
-    table = table[kept_of(table["stamp"], good, "poses_dropped", f"{path}: pose", diagnostics)]
-    return table["stamp"], table["position"], table["quaternion"], table["sigma"]
+    kept = kept_of(stamps_ns, good, "poses_dropped", what, diagnostics)
+    return stamps_ns[kept], positions[kept], quaternions[kept], sigmas[kept]
 
 
 def aiding_texts(data: AidingData) -> dict[str, str]:
