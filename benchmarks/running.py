@@ -73,10 +73,11 @@ class Run:
         overrides: Iterable[str] = (),
         duration_s: float | None = None,
         final_ba: bool = False,
+        seed: int | None = None,
     ) -> None:
         overrides = (f"final_ba.enabled={str(final_ba).lower()}", *overrides)
         config = load_config(
-            None, overrides, algorithm=algorithm, cameras=cameras, duration_s=duration_s
+            None, overrides, algorithm=algorithm, cameras=cameras, duration_s=duration_s, seed=seed
         )
         sequence = (
             open_dataset(recording, cameras=cameras, groundtruth=groundtruth)
