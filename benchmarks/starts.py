@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,7 @@ from slam_graph.arrays import skew
 from slam_graph.backend import Estimator, triangulate_frames
 from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FeatureFrame, ImuData, Packet
-from slam_graph.simulation.simulated_sequence import SimulatedSequence
+from slam_graph.sensors import FeatureFrame, ImuData, Packet, Rig
 
 SPACING_S, PATIENCE_S, JUDGED_AFTER_S = 2.0, 8.0, 1.0
 """Time between starts; how long one may take; and when after it the state is judged."""
@@ -111,13 +110,18 @@ def measure(data: Path, spacing_s: float = SPACING_S) -> Outcome:
         name = f"{path.name}.{KIND[cameras]}_{sigma:g}px"
         outcome.add(name, figures_of(starts, cameras), judged=False, held_out=held_out)
         together.setdefault((cameras, held_out), []).extend(starts)
+    add_together(outcome, together)
+    return outcome
+
+
+def add_together(outcome: Outcome, together: dict[tuple[int, bool], list[Start]]) -> None:
+    """Add the figures of all flights, by number of cameras and whether they are held out."""
     for (cameras, held_out), starts in sorted(together.items()):
         name = f"{'held_out' if held_out else 'chosen_on'}.{KIND[cameras]}"
         outcome.add(name, figures_of(starts, cameras), held_out=held_out)
         reasons = Counter(start.reason for start in starts if not start.started)
         for reason, count in reasons.most_common(5):
             outcome.notes.append(f"{name}: {count} of {len(starts)} waited for {reason}")
-    return outcome
 
 
 def starts_of(path: Path, cameras: int, pixel_sigma: float, spacing_s: float) -> list[Start]:
@@ -128,11 +132,24 @@ def starts_of(path: Path, cameras: int, pixel_sigma: float, spacing_s: float) ->
         overrides=[f"backend.noise.pixel_sigma={pixel_sigma:g}"],
     )
     packets, truth = list(sequence.packets()), sequence.groundtruth()
+    rows = rows_of_starts(packets, cameras, spacing_s)
+    return [start(sequence.rig, config, packets_from(packets, row), truth) for row in rows]
+
+
+def rows_of_starts(packets: list[Packet], cameras: int, spacing_s: float) -> list[int]:
+    """Which packets of a flight are the first ones of a start."""
     stamps = np.array([packet.frame.stamp_ns for packet in packets])
     last = stamps[-1] - round((JUDGED_AFTER_S + LATENCY_S[cameras]) * 1e9)
     begun = np.arange(stamps[0], last, round(spacing_s * 1e9))
-    rows = np.searchsorted(stamps, begun)
-    return [_start(sequence, config, packets, truth, int(row), cameras) for row in rows]
+    return [int(row) for row in np.searchsorted(stamps, begun)]
+
+
+def packets_from(packets: list[Packet], row: int) -> Iterator[Packet]:
+    """The packets from a row on; the first one has the samples since the frame before, too."""
+    since = max(0, row - 1)
+    imu = ImuData.concatenate([packet.imu for packet in packets[since : row + 1]])
+    yield replace(packets[row], imu=imu)
+    yield from packets[row + 1 :]
 
 
 def figures_of(starts: list[Start], cameras: int) -> Iterator[Metric]:
@@ -162,47 +179,43 @@ def figures_of(starts: list[Start], cameras: int) -> Iterator[Metric]:
     yield info("waiting", float(np.nanmean([s.cpu_ms for s in starts])), "ms CPU")
 
 
-def _start(
-    sequence: SimulatedSequence,
-    config: RunConfig,
-    packets: list[Packet],
-    truth: Trajectory,
-    first: int,
-    cameras: int,
-) -> Start:
-    estimator = Estimator(sequence.rig, config.algorithm, config.backend)
-    begun_ns = int(packets[first].frame.stamp_ns)
-    begun_s = (begun_ns - int(truth.stamps_ns[0])) * 1e-9
-    observed_ns = _observed_ns(truth, begun_ns, cameras)
-    until_ns = observed_ns + round(PATIENCE_S * 1e9)
+def start(rig: Rig, config: RunConfig, packets: Iterator[Packet], truth: Trajectory) -> Start:
+    """One start.
+
+    Args:
+        rig: of the recording.
+        config: of the estimator.
+        packets: from the first frame of the start on, with features.
+        truth: at the frames of the recording.
+    """
+    cameras = len(rig.cameras)
+    estimator = Estimator(rig, config.algorithm, config.backend)
+    frames: list[FeatureFrame] = []
     states: list[NavState] = []
-    waited, frames = 0.0, 0
-    for row in range(first, len(packets)):
-        packet = packets[row]
+    waited_s, observed_ns = [0.0], 0
+    for packet in packets:
         assert isinstance(packet.frame, FeatureFrame)
-        if not states and packet.frame.stamp_ns > until_ns:
+        if not frames:
+            observed_ns = _observed_ns(truth, packet.frame.stamp_ns, cameras)
+        elif not states and packet.frame.stamp_ns > observed_ns + round(PATIENCE_S * 1e9):
             break
+        frames.append(packet.frame)
         began = time.process_time()
-        estimator.add_imu(packet.imu if row > first else _history(packets, row))
+        estimator.add_imu(packet.imu)
         state = estimator.add_frame(packet.frame)
         if state is None:
-            waited, frames = waited + time.process_time() - began, frames + 1
+            waited_s.append(time.process_time() - began)
             continue
         states.append(state)
         if state.stamp_ns - states[0].stamp_ns >= JUDGED_AFTER_S * 1e9:
-            cpu_ms = 1e3 * waited / max(frames, 1)
-            scale = _scale_error(
-                estimator, state, [p.frame for p in packets[first : row + 1]], truth
-            )
-            return _judged(states, truth, begun_s, observed_ns, cpu_ms, scale)
-    nothing = (np.nan, np.nan, np.nan, np.nan, (np.nan, np.nan))
-    cpu_ms = 1e3 * waited / max(frames, 1)
-    return Start(begun_s, *nothing, reason=estimator.waiting_for, cpu_ms=cpu_ms)
-
-
-def _history(packets: list[Packet], row: int) -> ImuData:
-    """The IMU samples up to a frame, from the frame before on."""
-    return ImuData.concatenate([packets[i].imu for i in range(max(0, row - 1), row + 1)])
+            break
+    begun_s = (frames[0].stamp_ns - int(truth.stamps_ns[0])) * 1e-9
+    cpu_ms = 1e3 * sum(waited_s) / max(len(waited_s) - 1, 1)
+    if not states or states[-1].stamp_ns - states[0].stamp_ns < JUDGED_AFTER_S * 1e9:
+        nothing = (np.nan, np.nan, np.nan, np.nan, (np.nan, np.nan))
+        return Start(begun_s, *nothing, reason=estimator.waiting_for, cpu_ms=cpu_ms)
+    scale = _scale_error(estimator, states[-1], frames, truth)
+    return _judged(states, truth, begun_s, observed_ns, cpu_ms, scale)
 
 
 def _observed_ns(truth: Trajectory, begun_ns: int, cameras: int) -> int:
