@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.ascending import are_among, are_among_numpy
 from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
-from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
+from slam_graph.kernels.elimination import (
+    eliminate_columns,
+    eliminate_columns_numpy,
+    zeros_to_the_left,
+    zeros_to_the_left_numpy,
+)
 from slam_graph.kernels.epipolar import (
     constraint_moments,
     constraint_moments_numpy,
@@ -38,6 +43,7 @@ from slam_graph.kernels.gate import (
 )
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
+from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
@@ -184,6 +190,40 @@ def test_sum_of_features(calibration: int) -> None:
         found.append([np.empty(shape) for shape in shapes])
         kernel(*given, *found[-1])
     assert all(same(a, b) for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("calibration", [0, 2])
+def test_fill_state_rows(calibration: int) -> None:
+    """Features with no, one, two and five observations, from two poses."""
+    rng = np.random.default_rng(3)
+    counts = np.array([2, 0, 1, 5, 2])
+    N, size, k = int(counts.sum()), 40, 12 + calibration
+    parts = (rng.normal(size=(N, 2, width)) for width in (6, 3, calibration))
+    given = rng.normal(size=(N, 2)), *parts, rng.integers(0, 2, N)
+    starts, order = np.append(0, np.cumsum(counts)), np.array([3, 0, 4, 1, 2])
+    of_points, columns = np.array([3, 9, 12, 0, 6]), np.append(np.arange(15, 26), 30)
+    columns = np.append(columns, np.arange(33, 33 + calibration))
+    with_feature = int(np.minimum(2 * counts, 3).sum())
+    results = []
+    for kernel in (fill_state_rows, fill_state_rows_numpy):
+        Ab = np.zeros((with_feature, size + 1), order="F")
+        rest = np.empty((2 * N - with_feature, k + 1))
+        kernel(*given, starts, order, of_points, columns, Ab, rest)
+        results.append((Ab, rest))
+    assert all(same(a, b) for a, b in zip(*results, strict=True))
+    assert zeros_to_the_left(results[0][0]) == (0, True)
+
+
+@pytest.mark.parametrize("first", [0, 3, 7])
+@pytest.mark.parametrize("below", [0.0, 1.0])
+def test_zeros_to_the_left(first: int, below: float) -> None:
+    rows = np.zeros((4, 7), order="F")
+    rows[:, first:] = np.triu(np.ones((4, 7 - first)))
+    rows[2, first : first + 1] = below
+    found = zeros_to_the_left(rows)
+    assert found == zeros_to_the_left_numpy(rows)
+    assert found[0] == first
+    assert found[1] == (below == 0.0 and first <= 3)
 
 
 @pytest.mark.parametrize("gone", [[], [0, 1], [4, 5, 9], [3, 11, 12], [11, 12]])

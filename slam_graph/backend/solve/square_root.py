@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.kernels.elimination import eliminate_columns
+from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
@@ -179,6 +179,8 @@ class SquareRootInformation:
     ) -> SquareRootInformation:
         """Fold in measurement rows.
 
+        Where row i begins i columns behind the first one or later, the zeros are left out.
+
         Args:
             Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
             overwrite: whether this Gaussian, which nobody needs any more, may be changed: copies
@@ -187,19 +189,19 @@ class SquareRootInformation:
         """
         if len(Ab) == 0:
             return self
-        first = 0  # columns to the left are not touched
-        if not Ab[:, 0].any():
-            first = int(np.argmax(Ab.any(axis=0)))
-        Ab = Ab[:, first:]
-        if len(Ab) > 2 * Ab.shape[1]:
-            Ab = triangularize(Ab)
+        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
+        first, staggered = zeros_to_the_left(rows)  # columns to the left are not touched
+        if first == rows.shape[1]:
+            return self
+        rows = rows[:, first:]
+        if len(rows) > 2 * rows.shape[1]:
+            rows, staggered = triangularize(rows), True
         in_place = overwrite and first == 0
         triangle = self.Rd if in_place else self.Rd[first:, first:].copy(order="F")
-        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
-        block = min(_BLOCK_SIZE, len(triangle))
+        block, depth = min(_BLOCK_SIZE, len(triangle)), len(rows) if staggered else 0
         # in the copies themselves: new memory costs as much as the arithmetic
         triangle, _, _, info = lapack.dtpqrt(
-            0, block, triangle, rows, overwrite_a=True, overwrite_b=True
+            depth, block, triangle, rows, overwrite_a=True, overwrite_b=True
         )
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
