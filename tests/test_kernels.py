@@ -43,7 +43,6 @@ from slam_graph.kernels.gate import (
 )
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
-from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
@@ -61,6 +60,7 @@ from slam_graph.kernels.spacing import (
     clear_disks,
     clear_disks_numpy,
 )
+from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_level, track_level_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
