@@ -82,7 +82,8 @@ def fill_state_rows(
         begin, m = starts[j], 2 * (starts[j + 1] - starts[j])
         for row in range(m):
             n, axis = begin + row // 2, row % 2
-            W[row] = 0.0
+            for a in range(4 + k):
+                W[row, a] = 0.0
             for a in range(3):
                 W[row, a] = by_point[n, axis, a]
             for a in range(6):
@@ -93,7 +94,8 @@ def fill_state_rows(
         _triangularize(W, m)
         for row in range(m):
             if row >= 3:
-                rest[others] = W[row, 3:]
+                for a in range(k + 1):
+                    rest[others, a] = W[row, 3 + a]
                 others += 1
                 continue
             for a in range(row, 3):
