@@ -37,8 +37,7 @@ _TINY = 1e-12
 """Keeps divisions finite."""
 _DAMPING = 1e-6
 """Of a step, relative to the trace of its information."""
-_SWEEPS = 30
-"""Most sweeps of Jacobi's rotations; they converge in five."""
+_SWEEPS = 30  # of Jacobi's rotations at most; they converge in five
 
 
 @compiled()
