@@ -174,7 +174,7 @@ def _middle(values: FloatArray) -> float:
                 k -= gap
             values[k] = value
         gap //= 2
-    return 0.5 * (values[(N - 1) // 2] + values[N // 2])
+    return 0.5 * float(values[(N - 1) // 2] + values[N // 2])
 
 
 @compiled()
