@@ -65,6 +65,17 @@ def test_a_tall_update_equals_the_same_rows_in_pieces() -> None:
     assert np.all(np.tril(whole.Rd, -1) == 0.0)
 
 
+@pytest.mark.parametrize("first", [0, 2])
+def test_zeros_that_are_left_out_change_nothing(first: int) -> None:
+    """Staggered rows say the same in reverse order, in which none of their zeros is left out."""
+    rng = np.random.default_rng(5)
+    prior, rows = gaussian(rng), np.zeros((SIZE - first, SIZE + 1))
+    rows[:, first:] = np.triu(random_rows(rng, SIZE - first)[:, first:])
+    posterior, expected = prior.updated(rows), prior.updated(rows[::-1])
+    np.testing.assert_allclose(posterior.solution(), expected.solution(), atol=1e-12)
+    np.testing.assert_allclose(posterior.R.T @ posterior.R, expected.R.T @ expected.R, atol=1e-12)
+
+
 def test_an_update_leaves_the_prior_and_the_rows_alone() -> None:
     rng = np.random.default_rng(1)
     prior, rows = gaussian(rng), np.asfortranarray(random_rows(rng, SIZE))

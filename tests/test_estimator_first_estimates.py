@@ -73,7 +73,7 @@ def test_with_first_estimates_nothing_unseen_is_claimed(name: str, cameras: int)
 def seen_of_the_unobservable(cost: Cost) -> float:
     """The largest derivative along the four directions, relative to the largest of all."""
     linear, layout = cost.linearize(summed=True), cost.layout()
-    A = np.concatenate([cost.factor_rows(layout), cost.rows(linear, layout)])[:, :-1]
+    A = np.concatenate([cost.factor_rows(layout), *cost.rows(linear, layout)])[:, :-1]
     directions = unobservable_directions(cost.state.first, layout)
     return float(np.abs(A @ directions).max() / np.abs(A).max())
 

@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.ascending import are_among, are_among_numpy
 from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
-from slam_graph.kernels.elimination import eliminate_columns, eliminate_columns_numpy
+from slam_graph.kernels.elimination import (
+    eliminate_columns,
+    eliminate_columns_numpy,
+    zeros_to_the_left,
+    zeros_to_the_left_numpy,
+)
 from slam_graph.kernels.epipolar import (
     constraint_moments,
     constraint_moments_numpy,
@@ -47,6 +52,7 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
+from slam_graph.kernels.rotation_refinement import refine_rotation, refine_rotation_numpy
 from slam_graph.kernels.spacing import (
     apart,
     apart_numpy,
@@ -55,6 +61,7 @@ from slam_graph.kernels.spacing import (
     clear_disks,
     clear_disks_numpy,
 )
+from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_level, track_level_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
@@ -184,6 +191,62 @@ def test_sum_of_features(calibration: int) -> None:
         found.append([np.empty(shape) for shape in shapes])
         kernel(*given, *found[-1])
     assert all(same(a, b) for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("calibration", [0, 2])
+def test_fill_state_rows(calibration: int) -> None:
+    """Features with no, one, two and five observations, from two poses."""
+    rng = np.random.default_rng(3)
+    counts = np.array([2, 0, 1, 5, 2])
+    N, size, k = int(counts.sum()), 40, 12 + calibration
+    parts = (rng.normal(size=(N, 2, width)) for width in (6, 3, calibration))
+    given = rng.normal(size=(N, 2)), *parts, rng.integers(0, 2, N)
+    starts, order = np.append(0, np.cumsum(counts)), np.array([3, 0, 4, 1, 2])
+    of_points, columns = np.array([3, 9, 12, 0, 6]), np.append(np.arange(15, 26), 30)
+    columns = np.append(columns, np.arange(33, 33 + calibration))
+    with_feature = int(np.minimum(2 * counts, 3).sum())
+    results = []
+    for kernel in (fill_state_rows, fill_state_rows_numpy):
+        Ab = np.zeros((with_feature, size + 1), order="F")
+        rest = np.empty((2 * N - with_feature, k + 1))
+        kernel(*given, starts, order, of_points, columns, Ab, rest)
+        results.append((Ab, rest))
+    assert all(same(a, b) for a, b in zip(*results, strict=True))
+    assert zeros_to_the_left(results[0][0]) == (0, True)
+
+
+@pytest.mark.parametrize("first", [0, 3, 7])
+@pytest.mark.parametrize("below", [0.0, 1.0])
+def test_zeros_to_the_left(first: int, below: float) -> None:
+    rows = np.zeros((4, 7), order="F")
+    rows[:, first:] = np.triu(np.ones((4, 7 - first)))
+    rows[2, first : first + 1] = below
+    found = zeros_to_the_left(rows)
+    assert found == zeros_to_the_left_numpy(rows)
+    assert found[0] == first
+    assert found[1] == (below == 0.0 and first <= 3)
+
+
+@pytest.mark.parametrize("wrong", [0, 8])
+@pytest.mark.parametrize("baseline", [0.05, 0.3])
+def test_refine_rotation(wrong: int, baseline: float) -> None:
+    """With little and much parallax, with and without wrong matches."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 8.0], (60, 3))
+    R_true = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
+    second = (points - baseline * np.array([1.0, 0.2, 0.1])) @ R_true
+    second += rng.normal(0.0, 5e-4, second.shape) * points[:, 2:]
+    second[:wrong] = second[rng.permutation(wrong)]
+    first, second = (f / np.linalg.norm(f, axis=1)[:, None] for f in (points, second))
+    start = R_true @ Rotation.from_rotvec([0.01, 0.01, -0.02]).as_matrix()
+    results = []
+    for kernel in (refine_rotation, refine_rotation_numpy):
+        R, H, known = start.copy(), np.empty((5, 5)), np.empty((2, 2))
+        cost = kernel(first, second, np.full((60, 2), 2.5e-7), R, H, known)
+        about_t = H[:3, 3:] @ np.linalg.solve(known, H[3:, :3])  # the sign of t is arbitrary
+        results.append((np.array(cost), R, H[:3, :3], known, about_t))
+    assert all(same(a, b) for a, b in zip(*results, strict=True))
+    assert np.abs(results[0][1] - R_true).max() < 0.01
 
 
 @pytest.mark.parametrize("gone", [[], [0, 1], [4, 5, 9], [3, 11, 12], [11, 12]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Givens rotations that take variables out of the rows of a triangle."""
+"""Givens rotations that take variables out of the rows of a triangle; where rows have zeros."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["eliminate_columns", "eliminate_columns_numpy"]
+__all__ = [
+    "eliminate_columns",
+    "eliminate_columns_numpy",
+    "zeros_to_the_left",
+    "zeros_to_the_left_numpy",
+]
 
 
 _at = np.uintp
@@ -85,3 +90,26 @@ def eliminate_columns_numpy(
     triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     carried[:] = triangle[: len(carried)]
     kept[:] = triangle[len(carried) :, len(carried) :][: len(kept)]
+
+
+@compiled("Tuple((i8, b1))(f8[:, :])")
+def zeros_to_the_left(rows: FloatArray) -> tuple[int, bool]:
+    """How many columns of (m, n) rows are zero, and whether row i is zero for i columns more."""
+    m, n = rows.shape
+    first, found = 0, False
+    while first < n and not found:
+        for i in range(m):
+            found = found or rows[i, first] != 0.0
+        first += 0 if found else 1
+    for k in range(min(m, n - first)):
+        for i in range(k + 1, m):
+            if rows[i, first + k] != 0.0:
+                return first, False
+    return first, m <= n - first
+
+
+def zeros_to_the_left_numpy(rows: FloatArray) -> tuple[int, bool]:
+    """`zeros_to_the_left` in NumPy."""
+    first = int(np.argmax(np.append(rows.any(axis=0), True)))
+    rest = rows[:, first:]
+    return first, len(rest) <= rest.shape[1] and not np.any(np.tril(rest, -1))

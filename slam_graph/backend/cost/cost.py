@@ -22,9 +22,6 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_factors import (
     SummedFeatures,
     WhitenedObservations,
-    fill_new_variable_rows,
-    fill_null_space_rows,
-    fill_state_rows,
     sum_features,
     whiten,
 )
@@ -36,11 +33,12 @@ from slam_graph.backend.cost.gating import (
     distances_of_tracks,
     threshold,
 )
+from slam_graph.backend.cost.measurement_rows import pose_rows, state_feature_rows
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
-from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
+from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM, State, dims_of, landmark_keys
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,24 +272,23 @@ class Cost:
             end = rows.stop
         return Ab
 
-    def rows(self, linear: Linearization, layout: Layout) -> FloatArray:
-        """Rows [A b] (m, n + 1) of all observations, in the order that LAPACK takes."""
-        landmarks, tracks, new = linear.landmarks, linear.tracks, np.zeros(0, np.int64)
-        single = 0 if landmarks is None else 2 * len(landmarks.r)
-        end = single
-        if tracks is not None and self.tracks is not None:
-            assert isinstance(tracks, SummedFeatures)
-            new, end = np.flatnonzero(self.tracks.in_state), single + len(tracks.rows)
-        Ab = np.zeros((end + POINT_DIM * len(new), layout.size + 1), order="F")
-        if landmarks is not None and self.landmarks is not None:
-            fill_state_rows(Ab[:single], landmarks, self._state_columns(self.landmarks, layout))
-        if tracks is not None and self.tracks is not None:
-            assert isinstance(tracks, SummedFeatures)
-            columns = layout.indices(self.rig.keys_of(self.tracks.obs))
-            fill_null_space_rows(Ab[single:end], tracks, columns)
-            own = layout.indices(landmark_keys(self.tracks.obs.ids[new]))
-            fill_new_variable_rows(Ab[end:], tracks, new, own, columns)
-        return Ab
+    def rows(self, linear: Linearization, layout: Layout) -> list[FloatArray]:
+        """Rows [A b] (m, n + 1) of all observations, to be folded in one after the other."""
+        none, size = np.zeros(0, np.intp), layout.size
+        leading, rest, of_state = np.zeros((0, size + 1)), np.zeros((0, 1)), none
+        if linear.landmarks is not None and self.landmarks is not None:
+            obs = self.landmarks
+            of_state = layout.indices(self.rig.keys_of(obs))
+            own = np.zeros(len(obs.ids), np.int64)
+            own[obs.feature] = self._state_columns(obs, layout)[:, POSE_DIM]
+            leading, rest = state_feature_rows(obs, linear.landmarks, own, of_state, size)
+        if linear.tracks is None or self.tracks is None:
+            return [leading, pose_rows(rest, None, none, none, (of_state, none), size)]
+        assert isinstance(linear.tracks, SummedFeatures)
+        columns = of_state, layout.indices(self.rig.keys_of(self.tracks.obs))
+        new = np.flatnonzero(self.tracks.in_state)
+        own = layout.indices(landmark_keys(self.tracks.obs.ids[new]))
+        return [leading, pose_rows(rest, linear.tracks, new, own, columns, size)]
 
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the estimates by an increment (n,), and new features with them, in inverse depth.

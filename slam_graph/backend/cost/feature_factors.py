@@ -34,11 +34,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM
+from slam_graph.backend.solve.state import POSE_DIM
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
@@ -247,41 +247,3 @@ def eliminate_points(
     A, B = stacked.reshape(J, 2 * M, 3), beside.reshape(J, 2 * M, -1)
     triangularize_features(A, B)
     return np.triu(A[:, :3]), B
-
-
-def fill_state_rows(
-    Ab: FloatArray, linear: WhitenedObservations, columns: NDArray[np.intp]
-) -> None:
-    """The rows of N observations of features of the state, which have (N, 9 + C) columns."""
-    rows = np.arange(len(Ab)).reshape(-1, 2)
-    Ab[rows[:, :, None], columns[:, None, :]] = linear.H
-    Ab[:, -1] = linear.r.ravel()
-
-
-def fill_null_space_rows(Ab: FloatArray, linear: SummedFeatures, columns: NDArray[np.intp]) -> None:
-    """What new features say of all else, at most 6 F + C + 1 rows."""
-    Ab[:, columns], Ab[:, -1] = linear.rows[:, :-1], linear.rows[:, -1]
-
-
-def fill_new_variable_rows(
-    Ab: FloatArray,
-    linear: SummedFeatures,
-    new: IntArray,
-    own: NDArray[np.intp],
-    columns: NDArray[np.intp],
-) -> None:
-    """The three rows that determine each feature (K,) of J that becomes a variable.
-
-    Args:
-        Ab: (3 K, n + 1), filled.
-        linear: of all J features.
-        new: (K,) those that become variables.
-        own: (3 K,) their columns.
-        columns: (6 F + C,) of poses and calibration.
-    """
-    if len(new) == 0:
-        return
-    rows = np.arange(len(Ab)).reshape(-1, POINT_DIM)
-    Ab[rows[:, :, None], own.reshape(-1, 1, POINT_DIM)] = linear.R_f[new]
-    Ab[:, columns] = linear.T[new].reshape(len(Ab), -1)
-    Ab[:, -1] = linear.r_1[new].ravel()

@@ -160,11 +160,10 @@ class RigProjection:
         """
         if self._mounts is not None and self._mounts[0] is obs:
             return self._mounts[1]
-        R, p = self.body_R_camera[obs.camera], self.body_p_camera[obs.camera]
-        if not self.rolling or len(obs) == 0:
-            return R, p
-        turn, move = self._row_motions(obs).after(self.row_times_s(obs))
-        mounts = turn @ R, move + np.einsum("nij,nj->ni", turn, p)
+        mounts = R, p = self.body_R_camera[obs.camera], self.body_p_camera[obs.camera]
+        if self.rolling and len(obs):
+            turn, move = self._row_motions(obs).after(self.row_times_s(obs))
+            mounts = turn @ R, move + np.einsum("nij,nj->ni", turn, p)
         self._mounts = obs, mounts
         return mounts
 

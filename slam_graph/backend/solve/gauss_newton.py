@@ -137,16 +137,17 @@ def _system(
     predicted: SquareRootInformation | None = None,
 ) -> SquareRootInformation:
     """The linearised cost as a Gaussian over an increment of the estimates."""
-    rows = cost.rows(linear, layout)
     if predicted is None:
-        rows = np.concatenate([cost.factor_rows(layout), rows])
-        return cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
-    extended = predicted
-    if layout is not predicted.layout:
+        rows = cost.factor_rows(layout)
+        system = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
+    elif layout is predicted.layout:
+        system = predicted
+    else:
         known = predicted.layout.dims
-        new = {key: dim for key, dim in layout.dims.items() if key not in known}
-        extended = predicted.extended(new)
-    return extended.updated(rows, overwrite=extended is not predicted, overwrite_rows=True)
+        system = predicted.extended({k: d for k, d in layout.dims.items() if k not in known})
+    for rows in cost.rows(linear, layout):
+        system = system.updated(rows, overwrite=system is not predicted, overwrite_rows=True)
+    return system
 
 
 def _levenberg_marquardt(

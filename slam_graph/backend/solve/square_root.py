@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.kernels.elimination import eliminate_columns
+from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
@@ -179,6 +179,8 @@ class SquareRootInformation:
     ) -> SquareRootInformation:
         """Fold in measurement rows.
 
+        Where row i begins i columns behind the first one or later, the zeros are left out.
+
         Args:
             Ab: (m, n + 1) rows [A b] of the cost ‖A δ - b‖².
             overwrite: whether this Gaussian, which nobody needs any more, may be changed: copies
@@ -187,19 +189,19 @@ class SquareRootInformation:
         """
         if len(Ab) == 0:
             return self
-        first = 0  # columns to the left are not touched
-        if not Ab[:, 0].any():
-            first = int(np.argmax(Ab.any(axis=0)))
-        Ab = Ab[:, first:]
-        if len(Ab) > 2 * Ab.shape[1]:
-            Ab = triangularize(Ab)
+        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
+        first, staggered = zeros_to_the_left(rows)  # columns to the left are not touched
+        if first == rows.shape[1]:
+            return self
+        rows = rows[:, first:]
+        if len(rows) > 2 * rows.shape[1]:
+            rows, staggered = triangularize(rows), True
         in_place = overwrite and first == 0
         triangle = self.Rd if in_place else self.Rd[first:, first:].copy(order="F")
-        rows = np.asfortranarray(Ab) if overwrite_rows else Ab.copy(order="F")
-        block = min(_BLOCK_SIZE, len(triangle))
+        block, depth = min(_BLOCK_SIZE, len(triangle)), len(rows) if staggered else 0
         # in the copies themselves: new memory costs as much as the arithmetic
         triangle, _, _, info = lapack.dtpqrt(
-            0, block, triangle, rows, overwrite_a=True, overwrite_b=True
+            depth, block, triangle, rows, overwrite_a=True, overwrite_b=True
         )
         if info != 0:
             raise ValueError(f"LAPACK's tpqrt rejected argument {-info}")
@@ -243,11 +245,11 @@ class SquareRootInformation:
 
     def root_from(self, first: int) -> FloatArray:
         """A root (m, m) of the covariance of all columns from one on, R⁻ᵀ of these."""
-        return np.asfortranarray(_inverse(self.R[first:, first:]).T)
+        return _transposed_inverse(self.R[first:, first:])
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
-        return np.asarray(np.triu(_inverse(self.R)), dtype=np.float64)
+        return np.asarray(np.tril(_transposed_inverse(self.R)).T, dtype=np.float64)
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
@@ -298,27 +300,28 @@ def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
     return np.asarray(x, dtype=np.float64)
 
 
-def _inverse(R: FloatArray) -> FloatArray:
-    """The inverse of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
+def _transposed_inverse(R: FloatArray) -> FloatArray:
+    """R⁻ᵀ of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
 
     By the inverses of its halves and triangular products of these, which take half of the time of
-    LAPACK's `dtrtri` for a few hundred columns.
+    LAPACK's `dtrtri` for a few hundred columns. What is above the diagonal of the result is zero
+    but for small matrices.
 
     Raises:
         numpy.linalg.LinAlgError: if it is singular.
     """
     n = len(R)
     if n <= _SMALL_TRIANGLE:
-        small, info = lapack.dtrtri(R)
+        small, info = lapack.dtrtri(R.T, lower=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(small, dtype=np.float64)
     half = n // 2
     inverse = np.zeros((n, n), order="F")
-    inverse[:half, :half] = upper = _inverse(R[:half, :half])
-    inverse[half:, half:] = lower = _inverse(R[half:, half:])
-    corner = blas.dtrmm(-1.0, upper, R[:half, half:])
-    inverse[:half, half:] = blas.dtrmm(1.0, lower, corner, side=1, overwrite_b=1)
+    inverse[:half, :half] = first = _transposed_inverse(R[:half, :half])
+    inverse[half:, half:] = second = _transposed_inverse(R[half:, half:])
+    corner = blas.dtrmm(-1.0, second, R[:half, half:].T, lower=1)
+    inverse[half:, :half] = blas.dtrmm(1.0, first, corner, side=1, lower=1, overwrite_b=1)
     return inverse
 
 
