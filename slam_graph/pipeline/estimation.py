@@ -216,6 +216,7 @@ class Estimation:
         if state is not None:
             check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
+            self._recovery.agreement.check_correction(estimator, features)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)
         self._recovery.agreement.check_motion(estimator, features, state)
