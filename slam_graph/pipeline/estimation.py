@@ -166,6 +166,7 @@ class Estimation:
             tracked.frame_stats,
             estimator.aiding.aligned,
             estimator.aiding.offset_s,
+            imu_noise_at_limit=estimator.imu_noise_at_limit,
         )
         self._note(frame, tracked)
         return frame
