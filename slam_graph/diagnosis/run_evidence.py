@@ -26,9 +26,9 @@ _FEWEST = 20
 _ROTATION, _POSITION = slice(0, 3), slice(3, 6)
 """Columns of the standard deviations of a state."""
 
-USUAL_NOISE_AT_LIMIT, USUAL_SHIFT = 0.1, 2.5
+USUAL_NOISE_AT_LIMIT, USUAL_SHIFT = 0.25, 2.5
 """What good runs show at most: more is a reason to look at calibration and clocks."""
-MOST_NOISE_AT_LIMIT, MOST_SHIFT = 0.4, 5.0
+MOST_NOISE_AT_LIMIT, MOST_SHIFT = 0.5, 5.0
 """No good run comes near: more makes a run suspect."""
 
 
