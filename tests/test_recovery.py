@@ -3,6 +3,7 @@
 """Recovery: what is lost is taken back, and the run goes on as a new segment, honestly joined."""
 
 import csv
+from contextlib import nullcontext
 from pathlib import Path
 
 import gtsam
@@ -19,9 +20,10 @@ from slam_graph.config import RunConfig
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline.agreement import Agreement
+from slam_graph.pipeline.agreement import Agreement, Corrections, DivergenceError
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
+from slam_graph.sensors import FeatureFrame, FeatureObservations
 from slam_graph.simulation.simulator import simulate
 
 CAUSAL = ("final_ba.enabled=false",)
@@ -115,6 +117,29 @@ def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() ->
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]
     assert "not across it" in result.segments[0].ended_by
     assert max(error_m(result, 0), error_m(result, 1)) < 0.02
+
+
+@pytest.mark.parametrize("algorithm", ["okvis", "fixed_lag_isam2"])
+def test_another_velocity_is_not_taken_over(algorithm: str) -> None:
+    """No track goes on across the jump: new features agree with the new velocity, the IMU not."""
+    result = flown("kidnapped:at_s=6,duration_s=3.7", algorithm=algorithm)
+    assert [segment.joined_by for segment in result.segments] == ["start", "none"]
+    begins_s = (result.segments[1].begin_ns - result.input.start_ns) * 1e-9
+    assert begins_s < FAULT_S + 5.0
+    assert max(error_m(result, 0), error_m(result, 1)) < 0.05
+
+
+@pytest.mark.parametrize("first_id", [0, 100])
+def test_corrections_of_the_velocity_count_where_tracks_are_broken(first_id: int) -> None:
+    """Ids begin at another number after 2 s, and corrections are too large; one was before."""
+    corrections, step_ns = Corrections(), 50_000_000
+    with pytest.raises(DivergenceError) if first_id else nullcontext():
+        for k in range(80):
+            ids = np.arange(30) + (first_id if k >= 40 else 0)
+            seen = FeatureObservations(ids, np.zeros((30, 2)), np.zeros((30, 2)))
+            corrections.note(FeatureFrame(k * step_ns, (seen,)))
+            corrections.check(k * step_ns, 5.0 if k >= 40 else 20.0 * (k == 20))
+    assert (corrections.agreed_until() < 41 * step_ns) == (first_id > 0)
 
 
 @pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])

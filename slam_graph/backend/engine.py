@@ -60,7 +60,7 @@ class SquareRootEngine:
         self._posterior, self._cost = minimum.posterior, constructed.cost
         context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
-        context.propagation.learn(state)
+        report.correction = context.propagation.learn(state)
         context.pixels.learn(constructed.cost, constructed.offered, stamp_ns)
         return context.propagation.reported(state)
 

@@ -44,6 +44,8 @@ class StepReport:
         costs: the cost before the first Gauss-Newton step and after each; empty if not known.
         columns: dimension of the state, with the features that are stored; 0 without costs.
         innovations: how far the measurements were from what was predicted.
+        correction: of the velocity that the IMU predicted, squared, in units of the variance of the
+            prediction; None if not known, and at a standstill.
         rejected: ids (N,) of the features that the gate rejected, ascending.
     """
 
@@ -51,6 +53,7 @@ class StepReport:
     costs: tuple[float, ...] = ()
     columns: int = 0
     innovations: Innovations = field(default_factory=Innovations)
+    correction: float | None = None
     rejected: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @contextmanager

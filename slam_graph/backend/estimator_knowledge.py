@@ -88,6 +88,11 @@ class EstimatorKnowledge:
         return float(np.max(self._context.pixels.sigma_px))
 
     @property
+    def imu_noise_at_limit(self) -> bool:
+        """Whether a noise density of the IMU was raised as far as it may be."""
+        return self._context.propagation.noise.at_limit
+
+    @property
     def motion(self) -> FrameMotion | None:
         """The motion of the body within the last frame, where a shutter rolls."""
         window = self.window

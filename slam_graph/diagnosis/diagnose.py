@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.finding import Finding, in_order
@@ -17,8 +17,10 @@ from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_
 from slam_graph.diagnosis.gathering import Material, Part, around, gather
 from slam_graph.diagnosis.imu_checks import check_sampling, check_units
 from slam_graph.diagnosis.motion_checks import check_motion
+from slam_graph.diagnosis.run_evidence import Evidence
 from slam_graph.diagnosis.stereo_geometry import check_stereo
 from slam_graph.diagnosis.stereo_matching import StereoMatches, match_images
+from slam_graph.geometry import StateHistory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 SETUP_KINDS = (
@@ -112,6 +114,16 @@ class Diagnosis:
         if now.fit is not None:
             found += check_motion(now, now.fit, len(rig.cameras) > 1, axes_known=True)
         return Diagnosis(in_order(found))
+
+    @staticmethod
+    def of_run(
+        innovations: Mapping[str, FloatArray],
+        noise_at_limit: float | None,
+        causal: StateHistory,
+        smoothed: StateHistory | None,
+    ) -> Evidence:
+        """How consistent a run is by itself, without its recording; see `Evidence.of`."""
+        return Evidence.of(innovations, noise_at_limit, causal, smoothed)
 
     @property
     def faults(self) -> list[Finding]:

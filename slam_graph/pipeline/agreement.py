@@ -13,6 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from slam_graph.arrays import IntArray
 from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
@@ -31,6 +32,12 @@ _BAD_SHARE = 0.9
 _MOST_UNFIT, _SOONER = 0.9, 5.0 / 6.0
 """Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
 other one. Most of the tracks may be on a wall that moves; nearly all do not fit a lost state."""
+_CORRECTED_S, _FEWEST_CORRECTIONS, _MOST_CORRECTED = 0.5, 5, 3.0
+"""Largest mean over so long, and over so many, of the squared corrections of the velocity, in units
+of the variances of the predictions. It is below one if covariances are right, up to 1.8 in good
+runs with a real IMU, and 4 to 20 where another velocity is taken over."""
+_FOUND_AGAIN, _BROKEN_NS = 0.5, 1_500_000_000
+"""Tracks are broken where fewer of them go on to the next frame; corrections count for so long."""
 _MOST_WAITING = 100
 """Frames that wait for their states, at most."""
 
@@ -162,14 +169,70 @@ class Disagreement:
         return tests[first - 1].stamp_ns if first else self._earlier_ns
 
 
+class Corrections:
+    """Corrections of the velocity against what the IMU allows, where tracks were broken.
+
+    After a jump that no track outlives, the images may show another velocity, with which every new
+    feature agrees. An estimator takes it over in small steps, each of them against the IMU. As long
+    as tracks go on they tell more: they show a wrong clock as well, which a start need not cure.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, float]] = deque()
+        self._ids: IntArray = np.zeros(0, np.int64)
+        self._broken_ns: int | None = None
+        self._agreed_ns = 0
+
+    def __len__(self) -> int:
+        """How many corrections are kept."""
+        return len(self._recent)
+
+    def note(self, frame: FeatureFrame) -> None:
+        """Note whether the tracks of the frame before go on in this one."""
+        ids = np.unique(np.concatenate([seen.ids for seen in frame.cameras]))
+        if not len(ids):
+            return
+        if np.count_nonzero(np.isin(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
+            self._broken_ns = frame.stamp_ns
+        self._ids = ids
+
+    def check(self, stamp_ns: int, correction: float) -> None:
+        """Add the correction of the next step, squared, in units of the variance.
+
+        Raises:
+            DivergenceError: if velocities were corrected by too much.
+        """
+        recent, begin_ns = self._recent, stamp_ns - round(_CORRECTED_S * 1e9)
+        recent.append((stamp_ns, correction))
+        while len(recent) > _FEWEST_CORRECTIONS and recent[1][0] <= begin_ns:
+            recent.popleft()
+        self._agreed_ns = stamp_ns
+        if len(recent) < _FEWEST_CORRECTIONS or recent[0][0] > begin_ns:
+            return
+        mean = sum(square for _, square in recent) / len(recent)
+        broken = self._broken_ns is not None and stamp_ns <= self._broken_ns + _BROKEN_NS
+        if broken and mean > _MOST_CORRECTED:
+            self._agreed_ns = recent[0][0]
+            raise DivergenceError(
+                f"diverged at frame {stamp_ns}: no track went on, and new ones contradict the IMU: "
+                f"velocities were corrected by {math.sqrt(mean):.1f} standard deviations for "
+                f"{_CORRECTED_S:g} s"
+            )
+
+    def agreed_until(self) -> int:
+        """Time of the last step, or before those that corrected the velocity by too much."""
+        return self._agreed_ns
+
+
 class Agreement:
     """Whether the images still agree with the state.
 
     Where they contradict it for seconds, the state is wrong and its covariance too small. It cannot
-    recover then: the features that would correct it are those that are rejected. Two tests tell:
+    recover then: the features that would correct it are those that are rejected. Three tests tell:
 
     - the χ² gate rejects a few percent of the features if state and covariance are right;
-    - tracks of the last second fit the poses that were reported for their frames (`TrackFit`).
+    - tracks of the last second fit the poses that were reported for their frames (`TrackFit`);
+    - where no track goes on, velocities are not corrected by more than the IMU allows.
 
     Args:
         config: has the limits.
@@ -182,6 +245,7 @@ class Agreement:
         self._motion = Disagreement(
             _SOONER * interval_s, max(share, _MOST_UNFIT), "does not fit the motion"
         )
+        self._velocity = Corrections()
         self._fit = Estimator.track_fit(config.backend)
         self._waiting: dict[int, FeatureFrame] = {}
 
@@ -192,6 +256,24 @@ class Agreement:
             DivergenceError: if too much was rejected for too long.
         """
         self._gate.check(stamp_ns, innovations.tested, innovations.rejected)
+
+    def check_correction(self, estimator: Estimator, frame: FeatureFrame) -> None:
+        """Add how the last step corrected the velocity, where an IMU measures it.
+
+        Not while the start is reviewed, whose velocity may be wrong.
+
+        Args:
+            estimator: the back end, which has taken the frame.
+            frame: its features.
+
+        Raises:
+            DivergenceError: if velocities were corrected by too much for too long.
+        """
+        self._velocity.note(frame)
+        correction = estimator.report.correction
+        known = estimator.rig.has_imu and not estimator.start_is_doubtful
+        if known and correction is not None:
+            self._velocity.check(frame.stamp_ns, correction)
 
     def check_motion(
         self, estimator: Estimator, frame: FeatureFrame, state: NavState | None
@@ -239,8 +321,9 @@ class Agreement:
     def agreed_until(self) -> int | None:
         """Time of the last frame before the images contradicted the state; None if they always did.
 
-        The earlier one of what the two tests say.
+        The earliest of what the tests say.
         """
-        agreed = [test.agreed_until() for test in (self._gate, self._motion) if len(test)]
+        tests = self._gate, self._motion, self._velocity
+        agreed = [test.agreed_until() for test in tests if len(test)]
         known = [stamp_ns for stamp_ns in agreed if stamp_ns is not None]
         return min(known) if agreed and len(known) == len(agreed) else None

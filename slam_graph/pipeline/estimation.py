@@ -166,6 +166,7 @@ class Estimation:
             tracked.frame_stats,
             estimator.aiding.aligned,
             estimator.aiding.offset_s,
+            imu_noise_at_limit=estimator.imu_noise_at_limit,
         )
         self._note(frame, tracked)
         return frame
@@ -216,6 +217,7 @@ class Estimation:
         if state is not None:
             check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
+            self._recovery.agreement.check_correction(estimator, features)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)
         self._recovery.agreement.check_motion(estimator, features, state)

@@ -58,6 +58,7 @@ class EstimatedFrame:
         georeferenced: whether the world of the estimate is that of position fixes.
         fix_offset_s: time that was found to be missing from those of the fixes.
         objects: what moves; None where moving objects are not estimated.
+        imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.
     """
 
     packet: Packet
@@ -76,6 +77,7 @@ class EstimatedFrame:
     georeferenced: bool = False
     fix_offset_s: float = 0.0
     objects: ObjectFrame | None = None
+    imu_noise_at_limit: bool = False
 
     @property
     def image(self) -> np.ndarray | None:

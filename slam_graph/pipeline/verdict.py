@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -122,6 +123,7 @@ class Verdict(Stage):
     ) -> None:
         self._result, self._diagnostics = result, diagnostics
         self._kept = _Memory(len(result.input.rig.cameras) > 1, objects or NoObjects())
+        self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._started_ns: int | None = None
         self._first_ns: int | None = None
         config = result.config
@@ -137,6 +139,8 @@ class Verdict(Stage):
                 wrong.
         """
         stamp_ns = frame.features.stamp_ns
+        self._estimated += frame.initialized
+        self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
             self._started_ns = None
         elif self._started_ns is None:
@@ -156,8 +160,29 @@ class Verdict(Stage):
         if not len(self._kept) or not (failed or status in COMPLETED):
             return
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            if failed or self._is_doubtful():
-                self._judge(failed)
+            unusual, contradictions = self._contradictions()
+            if failed or unusual or self._is_doubtful():
+                self._judge(failed, contradictions)
+
+    def _contradictions(self) -> tuple[bool, list[str]]:
+        """Whether the run by itself is unlike good ones, and what shows if that is beyond doubt.
+
+        Without an IMU motion is a guess, whose errors are not white; and in the world of position
+        fixes these tell more of the shift than the causal covariance does.
+        """
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
+        result = self._result
+        innovations, measured = result.logs.innovations.columns(), result.input.rig.has_imu
+        adjusted = result.final_ba if measured and not result.georeferenced else None
+        found = Diagnosis.of_run(
+            innovations,
+            self._at_limit / self._estimated if measured and self._estimated else None,
+            result.history,
+            None if adjusted is None else adjusted.history,
+        )
+        result.evidence = asdict(found)
+        return found.is_unusual, found.causes if found.contradicts else []
 
     def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
         """Look now and then what keeps a run from starting.
@@ -196,20 +221,32 @@ class Verdict(Stage):
         ]
         return "; or ".join(certain[:2])
 
-    def _judge(self, failed: bool) -> None:
-        """Diagnose what was recorded, under the calibration that the run began or ended with."""
+    def _judge(self, failed: bool, contradictions: list[str]) -> None:
+        """Diagnose what was recorded, under the calibration that the run began or ended with.
+
+        Args:
+            failed: whether the run did.
+            contradictions: what shows in the run itself, if that is beyond doubt.
+        """
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
         ending, guess = self._result.ending, found.best_guess()
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
         elif found.setup_faults and not failed:
             likely = "; or ".join(finding.what for finding in found.setup_faults[:2])
-            ending.status = "suspect"
-            ending.message = f"the estimate may be wrong: {likely}; see `slam-graph doctor`"
+            self._suspect(likely)
+        elif contradictions and not failed:
+            self._suspect("; and ".join(contradictions))
         else:
             return
         ending.error = EstimationError(ending.message)
         logger.error("%s", ending.message)
+
+    def _suspect(self, likely: str) -> None:
+        """Say that the estimate may be wrong, and why."""
+        ending = self._result.ending
+        ending.status = "suspect"
+        ending.message = f"the estimate may be wrong: {likely}; see `slam-graph doctor`"
 
     def _diagnosed(self, rig: Rig) -> Diagnosis:
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import

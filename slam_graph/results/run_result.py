@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -70,6 +71,7 @@ class RunResult(RunSummary):
         slam_map: the map, if one was to be built.
         localization: poses in a known map, if there was one.
         objects: moving objects, if they were to be estimated.
+        evidence: statistics of how consistent the run is by itself, by name; None if not judged.
         graphs: factor graphs of the back end by the stamps (ns) of their frames, if asked for.
         warnings: counted faults and rejections.
     """
@@ -89,6 +91,7 @@ class RunResult(RunSummary):
     slam_map: SlamMap | None = None
     localization: LocalizationLog | None = None
     objects: MovingObjects | None = None
+    evidence: Mapping[str, float | None] | None = None
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
 
@@ -280,6 +283,7 @@ class RunResult(RunSummary):
                     truth, self.history, self.start_was_given, self.final_ba
                 ),
                 "nis": evaluation.innovation_report(logs.innovations.columns()),
+                "evidence": self.evidence,
                 "calibration": logs.calibration.table(),
                 "timing": tables.timing_table(logs, asked.start_ns, self.ending.wall_s),
                 "features_per_frame": {

@@ -203,6 +203,11 @@ class DynamicsNoise:
         factors = self._scales.factors
         return float(factors[_GYRO]), float(factors[_ACCEL])
 
+    @property
+    def at_limit(self) -> bool:
+        """Whether the factor on a density is as large as it may become."""
+        return bool(self._scales.factors.max() >= MAX_FACTOR)
+
     def watch_vibration(self, imu: ImuBuffer, stamp_ns: int) -> None:
         """Raise the noise of the accelerometer at once when the IMU begins to vibrate.
 

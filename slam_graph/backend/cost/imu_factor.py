@@ -32,6 +32,8 @@ IMU_GAP_SCALE = 1000.0
 """Factor on the noise densities between two frames where samples are missing: the IMU then hardly
 counts."""
 
+_VELOCITY = slice(6, 9)
+"""Rows of a state's covariance."""
 _UNIT = np.eye(15)
 
 
@@ -69,6 +71,14 @@ def imu_factor(
 ) -> gtsam.CombinedImuFactor:
     """The dynamics residual between frames i and j."""
     return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
+
+
+def _velocity_correction(predicted: NavState, state: NavState) -> float:
+    """Squared Mahalanobis distance of a velocity from the predicted one, over its dimension."""
+    assert predicted.covariance is not None
+    off = state.velocity - predicted.velocity
+    square = off @ np.linalg.solve(predicted.covariance[_VELOCITY, _VELOCITY], off)
+    return float(square) / len(off)
 
 
 class Propagation:
@@ -185,20 +195,28 @@ class Propagation:
         """The state of the last frame with the covariance that vibration gives it."""
         return self._vibration.added_to(state)
 
-    def learn(self, state: NavState) -> None:
+    def learn(self, state: NavState) -> float | None:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction.
 
         Not at a standstill, whose zero velocity is no measurement of images.
+
+        Returns:
+            Squared Mahalanobis distance of the velocity from its prediction, by the covariance of
+            the prediction, over its degrees of freedom; None where nothing was learned. Its mean is
+            below one if covariances are right: a correction is smaller than the error it corrects.
         """
+        correction = None
         if self._last is not None and self._predicted is not None:
             if not self._still:
                 dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
+                correction = _velocity_correction(self._predicted, state)
                 self.noise.learn(self._predicted, state, dt_s)
             if self._counts_vibration():
                 assert self._predicted.covariance is not None
                 assert state.covariance is not None
                 self._vibration.correct(self._predicted.covariance, state.covariance)
         self._last = state
+        return correction
 
     def _params(self, imu: ImuBuffer, samples: ImuData) -> gtsam.PreintegrationCombinedParams:
         """Parameters of the preintegration; where samples are missing, with much larger noise."""

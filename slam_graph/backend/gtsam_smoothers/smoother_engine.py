@@ -112,7 +112,7 @@ class SmootherEngine:
             self._solve(window, ahead, new)
         with report.timed("covariance"):
             state = self._advance(window, ahead, predicted)
-        propagation.learn(state)
+        report.correction = propagation.learn(state)
         return propagation.reported(state)
 
     def _predicted(self, ahead: Window) -> NavState:
