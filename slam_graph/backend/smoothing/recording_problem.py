@@ -26,7 +26,6 @@ from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
-from slam_graph.backend.smoothing.frame_motions import FrameMotions
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import (
     fill_in,
@@ -34,7 +33,8 @@ from slam_graph.backend.smoothing.keyframe_states import (
     states_in,
     values_of,
 )
-from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
+from slam_graph.backend.smoothing.learned_imu_noise import Minimum, equations_at_minimum
+from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
     RecordingCost,
@@ -56,8 +56,6 @@ from slam_graph.backend.smoothing.recording_segment import (
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
-    KeyframeCovariances,
-    keyframe_covariances,
     with_covariances,
 )
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
@@ -92,6 +90,7 @@ class SmoothingTask:
         config: settings of the bundle adjustment.
         causal: motion between keyframes where there is no IMU to predict it.
         least_noise: smallest factor on the noise of the IMU, or of the dynamics, that is learned.
+        joint: whether the equations at the minimum are kept, which others can be joined to.
     """
 
     rig: Rig
@@ -99,18 +98,24 @@ class SmoothingTask:
     config: FinalBaConfig
     causal: Trajectory | None = None
     least_noise: float = 1.0
+    joint: bool = False
 
     @classmethod
     def of(
-        cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig, least_noise: float = 1.0
+        cls,
+        rig: Rig,
+        backend: BackendConfig,
+        config: FinalBaConfig,
+        least_noise: float = 1.0,
+        joint: bool = False,
     ) -> SmoothingTask:
         """The task under the dynamics that the settings choose."""
         rig = with_depth_camera(rig)
         if backend.dynamics.uses_imu(rig.has_imu):
-            return cls(rig, backend, config, least_noise=least_noise)
+            return cls(rig, backend, config, None, least_noise, joint)
         alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
         rig = model_rig(rig, backend.dynamics)
-        return cls(rig, without_imu(backend), alone, least_noise=least_noise)
+        return cls(rig, without_imu(backend), alone, None, least_noise, joint)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -144,14 +149,14 @@ class AdjustedSegment:
         figures: of the minimum.
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
         noise: factors on the noise of the IMU that the covariances were computed with.
-        motions: errors of the motions from frame to frame, or None.
+        equations: those at the minimum, if they are wanted and there are covariances.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
     aligned: FloatArray | None
     noise: ImuNoiseFactors
-    motions: FrameMotions | None
+    equations: PoseEquations | None
 
 
 class BundleAdjustment:
@@ -217,14 +222,16 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned, motions = self._states(self._segment.stamps_ns), None, None
-        known = self._covariances()
-        if known is not None:
-            densities = self._factors.densities()
-            frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
-            states, aligned = with_covariances(states, known, frames)
-            motions = FrameMotions(known, frames)
-        return AdjustedSegment(states, figures, aligned, self.imu_noise, motions)
+        states, aligned, equations = self._states(self._segment.stamps_ns), None, self._equations()
+        try:
+            if equations is not None:
+                known = equations.covariances()
+                states, aligned = with_covariances(states, known, equations.frames)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            _log_no_covariances(error)
+            equations = None
+        kept = equations if self._task.joint else None
+        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.
@@ -361,23 +368,28 @@ class BundleAdjustment:
         points[~good] = self._minimum.estimates.points[~good]
         return self._minimum.cost.value(Estimates(self._given, points))
 
-    def _covariances(self) -> KeyframeCovariances | None:
-        """Covariances at the minimum; None if it does not determine all variables."""
+    def _equations(self) -> PoseEquations | None:
+        """The equations at the minimum; None if it does not determine all variables."""
         segment = self._segment
         nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
         weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
         try:
-            states = states_at_minimum(
+            minimum = equations_at_minimum(
                 self._minimum,
                 self._factor,
                 self._factors,
                 self._config.learn_imu_noise,
+                self._task.joint,
                 self._count_step,
             )
-            return keyframe_covariances(states, self._values, weights, self._task.rig.has_imu)
         except (RuntimeError, np.linalg.LinAlgError) as error:
-            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
+            _log_no_covariances(error)
             return None
+        densities = self._factors.densities()
+        frames = FrameInterpolation.of(segment.stamps_ns, segment.keyframes, densities)
+        return PoseEquations(
+            minimum, segment.stamps_ns, segment.keyframes, frames, weights, self._task.rig.has_imu
+        )
 
     def _note_motions(self) -> None:
         """Take the current velocities for the motion between the rows of rolling shutters."""
@@ -398,3 +410,7 @@ class BundleAdjustment:
     def _keyframe_states(self) -> list[NavState]:
         """The states of the keyframes."""
         return states_in(self._values, self._segment.keyframe_stamps_ns.tolist())
+
+
+def _log_no_covariances(error: Exception) -> None:
+    logger.info("no covariances: %s", " ".join(str(error).split())[:200])
