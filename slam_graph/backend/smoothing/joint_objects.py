@@ -17,9 +17,9 @@ object. With the covariance P of all of its variables, and g' their gradient, it
 
     Tᵀ (S - S P S) T   and   Tᵀ (g - S P g')
 
-on e, and δ = -P S T e. That is added to the equations of the platform (`pose_equations.py`), and one
-Gauss-Newton step of the joint problem and its covariances follow. It is exact to first order, but
-for what an object turns within one interval, where the velocity of the platform is concerned.
+on e, and δ = -P S T e. That is added to the equations of the platform (`pose_equations.py`), and
+one Gauss-Newton step of the joint problem and its covariances follow. It is exact to first order,
+but for what an object turns within one interval, where the velocity of the platform is concerned.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from scipy import sparse
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.smoothing.learned_imu_noise import EliminatedMinimum
+from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
     KeyframeCovariances,
@@ -48,6 +49,21 @@ class PoseEquations:
     frames: FrameInterpolation
     weights: FloatArray
     level: bool
+
+    @classmethod
+    def of(
+        cls,
+        minimum: EliminatedMinimum,
+        stamps_ns: IntArray,
+        keyframes: IntArray,
+        densities: FloatArray,
+        level: bool,
+    ) -> PoseEquations:
+        """The equations at a minimum; see the class, and `FrameInterpolation.of` for densities."""
+        frames = FrameInterpolation.of(stamps_ns, keyframes, densities)
+        nearest = nearest_keyframe(stamps_ns, keyframes)
+        weights = np.bincount(nearest, minlength=len(keyframes)) / len(nearest)
+        return cls(minimum, stamps_ns, keyframes, frames, weights, level)
 
     @property
     def states(self) -> EliminatedStates:
@@ -137,4 +153,3 @@ class PoseEquations:
         times = self.stamps_ns[self.keyframes]
         before = np.clip(np.searchsorted(times, stamps_ns, "right") - 1, 0, len(times) - 2)
         return before, (stamps_ns - times[before]) / np.diff(times)[before]
-

@@ -54,10 +54,7 @@ from slam_graph.backend.smoothing.recording_segment import (
     with_gtsam_cameras,
 )
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.backend.smoothing.state_covariances import (
-    FrameInterpolation,
-    with_covariances,
-)
+from slam_graph.backend.smoothing.state_covariances import with_covariances
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.geometry import NavState, Trajectory
@@ -222,13 +219,12 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned, equations = self._states(self._segment.stamps_ns), None, self._equations()
+        states, aligned, equations = self._states(self._segment.stamps_ns), None, None
         try:
-            if equations is not None:
-                known = equations.covariances()
-                states, aligned = with_covariances(states, known, equations.frames)
+            equations = self._equations()
+            states, aligned = with_covariances(states, equations.covariances(), equations.frames)
         except (RuntimeError, np.linalg.LinAlgError) as error:
-            _log_no_covariances(error)
+            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             equations = None
         kept = equations if self._task.joint else None
         return AdjustedSegment(states, figures, aligned, self.imu_noise, kept)
@@ -368,28 +364,24 @@ class BundleAdjustment:
         points[~good] = self._minimum.estimates.points[~good]
         return self._minimum.cost.value(Estimates(self._given, points))
 
-    def _equations(self) -> PoseEquations | None:
-        """The equations at the minimum; None if it does not determine all variables."""
-        segment = self._segment
-        nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
-        weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
-        try:
-            minimum = equations_at_minimum(
-                self._minimum,
-                self._factor,
-                self._factors,
-                self._config.learn_imu_noise,
-                self._task.joint,
-                self._count_step,
-            )
-        except (RuntimeError, np.linalg.LinAlgError) as error:
-            _log_no_covariances(error)
-            return None
-        densities = self._factors.densities()
-        frames = FrameInterpolation.of(segment.stamps_ns, segment.keyframes, densities)
-        return PoseEquations(
-            minimum, segment.stamps_ns, segment.keyframes, frames, weights, self._task.rig.has_imu
+    def _equations(self) -> PoseEquations:
+        """The equations at the minimum.
+
+        Raises:
+            RuntimeError: if GTSAM cannot linearise a factor.
+            LinAlgError: if the minimum does not determine all variables.
+        """
+        minimum = equations_at_minimum(
+            self._minimum,
+            self._factor,
+            self._factors,
+            self._config.learn_imu_noise,
+            self._task.joint,
+            self._count_step,
         )
+        densities, level = self._factors.densities(), self._task.rig.has_imu
+        segment = self._segment
+        return PoseEquations.of(minimum, segment.stamps_ns, segment.keyframes, densities, level)
 
     def _note_motions(self) -> None:
         """Take the current velocities for the motion between the rows of rolling shutters."""
@@ -410,7 +402,3 @@ class BundleAdjustment:
     def _keyframe_states(self) -> list[NavState]:
         """The states of the keyframes."""
         return states_in(self._values, self._segment.keyframe_stamps_ns.tolist())
-
-
-def _log_no_covariances(error: Exception) -> None:
-    logger.info("no covariances: %s", " ".join(str(error).split())[:200])

@@ -7,13 +7,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.smoothing.joint_objects import JointObject
-from slam_graph.geometry import interpolate
 
 _BLOCK = 50
 """States whose joint covariance is computed at once."""
@@ -33,7 +31,7 @@ def smoothed_states(
         Those that the adjustment has. Covariances of poses are relative to the first ones. Those of
         motions and velocities are NaN where platform and object are not joined.
     """
-    known = [state for state in _placed(states, found, offset_ns) if state is not None]
+    known = _placed(states, found, offset_ns)
     result: list[ObjectState] = []
     for first in range(0, len(known), _BLOCK):
         begin, end = max(first - 1, 0), min(first + _BLOCK + 1, len(known))
@@ -44,9 +42,7 @@ def smoothed_states(
     return result
 
 
-def _placed(
-    states: Sequence[ObjectState], found: JointObject, offset_ns: int
-) -> list[ObjectState]:
+def _placed(states: Sequence[ObjectState], found: JointObject, offset_ns: int) -> list[ObjectState]:
     """States with the poses that two smoothed poses of the platform give."""
     stamps_ns = np.array([state.stamp_ns for state in states]) + offset_ns
     both = [
