@@ -29,7 +29,7 @@ def equations(stamps_ns: IntArray, keyframes: IntArray, rotations: FloatArray) -
     minimum = EliminatedMinimum(None, gtsam.NonlinearFactorGraph(), values, cast(Any, None))
     densities = np.tile([0.7, 2.0], (len(keyframes) - 1, 1))
     frames = FrameInterpolation.of(stamps_ns, keyframes, densities)
-    return PoseEquations(minimum, stamps_ns, keyframes, frames, np.zeros(0), True)
+    return PoseEquations(minimum, stamps_ns, keyframes, frames, np.zeros(0), True, keyframes)
 
 
 def test_the_joint_covariance_of_frames_has_that_of_each() -> None:

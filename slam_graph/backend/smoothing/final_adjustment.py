@@ -170,8 +170,8 @@ def adjust_recording(
         EstimationError: if the minimum does not fit the observations.
     """
     try:
-        task = SmoothingTask.of(rig, backend, config, least_noise, joint)
-        return _smoothed(log, causal, task, report)
+        task = SmoothingTask.of(rig, backend, config, least_noise)
+        return _smoothed(log, causal, replace(task, joint=joint), report)
     except _UndeterminedError as reason:
         logger.info("no final bundle adjustment: %s", reason)
         return None

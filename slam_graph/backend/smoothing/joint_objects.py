@@ -45,6 +45,9 @@ from slam_graph.geometry import NavState, Trajectory, interpolate
 logger = logging.getLogger(__name__)
 
 _POSE = 6
+_MOST_SHARED = 0.1
+"""An object that has a larger share of its tracks in common with the platform, which held them for
+static, says nothing new of it: their errors would count twice."""
 
 
 def joined(
@@ -183,7 +186,10 @@ class _Coupling:
         left = gradient - S @ own.rest()[:, :_POSE].ravel()
         information = T.T @ ST - ST.T @ answer
         rows = _motion_rows(X) @ world.error_rows(stamps_ns, _rotations(X))
-        return _Coupling(rows, 0.5 * (information + information.T), T.T @ left, T - answer)
+        shared = float(np.isin(own.features, world.features).mean())
+        new = 0.0 if shared > _MOST_SHARED else 1.0
+        symmetric = 0.5 * new * (information + information.T)
+        return _Coupling(rows, symmetric, new * (T.T @ left), T - answer)
 
 
 def _carried(X: Trajectory, Y: Trajectory) -> FloatArray:
@@ -234,7 +240,7 @@ def _blocks(diagonal: Sequence[FloatArray]) -> sparse.csr_array:
 
 def _rotations(path: Trajectory) -> FloatArray:
     """(N, 3, 3)."""
-    return Rotation.from_quat(path.quaternions).as_matrix()
+    return np.asarray(Rotation.from_quat(path.quaternions).as_matrix())
 
 
 def _moved(found: FinalBa, equations: PoseEquations, step: FloatArray, known: bool) -> FinalBa:

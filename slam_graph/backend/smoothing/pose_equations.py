@@ -41,6 +41,7 @@ class PoseEquations:
         frames: where the frames are among the keyframes.
         weights: (K,) of the keyframes in an alignment.
         level: whether gravity is measured.
+        features: (J,) ids of the features that images say this by.
     """
 
     minimum: EliminatedMinimum
@@ -49,6 +50,7 @@ class PoseEquations:
     frames: FrameInterpolation
     weights: FloatArray
     level: bool
+    features: IntArray
 
     @classmethod
     def of(
@@ -58,12 +60,13 @@ class PoseEquations:
         keyframes: IntArray,
         densities: FloatArray,
         level: bool,
+        features: IntArray,
     ) -> PoseEquations:
         """The equations at a minimum; see the class, and `FrameInterpolation.of` for densities."""
         frames = FrameInterpolation.of(stamps_ns, keyframes, densities)
         nearest = nearest_keyframe(stamps_ns, keyframes)
         weights = np.bincount(nearest, minlength=len(keyframes)) / len(nearest)
-        return cls(minimum, stamps_ns, keyframes, frames, weights, level)
+        return cls(minimum, stamps_ns, keyframes, frames, weights, level, features)
 
     @property
     def states(self) -> EliminatedStates:

@@ -99,20 +99,15 @@ class SmoothingTask:
 
     @classmethod
     def of(
-        cls,
-        rig: Rig,
-        backend: BackendConfig,
-        config: FinalBaConfig,
-        least_noise: float = 1.0,
-        joint: bool = False,
+        cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig, least_noise: float = 1.0
     ) -> SmoothingTask:
         """The task under the dynamics that the settings choose."""
         rig = with_depth_camera(rig)
         if backend.dynamics.uses_imu(rig.has_imu):
-            return cls(rig, backend, config, None, least_noise, joint)
+            return cls(rig, backend, config, least_noise=least_noise)
         alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
         rig = model_rig(rig, backend.dynamics)
-        return cls(rig, without_imu(backend), alone, None, least_noise, joint)
+        return cls(rig, without_imu(backend), alone, least_noise=least_noise)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
@@ -371,17 +366,14 @@ class BundleAdjustment:
             RuntimeError: if GTSAM cannot linearise a factor.
             LinAlgError: if the minimum does not determine all variables.
         """
+        found, config = (self._minimum, self._factor, self._factors), self._config
         minimum = equations_at_minimum(
-            self._minimum,
-            self._factor,
-            self._factors,
-            self._config.learn_imu_noise,
-            self._task.joint,
-            self._count_step,
+            *found, config.learn_imu_noise, self._task.joint, self._count_step
         )
         densities, level = self._factors.densities(), self._task.rig.has_imu
-        segment = self._segment
-        return PoseEquations.of(minimum, segment.stamps_ns, segment.keyframes, densities, level)
+        stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes
+        features = self._minimum.cost.images.obs.ids
+        return PoseEquations.of(minimum, stamps_ns, keyframes, densities, level, features)
 
     def _note_motions(self) -> None:
         """Take the current velocities for the motion between the rows of rolling shutters."""

@@ -70,7 +70,8 @@ def _with_motions(states: Sequence[ObjectState], P: FloatArray) -> list[ObjectSt
         state = replace(state, covariance=covariance, step=_motion(states, P, k))
         if last:
             pair = max(k - 1, 0), min(k + 1, last)
-            state = replace(state, **_velocity([states[i] for i in pair], _joint(P, *pair)))
+            velocity, covariance = _velocity([states[i] for i in pair], _joint(P, *pair))
+            state = replace(state, velocity=velocity, velocity_covariance=covariance)
         result.append(state)
     return result
 
@@ -78,7 +79,7 @@ def _with_motions(states: Sequence[ObjectState], P: FloatArray) -> list[ObjectSt
 def _joint(P: FloatArray, i: int, j: int) -> FloatArray:
     """Covariance (12, 12) of two of the poses."""
     rows = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-    return P[np.ix_(rows, rows)]
+    return np.asarray(P[np.ix_(rows, rows)])
 
 
 def _motion(states: Sequence[ObjectState], P: FloatArray, k: int) -> ObjectMotion | None:
@@ -92,14 +93,12 @@ def _motion(states: Sequence[ObjectState], P: FloatArray, k: int) -> ObjectMotio
     return ObjectMotion(step.before_ns, now.stamp_ns, motion, covariance)
 
 
-def _velocity(pair: Sequence[ObjectState], P: FloatArray) -> dict[str, FloatArray]:
+def _velocity(pair: Sequence[ObjectState], P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean velocity (3,) of the origin between two states, in the world, and its covariance."""
     seconds = (pair[1].stamp_ns - pair[0].stamp_ns) * 1e-9
     before, after = (state.world_T_object for state in pair)
     J = np.zeros((3, 12))
     J[:, 3:6], J[:, 9:] = -before.rotation().matrix(), after.rotation().matrix()
     J /= seconds
-    return {
-        "velocity": np.asarray((after.translation() - before.translation()) / seconds),
-        "velocity_covariance": J @ P @ J.T,
-    }
+    way = after.translation() - before.translation()
+    return np.asarray(way / seconds), J @ P @ J.T
