@@ -92,7 +92,7 @@ class Smoothing(Stage):
             result.config.backend,
             result.config.final_ba,
             self._progress.adjusting,
-            joint=result.config.objects.enabled,
+            result.config.objects.enabled,
         )
         if result.final_ba is None:
             return
