@@ -123,3 +123,31 @@ def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:
         for part in (truth, truth[: len(truth) // 2])
     )
     assert 0 < len(half.truth) < 0.7 * len(whole.truth)
+
+
+def test_smoothed_velocities_have_the_errors_that_they_say(two: RunResult) -> None:
+    """Of the point of the body at which its origin is, against how it truly moved."""
+    truth = two.input.truth
+    assert truth is not None
+    assert two.objects is not None
+    assert two.objects.smoothed is not None
+    bodies = dict(zip(truth.stamps_ns.tolist(), truth, strict=True))
+    squares: list[float] = []
+    for number in two.objects.smoothed.numbers:
+        states = two.objects.smoothed.states(number)
+        for before, state, after in zip(states, states[1:], states[2:], strict=False):
+            place = bodies[state.stamp_ns].compose(state.world_T_body.inverse())
+            origin = place.compose(state.world_T_object).translation()
+            own, path = min(
+                (
+                    (path.at(state.stamp_ns).transformTo(origin), path)
+                    for path in two.input.object_truth.values()
+                ),
+                key=lambda item: float(np.linalg.norm(item[0])),
+            )
+            ends = [path.at(s.stamp_ns).transformFrom(own) for s in (before, after)]
+            seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+            error = state.velocity - place.rotation().unrotate((ends[1] - ends[0]) / seconds)
+            squares.append(float(error @ np.linalg.solve(state.velocity_covariance, error)) / 3.0)
+    assert len(squares) > 80
+    assert 0.3 < np.mean(squares) < 2.0

@@ -110,7 +110,8 @@ class Objects(NoObjects):
                 calibrated = result.logs.calibration.latest
                 rig = result.causal_rig if calibrated is None else calibrated.rig
                 task = self._objects, rig, result.final_ba, result.config.final_ba
-                for failure in self._smoother.smooth(*task):
+                result.final_ba, failures = self._smoother.smooth(*task)
+                for failure in failures:
                     self._diagnostics.warn("object_not_smoothed", failure)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(

@@ -92,6 +92,7 @@ class Smoothing(Stage):
             result.config.backend,
             result.config.final_ba,
             self._progress.adjusting,
+            result.config.objects.enabled,
         )
         if result.final_ba is None:
             return

@@ -22,10 +22,10 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
 from slam_graph.backend.smoothing.frame_log import FrameLog
-from slam_graph.backend.smoothing.frame_motions import FrameMotions
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
 from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
+from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_problem import (
     AdjustedSegment,
     BundleAdjustment,
@@ -70,15 +70,15 @@ class FinalBa:
             determine no yaw, and of a recording in several segments.
         noise: factors on the noise of the IMU that the covariances were computed with; of the last
             segment.
-        motions: errors of the motions from frame to frame of `history`; None where the recording
-            was adjusted in several segments.
+        equations: those at the minimum, which others can be joined to; None if they were not wanted
+            or are not known, and where the recording was adjusted in several segments.
     """
 
     history: StateHistory
     summary: FinalBaSummary
     aligned: FloatArray | None
     noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
-    motions: FrameMotions | None = None
+    equations: PoseEquations | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -94,6 +94,7 @@ class FinalBa:
         backend: BackendConfig,
         config: FinalBaConfig,
         report: Report,
+        joint: bool = False,
     ) -> FinalBa | None:
         """Solve each part of a recording as a whole whose poses are in one world.
 
@@ -106,6 +107,7 @@ class FinalBa:
             backend: noise and triangulation.
             config: settings.
             report: is given the progress after each step.
+            joint: as for `adjust_recording`.
         """
         parts: list[FinalBa] = []
         for number, (begin_ns, end_ns) in enumerate(worlds):
@@ -118,7 +120,8 @@ class FinalBa:
                 None if end_ns is None else end_ns - offset_ns,
             )
             try:
-                found = adjust_recording(part, causal.select(inside), rig, backend, config, report)
+                chosen = causal.select(inside)
+                found = adjust_recording(part, chosen, rig, backend, config, report, joint=joint)
             except EstimationError as error:
                 if len(worlds) == 1:
                     raise
@@ -142,6 +145,7 @@ def adjust_recording(
     config: FinalBaConfig,
     report: Report,
     least_noise: float = 1.0,
+    joint: bool = False,
 ) -> FinalBa | None:
     """Solve a recording as a whole.
 
@@ -156,6 +160,7 @@ def adjust_recording(
         report: is given the progress after each step.
         least_noise: smallest factor on the noise of the IMU that is learned for covariances; one if
             the noise was calibrated.
+        joint: whether the equations at the minimum are kept, which others can be joined to.
 
     Returns:
         The smoothed trajectory; None if there are too few observations to improve on the causal
@@ -166,7 +171,7 @@ def adjust_recording(
     """
     try:
         task = SmoothingTask.of(rig, backend, config, least_noise)
-        return _smoothed(log, causal, task, report)
+        return _smoothed(log, causal, replace(task, joint=joint), report)
     except _UndeterminedError as reason:
         logger.info("no final bundle adjustment: %s", reason)
         return None
@@ -230,9 +235,15 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     for state in states:
         history.append(state)
     figures = [part.figures for part in solved]
-    aligned, motions = (solved[0].aligned, solved[0].motions) if len(solved) == 1 else (None, None)
+    alone = solved[0] if len(solved) == 1 else None
     summary = summary_of(figures, len(history), began)
-    return FinalBa(history, summary, aligned, solved[-1].noise, motions)
+    return FinalBa(
+        history,
+        summary,
+        None if alone is None else alone.aligned,
+        solved[-1].noise,
+        None if alone is None else alone.equations,
+    )
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:

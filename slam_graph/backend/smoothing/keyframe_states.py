@@ -20,7 +20,7 @@ _MAX_GAP_S = 1.0
 """States farther apart are not interpolated: the IMU predicts across the gap."""
 
 
-def _state_at(trajectory: Trajectory, row: int) -> NavState:
+def state_at(trajectory: Trajectory, row: int) -> NavState:
     """One row of a trajectory with velocities and biases."""
     assert trajectory.velocities is not None
     assert trajectory.gyro_biases is not None
@@ -68,7 +68,7 @@ def states_at(
     inside, valid = interpolate(known, stamps_ns, _MAX_GAP_S)
     rows = np.cumsum(valid) - 1
     states: dict[int, NavState] = {
-        k: _state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
+        k: state_at(inside, int(rows[k])) for k in np.flatnonzero(valid).tolist()
     }
     count, first = len(stamps_ns), int(np.argmax(valid))
     for k in range(first - 1, -1, -1):
@@ -200,7 +200,7 @@ def fill_in_by_motion(
         moved = first.between(last)
         error = gtsam.Pose3.Logmap(moved.between(start.world_T_body.between(end.world_T_body)))
         for i in between[1:-1]:
-            state = _state_at(known, int(rows[i]))
+            state = state_at(known, int(rows[i]))
             part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
             motion = first.between(state.world_T_body).compose(gtsam.Pose3.Expmap(part * error))
             pose = start.world_T_body.compose(motion)

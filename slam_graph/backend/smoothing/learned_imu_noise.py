@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.smoothing.recording_cost import (
     EliminatedFeatures,
     Estimates,
@@ -40,14 +41,50 @@ class Minimum:
     estimates: Estimates
 
 
-def states_at_minimum(
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageEquations:
+    """What images say of the poses at a minimum, features eliminated.
+
+    Attributes:
+        information: (n, n), see `EliminatedFeatures.poses`.
+        gradient: (K, 6) right-hand side.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EliminatedMinimum:
+    """The normal equations at a minimum, with a fixed gauge, and their factor.
+
+    Attributes:
+        images: one part of the equations; None where it is not kept, as it is large.
+        inertial: the other factors.
+        values: X(k), V(k) and B(k), where they are linearised.
+        states: the factor.
+    """
+
+    images: ImageEquations | None
+    inertial: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    states: EliminatedStates
+
+    def chain(self) -> ChainEquations:
+        """The equations of the other factors."""
+        keyframes = self.values.size() // 3
+        return ChainEquations.of(self.inertial.linearize(self.values), keyframes)
+
+
+def equations_at_minimum(
     found: Minimum,
     near: EliminatedStates | None,
     factors: RecordingFactors,
     learn: bool,
+    keep: bool,
     count_step: Callable[[], None],
-) -> EliminatedStates:
-    """The factor of the cost with its gauge fixed, which its covariances follow from.
+) -> EliminatedMinimum:
+    """The normal equations with a fixed gauge, which covariances follow from.
 
     After each estimate of the noise one Gauss-Newton step goes to the minimum under it. The states
     that are reported stay those of the given minimum. What images say of them hardly changes on the
@@ -59,6 +96,7 @@ def states_at_minimum(
             much of the residuals the images can contradict.
         factors: of the IMU; their noise becomes what was learned.
         learn: whether to estimate the noise of the IMU.
+        keep: whether to keep what images say.
         count_step: is called after each step.
 
     Raises:
@@ -87,7 +125,13 @@ def states_at_minimum(
             break
         inertial, estimates, states = changed, moved, known
         count_step()
-    return states or _eliminated(features, cost, factors, estimates)
+    states = states or _eliminated(features, cost, factors, estimates)
+    inertial = _with_gauge(inertial, factors, estimates)
+    images = None
+    if keep:
+        gradient = cost.images.linearized(estimates).gradient(cost.keyframes)
+        images = ImageEquations(features.poses, features.reduced(*gradient)[0])
+    return EliminatedMinimum(images, inertial, estimates.states, states)
 
 
 def _eliminated(

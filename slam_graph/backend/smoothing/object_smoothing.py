@@ -5,32 +5,33 @@
 In the frame of an object the platform moves (`relative_motion.py`), so its recording is one of
 cameras without an IMU, and the adjustment is that of every recording: poses of all frames, all of
 its points, and constant velocity of the object for the dynamics. The smoothed motion of the
-platform is given.
+platform is given at first; at last platform and objects take a step together (`joint_objects.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.objects.ego_motion import motion_samples
 from slam_graph.backend.objects.moving_objects import MovingObjects
 from slam_graph.backend.objects.object_history import ObjectHistory
-from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.object_state import ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
-from slam_graph.backend.objects.relative_motion import RelativeStep, object_settings
+from slam_graph.backend.objects.relative_motion import object_settings
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.joint_objects import joined
 from slam_graph.backend.smoothing.object_log import ObjectLog
+from slam_graph.backend.smoothing.smoothed_objects import smoothed_states
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
@@ -78,8 +79,8 @@ class ObjectSmoother:
 
     def smooth(
         self, objects: MovingObjects, rig: Rig, platform: FinalBa, config: FinalBaConfig
-    ) -> list[str]:
-        """Adjust every object as a whole.
+    ) -> tuple[FinalBa, list[str]]:
+        """Adjust every object as a whole, and then all of them together with the platform.
 
         Args:
             objects: as they were estimated on the way; they are given the smoothed ones.
@@ -88,20 +89,29 @@ class ObjectSmoother:
             config: settings of the adjustment.
 
         Returns:
-            What went wrong, for each object that is not smoothed for a reason.
+            The platform by what the objects say of it, too, and what went wrong, for each object
+            that is not smoothed for a reason.
         """
         if self._log is None:
-            return []
+            return platform, []
         task = _ObjectAdjustment(rig, platform, *self._settings, config)
         tracks, failures = self._log.tracks(), []
-        objects.smoothed = ObjectHistory(objects.classes)
+        found: dict[int, FinalBa] = {}
         for number in objects.numbers:
             frames = self._log.frames(tracks.get(number, np.zeros(0, np.int64)))
             try:
-                objects.smoothed.note(task.smoothed(objects.states(number), frames), ())
+                adjusted = task.adjusted(objects.states(number), frames)
             except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
                 failures.append(f"object {number} is not smoothed: {error}")
-        return failures
+                continue
+            if adjusted is not None:
+                found[number] = adjusted
+        platform, together = joined(platform, found)
+        objects.smoothed = ObjectHistory(objects.classes)
+        for number, item in together.items():
+            states = smoothed_states(objects.states(number), item, task.offset_ns)
+            objects.smoothed.note(states, ())
+        return platform, failures
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,20 +132,17 @@ class _ObjectAdjustment:
     objects: ObjectsConfig
     config: FinalBaConfig
 
-    def smoothed(
+    def adjusted(
         self, states: Sequence[ObjectState], frames: Iterable[FeatureFrame]
-    ) -> list[ObjectState]:
-        """States of an object from its first to its last one, by all of its observations.
+    ) -> FinalBa | None:
+        """The platform in the frame of an object, from its first to its last state.
 
         Args:
             states: as they were estimated on the way, in the order of time.
             frames: all observations of its tracks.
 
         Returns:
-            None of them if there are too few observations to improve on these. Covariances of poses
-            are relative to the first one, with that of the platform. Those of motions have that of
-            the platform's motion, as if independent; NaN where either was adjusted in several
-            segments. Velocities have none.
+            None if there are too few observations to improve on these.
 
         Raises:
             EstimationError: if no minimum fits the observations.
@@ -144,10 +151,9 @@ class _ObjectAdjustment:
             rig = self.rig.without_imu()
             with FrameLog.recording(rig, self.config, Path(folder), motion_known=True) as log:
                 self._record(log, (f for f in frames if f.stamp_ns >= states[0].stamp_ns))
-            found = self._adjusted(log, self._initial(states), rig)
-        return [] if found is None else self._states(found, states)
+            return self._minimum(log, self._initial(states), rig)
 
-    def _adjusted(self, log: FrameLog, initial: Trajectory, rig: Rig) -> FinalBa | None:
+    def _minimum(self, log: FrameLog, initial: Trajectory, rig: Rig) -> FinalBa | None:
         """The minimum under the noise of the object's acceleration that it shows itself.
 
         Raises:
@@ -159,7 +165,7 @@ class _ObjectAdjustment:
         for _ in range(_ROUNDS):
             backend = object_settings(self.backend, objects)
             found = adjust_recording(
-                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE
+                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE, joint=True
             )
             if found is None:
                 return None
@@ -174,7 +180,8 @@ class _ObjectAdjustment:
         return found
 
     @property
-    def _offset_ns(self) -> int:
+    def offset_ns(self) -> int:
+        """From stamps of frames to the clock of the poses."""
         return round(self.rig.pose_offset_s * 1e9)
 
     def _record(self, log: FrameLog, frames: Iterable[FeatureFrame]) -> None:
@@ -182,7 +189,7 @@ class _ObjectAdjustment:
         path = self.platform.trajectory
         before: NavState | None = None
         for frame in frames:
-            stamps_ns = np.array([frame.stamp_ns + self._offset_ns])
+            stamps_ns = np.array([frame.stamp_ns + self.offset_ns])
             there, valid = interpolate(path, stamps_ns)
             if not valid[0]:
                 continue
@@ -203,103 +210,9 @@ class _ObjectAdjustment:
             velocities = np.gradient(positions, (stamps_ns - stamps_ns[0]) * 1e-9, axis=0)
         history = StateHistory(level=False)
         for stamp_ns, pose, velocity in zip(stamps_ns.tolist(), poses, velocities, strict=True):
-            history.append(_state(stamp_ns + self._offset_ns, pose, velocity))
+            history.append(_state(stamp_ns + self.offset_ns, pose, velocity))
         return history.trajectory()
-
-    def _states(self, found: FinalBa, states: Sequence[ObjectState]) -> list[ObjectState]:
-        """Smoothed states at the times of those on the way."""
-        relative, platform = _Poses.of(found), _Poses.of(self.platform)
-        known = []
-        for state in states:
-            stamp_ns = state.stamp_ns + self._offset_ns
-            if stamp_ns in relative.rows and stamp_ns in platform.rows:
-                known.append(_placed(state, *platform.at(stamp_ns), *relative.at(stamp_ns)))
-        return _with_motions(known, relative, platform, self._offset_ns)
-
-
-@dataclass(frozen=True, eq=False)
-class _Poses:
-    """Poses (N) with covariances, and joint ones (N-1, 12, 12) of neighbours, by their times."""
-
-    rows: dict[int, int]
-    path: Trajectory
-    covariances: FloatArray
-    joint: FloatArray
-
-    @staticmethod
-    def of(found: FinalBa) -> _Poses:
-        path = found.trajectory
-        rows = {stamp_ns: row for row, stamp_ns in enumerate(path.stamps_ns.tolist())}
-        joint = np.full((max(len(path) - 1, 0), 12, 12), np.nan)
-        if found.motions is not None:
-            joint = found.motions.joint_covariances(
-                Rotation.from_quat(path.quaternions).as_matrix()
-            )
-        return _Poses(rows, path, found.history.pose_covariances(), joint)
-
-    def step(self, before_ns: int, now_ns: int) -> RelativeStep:
-        """Two poses; their covariance is NaN unless they are neighbours."""
-        before, now = self.rows[before_ns], self.rows[now_ns]
-        unknown = np.full((12, 12), np.nan)
-        joint = self.joint[before] if now == before + 1 else unknown
-        path = self.path
-        return RelativeStep(before_ns, now_ns, path.pose(before), path.pose(now), joint)
-
-    def at(self, stamp_ns: int) -> tuple[gtsam.Pose3, FloatArray]:
-        row = self.rows[stamp_ns]
-        return self.path.pose(row), self.covariances[row]
 
 
 def _state(stamp_ns: int, pose: gtsam.Pose3, velocity: FloatArray) -> NavState:
     return NavState(stamp_ns, pose, velocity, accel_bias=np.zeros(3), gyro_bias=np.zeros(3))
-
-
-def _placed(
-    state: ObjectState,
-    world_T_body: gtsam.Pose3,
-    world_covariance: FloatArray,
-    object_T_body: gtsam.Pose3,
-    object_covariance: FloatArray,
-) -> ObjectState:
-    """The state with the pose that two smoothed poses of the platform give."""
-    adjoint = object_T_body.AdjointMap()
-    return replace(
-        state,
-        world_T_object=world_T_body.compose(object_T_body.inverse()),
-        covariance=adjoint @ (world_covariance + object_covariance) @ adjoint.T,
-        world_T_body=world_T_body,
-    )
-
-
-def _with_motions(
-    states: Sequence[ObjectState], relative: _Poses, platform: _Poses, offset_ns: int
-) -> list[ObjectState]:
-    """States with the motions and velocities that their poses have.
-
-    Args:
-        states: smoothed, in the order of time.
-        relative: poses of the platform in the frame of the object.
-        platform: those in the world.
-        offset_ns: from stamps of frames to the clock of these poses.
-    """
-    if len(states) < 2:
-        return list(states)
-    result, unknown = [], np.full((3, 3), np.nan)
-    for k, state in enumerate(states):
-        before, after = states[max(k - 1, 0)], states[min(k + 1, len(states) - 1)]
-        step = None
-        if k and state.step is not None and before.stamp_ns == state.step.before_ns:
-            stamps = before.stamp_ns + offset_ns, state.stamp_ns + offset_ns
-            ego, covariance = platform.step(*stamps).body_motion()
-            step = ObjectMotion.of(relative.step(*stamps), gtsam.Pose3(), ego, covariance)
-            step = replace(step, before_ns=before.stamp_ns, now_ns=state.stamp_ns)
-        velocity = _velocity(before, after)
-        result.append(replace(state, step=step, velocity=velocity, velocity_covariance=unknown))
-    return result
-
-
-def _velocity(before: ObjectState, after: ObjectState) -> FloatArray:
-    """Mean velocity (3,) of the origin between two states, in the world."""
-    seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-    way = after.world_T_object.translation() - before.world_T_object.translation()
-    return np.asarray(way / seconds)

@@ -26,7 +26,6 @@ from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
-from slam_graph.backend.smoothing.frame_motions import FrameMotions
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import (
     fill_in,
@@ -34,7 +33,8 @@ from slam_graph.backend.smoothing.keyframe_states import (
     states_in,
     values_of,
 )
-from slam_graph.backend.smoothing.learned_imu_noise import Minimum, states_at_minimum
+from slam_graph.backend.smoothing.learned_imu_noise import Minimum, equations_at_minimum
+from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
     RecordingCost,
@@ -54,12 +54,7 @@ from slam_graph.backend.smoothing.recording_segment import (
     with_gtsam_cameras,
 )
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.backend.smoothing.state_covariances import (
-    FrameInterpolation,
-    KeyframeCovariances,
-    keyframe_covariances,
-    with_covariances,
-)
+from slam_graph.backend.smoothing.state_covariances import with_covariances
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.geometry import NavState, Trajectory
@@ -92,6 +87,7 @@ class SmoothingTask:
         config: settings of the bundle adjustment.
         causal: motion between keyframes where there is no IMU to predict it.
         least_noise: smallest factor on the noise of the IMU, or of the dynamics, that is learned.
+        joint: whether the equations at the minimum are kept, which others can be joined to.
     """
 
     rig: Rig
@@ -99,6 +95,7 @@ class SmoothingTask:
     config: FinalBaConfig
     causal: Trajectory | None = None
     least_noise: float = 1.0
+    joint: bool = False
 
     @classmethod
     def of(
@@ -144,14 +141,14 @@ class AdjustedSegment:
         figures: of the minimum.
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
         noise: factors on the noise of the IMU that the covariances were computed with.
-        motions: errors of the motions from frame to frame, or None.
+        equations: those at the minimum, if they are wanted and there are covariances.
     """
 
     states: list[NavState]
     figures: AdjustmentFigures
     aligned: FloatArray | None
     noise: ImuNoiseFactors
-    motions: FrameMotions | None
+    equations: PoseEquations | None
 
 
 class BundleAdjustment:
@@ -217,14 +214,15 @@ class BundleAdjustment:
             pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
         )
-        states, aligned, motions = self._states(self._segment.stamps_ns), None, None
-        known = self._covariances()
-        if known is not None:
-            densities = self._factors.densities()
-            frames = FrameInterpolation.of(self._segment.stamps_ns, keyframes, densities)
-            states, aligned = with_covariances(states, known, frames)
-            motions = FrameMotions(known, frames)
-        return AdjustedSegment(states, figures, aligned, self.imu_noise, motions)
+        states, aligned, equations = self._states(self._segment.stamps_ns), None, None
+        try:
+            equations = self._equations()
+            states, aligned = with_covariances(states, equations.covariances(), equations.frames)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
+            equations = None
+        kept = equations if self._task.joint else None
+        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.
@@ -361,23 +359,21 @@ class BundleAdjustment:
         points[~good] = self._minimum.estimates.points[~good]
         return self._minimum.cost.value(Estimates(self._given, points))
 
-    def _covariances(self) -> KeyframeCovariances | None:
-        """Covariances at the minimum; None if it does not determine all variables."""
-        segment = self._segment
-        nearest = nearest_keyframe(segment.stamps_ns, segment.keyframes)
-        weights = np.bincount(nearest, minlength=len(segment.keyframes)) / len(nearest)
-        try:
-            states = states_at_minimum(
-                self._minimum,
-                self._factor,
-                self._factors,
-                self._config.learn_imu_noise,
-                self._count_step,
-            )
-            return keyframe_covariances(states, self._values, weights, self._task.rig.has_imu)
-        except (RuntimeError, np.linalg.LinAlgError) as error:
-            logger.info("no covariances: %s", " ".join(str(error).split())[:200])
-            return None
+    def _equations(self) -> PoseEquations:
+        """The equations at the minimum.
+
+        Raises:
+            RuntimeError: if GTSAM cannot linearise a factor.
+            LinAlgError: if the minimum does not determine all variables.
+        """
+        found, config = (self._minimum, self._factor, self._factors), self._config
+        minimum = equations_at_minimum(
+            *found, config.learn_imu_noise, self._task.joint, self._count_step
+        )
+        densities, level = self._factors.densities(), self._task.rig.has_imu
+        stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes
+        features = self._minimum.cost.images.obs.ids
+        return PoseEquations.of(minimum, stamps_ns, keyframes, densities, level, features)
 
     def _note_motions(self) -> None:
         """Take the current velocities for the motion between the rows of rolling shutters."""

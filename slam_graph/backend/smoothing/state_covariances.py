@@ -198,7 +198,34 @@ def aligned_covariances(
     return _turned(rotations, P.transpose(0, 2, 1), transpose=True)
 
 
-def with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
+def bridge_variances(
+    frames: FrameInterpolation, before: IntArray, part: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (M, M) of what noise of the IMU adds to rotations and to positions, on each axis.
+
+    In an interval between keyframes it is a Brownian bridge for rotations and its integral for
+    positions; that of different intervals is independent.
+
+    Args:
+        frames: intervals and noise.
+        before: (M,) the last keyframe before each pose.
+        part: (M,) the part of the way to the next one.
+    """
+    same = before[:, None] == before
+    gyro, accel = (frames.densities[before] ** 2).T
+    T = frames.interval_s[before]
+    s, t = np.minimum(part[:, None], part), np.maximum(part[:, None], part)
+    # of white noise integrated once or twice, less the linear part of what it is at the end
+    twice = _double(s, t) - t * _double(s, 1.0) - s * _double(t, 1.0) + s * t / 3.0
+    return same * (gyro * T) * s * (1.0 - t), same * (accel * T**3) * twice
+
+
+def _double(s: FloatArray, t: FloatArray | float) -> FloatArray:
+    """Covariance of twice integrated white noise of unit density at the times s ≤ t."""
+    return np.asarray(s**2 * t / 2.0 - s**3 / 6.0)
+
+
+def _with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
     """The joint covariances (K-1, 30, 30) of neighbouring keyframes, with axes of the world."""
     T = np.zeros((len(known.rotations), _ERROR, _ERROR))
     T[:, _ROTATION, _ROTATION] = T[:, _POSITION, _POSITION] = known.rotations
@@ -212,7 +239,7 @@ def with_axes_of_the_world(known: KeyframeCovariances) -> FloatArray:
 
 def _in_world(known: KeyframeCovariances, frames: FrameInterpolation) -> FloatArray:
     """Covariances (N, 15, 15) of all frames, with axes of the world."""
-    a, pairs = frames.part[:, None, None], with_axes_of_the_world(known)[frames.before]
+    a, pairs = frames.part[:, None, None], _with_axes_of_the_world(known)[frames.before]
     first, second = slice(0, _ERROR), slice(_ERROR, 2 * _ERROR)
     cross = pairs[:, first, second]
     P = (1.0 - a) ** 2 * pairs[:, first, first] + a**2 * pairs[:, second, second]
