@@ -11,15 +11,18 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph import run
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.initialization.monocular_start import scale_direction
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import TwoViews, two_view_motion
 from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import dims_of
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
 from slam_graph.geometry import Similarity, Trajectory
@@ -189,6 +192,29 @@ def test_the_start_is_as_certain_as_it_says() -> None:
         squares.append(error @ np.linalg.solve(covariance, error) / len(error))
     # each is a mean of some hundred squares of 1, less one for the scale
     assert 0.8 < np.mean(squares) < 1.2, squares
+
+
+def test_images_do_not_change_when_the_world_is_scaled_about_the_path_of_the_camera() -> None:
+    arm, centre, rate = np.array([0.3, -0.2, 0.1]), np.array([0.5, 1.0, -2.0]), np.ones(3) * 0.7
+    values = gtsam.Values()
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.2, -0.4, 1.0])), np.array([1.0, 2.0, 3.0]))
+    values.insert(X(0), pose)
+    values.insert(V(0), np.array([0.3, -0.5, 0.2]))
+    values.insert(B(0), gtsam.imuBias.ConstantBias(np.zeros(3), -rate))
+    values.insert(L(0), np.array([4.0, -1.0, 2.0]))
+    layout = Layout(dims_of([L(0), X(0), V(0), B(0)]))
+    direction = scale_direction(values, layout, centre, arm)
+    step = 1e-3
+    moved = pose.retract(step * direction[layout.indices([X(0)])])
+    point = values.atPoint3(L(0)) + step * direction[layout.indices([L(0)])]
+    before = pose.transformTo(values.atPoint3(L(0))) - arm
+    np.testing.assert_allclose(moved.transformTo(point) - arm, (1.0 + step) * before)
+    turning = np.cross(rate, arm)
+    velocity = values.atVector(V(0)) + step * direction[layout.indices([V(0)])]
+    of_camera = pose.rotation().unrotate(values.atVector(V(0))) + turning
+    np.testing.assert_allclose(
+        moved.rotation().unrotate(velocity) + turning, (1.0 + step) * of_camera
+    )
 
 
 def test_a_camera_that_only_turns_waits_and_starts_when_it_moves() -> None:

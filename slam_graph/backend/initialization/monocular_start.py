@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, V, X
+from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.aiding.regauging import gauge_directions
@@ -39,8 +39,8 @@ from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGu
 from slam_graph.backend.initialization.segment_joint import moved
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import MIN_POINTS, TwoViews, two_view_motion
-from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
-from slam_graph.backend.solve.state import State, imu_state_keys
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import State, imu_state_keys, letter_and_index
 from slam_graph.backend.visual_motion import ERROR_PX
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
@@ -195,10 +195,11 @@ class ScaleFreeRefinement(DynamicRefinement):
     ) -> SquareRootInformation:
         """The prior with the last pose for known, and the scale (an S-transformation, Baarda)."""
         layout, values = prior.layout, state.first
-        centre = values.atPose3(X(last)).translation()
+        arm = self._context.rig.cameras[0].body_T_camera.translation()
+        centre = values.atPose3(X(last)).transformFrom(arm)
         free = np.zeros((layout.size + 1, 7))
         turns = gauge_directions(values, layout, centre, level=False)
-        scale = scale_direction(values, prior, centre)
+        scale = scale_direction(values, layout, centre, arm)
         free[:-1] = prior.R @ np.column_stack([turns, scale])
         rest = triangularize(np.hstack([free, prior.Rd]))[7:, 7:]
         fixed = np.zeros((7, layout.size + 1))
@@ -208,7 +209,7 @@ class ScaleFreeRefinement(DynamicRefinement):
             away = values.atPoint3(L(j)) - centre
             held[layout.indices([L(j)])] = away / np.linalg.norm(away) ** 3
         if not len(features):
-            held[layout.indices([V(last)])] = values.atVector(V(last))
+            held[layout.indices([V(last)])] = scale[layout.indices([V(last)])]
         fixed[6, :-1] = held / (held @ scale) / _SCALE_SIGMA
         fixed[:, -1] = fixed[:, :-1] @ state.offset(layout)
         return SquareRootInformation(layout, triangularize(np.vstack([rest, fixed])))
@@ -228,17 +229,29 @@ class ScaleFreeRefinement(DynamicRefinement):
 
 
 def scale_direction(
-    values: gtsam.Values, prior: SquareRootInformation, centre: FloatArray
+    values: gtsam.Values, layout: Layout, centre: FloatArray, arm: FloatArray
 ) -> FloatArray:
-    """Tangents (n,) of the variables of a prior when the world is scaled about a point (3,)."""
-    direction = np.zeros(prior.layout.size)
-    for key, columns in prior.layout.columns.items():
-        kind = chr(gtsam.Symbol(key).chr())
+    """Tangents (n,) of variables when the world is scaled about a point, as images allow it.
+
+    They see the camera, whose place in the body is in metres and is not scaled: so it is the path
+    of the camera that is scaled, and its velocity, and not those of the body.
+
+    Args:
+        values: of the variables, with the negative angular rate as the bias of a gyroscope.
+        layout: their columns.
+        centre: (3,) the point.
+        arm: (3,) position of the camera in the body.
+    """
+    direction = np.zeros(layout.size)
+    for key, columns in layout.columns.items():
+        kind, frame = letter_and_index(key)
         if kind == "x":
             pose = values.atPose3(key)
-            direction[columns][3:] = pose.rotation().unrotate(pose.translation() - centre)
+            direction[columns][3:] = pose.rotation().unrotate(pose.transformFrom(arm) - centre)
         elif kind == "v":
-            direction[columns] = values.atVector(key)
+            rate = -values.atConstantBias(B(frame)).gyroscope()
+            turning = values.atPose3(X(frame)).rotation().rotate(np.cross(rate, arm))
+            direction[columns] = values.atVector(key) + turning
         elif kind == "l":
             direction[columns] = values.atPoint3(key) - centre
     return direction
