@@ -80,6 +80,8 @@ def _tracked(packets: Iterator[Packet], rig: Rig, config: RunConfig) -> Iterator
 
 BENCHMARKS = {
     "starts_images": Benchmark(
-        "the same in rendered images along two flights with a real IMU", FLIGHTS, measure
+        "starts in rendered images along two flights with a real IMU: latency, errors, failures",
+        FLIGHTS,
+        measure,
     )
 }

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.smoothing import object_smoothing
+from slam_graph.backend.smoothing import joint_objects, object_smoothing
 from slam_graph.backend.smoothing.final_adjustment import FinalBa
 from slam_graph.backend.smoothing.joint_objects import JointObject, joined
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
@@ -247,3 +247,27 @@ def test_without_equations_all_stay_as_they_are(flight: Flight) -> None:
         joint = flight.together[number].covariance(found.trajectory.stamps_ns[1:3])
         np.testing.assert_allclose(np.diag(P)[3:6], np.diag(joint)[3:6], rtol=0.5)
         assert np.isnan(P[:6, 6:]).all()
+
+
+def test_an_object_without_equations_is_placed_by_the_joined_platform(flight: Flight) -> None:
+    number = next(iter(flight.apart))
+    mixed = flight.apart | {number: replace(flight.apart[number], equations=None)}
+    best, together = joined(flight.platform, mixed)
+    assert together[number].coupling is None
+    assert all(item.platform is best for item in together.values())
+
+
+def test_objects_that_contradict_the_platform_are_not_joined(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An object that is not at its minimum asks for a step that nothing it measures allows."""
+    found = joint_objects._Coupling.of
+
+    def wrong(platform: FinalBa, one: FinalBa) -> joint_objects._Coupling:
+        part = found(platform, one)
+        return replace(part, gradient=part.gradient + 1e6)
+
+    monkeypatch.setattr(joint_objects._Coupling, "of", staticmethod(wrong))
+    best, together = joined(flight.platform, flight.apart)
+    assert best is flight.platform
+    assert all(item.coupling is None for item in together.values())

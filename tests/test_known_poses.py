@@ -282,5 +282,6 @@ def test_known_poses_of_a_bag(tmp_path: Path, kind: str, known: bool) -> None:
     np.testing.assert_allclose(data.pose_quaternions, turns[kept])
     np.testing.assert_allclose(data.pose_sigmas, [SIGMAS if known else [0.05] * 6] * 3)
     assert sequence.diagnostics.counts["poses_dropped"] == 1
+    assert sequence.diagnostics.counts["pose_sigma_assumed"] == (not known)
     with pytest.raises(DataError, match=r"'/cam0.*' is of type .*; expected geometry_msgs"):
         _ = open_dataset(path, sources={"poses": "/cam0/image_raw"}).aiding

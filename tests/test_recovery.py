@@ -131,15 +131,31 @@ def test_another_velocity_is_not_taken_over(algorithm: str) -> None:
 
 @pytest.mark.parametrize("first_id", [0, 100])
 def test_corrections_of_the_velocity_count_where_tracks_are_broken(first_id: int) -> None:
-    """Ids begin at another number after 2 s, and corrections are too large; one was before."""
+    """Ids begin at another number after 2 s, and corrections are too large; one was before.
+
+    There are none from 1 to 1.75 s, as at a standstill.
+    """
     corrections, step_ns = Corrections(), 50_000_000
     with pytest.raises(DivergenceError) if first_id else nullcontext():
         for k in range(80):
             ids = np.arange(30) + (first_id if k >= 40 else 0)
             seen = FeatureObservations(ids, np.zeros((30, 2)), np.zeros((30, 2)))
             corrections.note(FeatureFrame(k * step_ns, (seen,)))
-            corrections.check(k * step_ns, 5.0 if k >= 40 else 20.0 * (k == 20))
-    assert (corrections.agreed_until() < 41 * step_ns) == (first_id > 0)
+            if not 20 < k < 35:
+                corrections.check(k * step_ns, 5.0 if k >= 40 else 20.0 * (k == 20))
+    agreed = corrections.agreed_until()
+    assert (agreed is not None and 35 * step_ns <= agreed < 41 * step_ns) == (first_id > 0)
+    assert (len(corrections) > 0) == (first_id > 0)
+
+
+def test_a_single_correction_after_a_pause_is_no_contradiction() -> None:
+    corrections, step_ns = Corrections(), 50_000_000
+    for k in (*range(20), 500):
+        ids = np.arange(30) + (100 if k == 500 else 0)
+        seen = FeatureObservations(ids, np.zeros((30, 2)), np.zeros((30, 2)))
+        corrections.note(FeatureFrame(k * step_ns, (seen,)))
+        corrections.check(k * step_ns, 50.0 if k == 500 else 0.5)
+    assert corrections.agreed_until() is None
 
 
 @pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])

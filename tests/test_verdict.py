@@ -16,7 +16,7 @@ from slam_graph.datasets import kalibr_text
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
-from slam_graph.diagnosis import Diagnosis
+from slam_graph.diagnosis import Diagnosis, run_evidence
 from slam_graph.pipeline import verdict
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import FeatureFrame
@@ -208,3 +208,18 @@ def test_a_failed_run_names_the_likeliest_cause() -> None:
     result = run(sequence, overrides=CAUSAL)
     assert result.status in ("not_initialized", "diverged", "low_coverage")
     assert "slam-graph doctor says: the camera is turned" in result.message
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_a_run_that_contradicts_itself_is_suspect(
+    monkeypatch: pytest.MonkeyPatch, with_imu: bool
+) -> None:
+    """The message says what shows, if the diagnosis finds nothing. Without an IMU nothing shows."""
+    monkeypatch.setattr(run_evidence, "MOST_SHIFT", 0.01)
+    monkeypatch.setattr(run_evidence, "USUAL_SHIFT", 0.01)
+    sequence = simulate(cameras=2, duration_s=6.0, rate_hz=10.0, seed=2, with_imu=with_imu)
+    result = run(sequence, algorithm="msckf")
+    assert result.status == ("suspect" if with_imu else "ok")
+    assert ("away from the causal one" in result.message) == with_imu
+    assert result.evidence is not None
+    assert (result.evidence["position_shift"] is not None) == with_imu

@@ -27,7 +27,7 @@ _ROTATION, _POSITION = slice(0, 3), slice(3, 6)
 """Columns of the standard deviations of a state."""
 
 USUAL_NOISE_AT_LIMIT, USUAL_SHIFT = 0.25, 2.5
-"""What good runs show at most: more is a reason to look at calibration and clocks."""
+"""What nearly all good runs stay below: more is a reason to look at calibration and clocks."""
 MOST_NOISE_AT_LIMIT, MOST_SHIFT = 0.5, 5.0
 """No good run comes near: more makes a run suspect."""
 
@@ -39,10 +39,12 @@ class Evidence:
     Attributes:
         nis: squared Mahalanobis distances of what passed the gate, over what is expected of them.
         nis_trend: the same of the second half over that of the first.
-        noise_at_limit: share of the frames in which a noise density of the IMU was at its limit.
+        noise_at_limit: share of the frames, since the estimator last began, in which a noise
+            density of the IMU was at its limit.
         smoothed_sigma: standard deviation of the smoothed position over that of the causal one.
-        position_shift: difference of the causal position from the smoothed one, in standard
-            deviations of the causal one; root mean square.
+        position_shift: difference of the causal position from the smoothed one, root mean square
+            over the run, in that of the standard deviations of the causal one. So it says nothing
+            where a part of the run is hardly known, as a segment that nothing joins.
         rotation_shift: the same of the rotation.
     """
 
@@ -88,7 +90,7 @@ class Evidence:
 
     @property
     def causes(self) -> list[str]:
-        """What is beyond its limit and the likeliest cause, in words; the likeliest first."""
+        """What is beyond its limit and the likeliest cause, in words."""
         causes = []
         if (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT:
             causes.append(

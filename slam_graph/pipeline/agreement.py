@@ -181,11 +181,11 @@ class Corrections:
         self._recent: deque[tuple[int, float]] = deque()
         self._ids: IntArray = np.zeros(0, np.int64)
         self._broken_ns: int | None = None
-        self._agreed_ns = 0
+        self._agreed_ns: int | None = None
 
     def __len__(self) -> int:
-        """How many corrections are kept."""
-        return len(self._recent)
+        """How many corrections contradict the state; none as long as it was not lost by them."""
+        return 0 if self._agreed_ns is None else len(self._recent)
 
     def note(self, frame: FeatureFrame) -> None:
         """Note whether the tracks of the frame before go on in this one."""
@@ -199,14 +199,17 @@ class Corrections:
     def check(self, stamp_ns: int, correction: float) -> None:
         """Add the correction of the next step, squared, in units of the variance.
 
+        After a pause, as at a standstill, earlier ones do not count.
+
         Raises:
             DivergenceError: if velocities were corrected by too much.
         """
         recent, begin_ns = self._recent, stamp_ns - round(_CORRECTED_S * 1e9)
+        if recent and recent[-1][0] < begin_ns:
+            recent.clear()
         recent.append((stamp_ns, correction))
         while len(recent) > _FEWEST_CORRECTIONS and recent[1][0] <= begin_ns:
             recent.popleft()
-        self._agreed_ns = stamp_ns
         if len(recent) < _FEWEST_CORRECTIONS or recent[0][0] > begin_ns:
             return
         mean = sum(square for _, square in recent) / len(recent)
@@ -219,8 +222,8 @@ class Corrections:
                 f"{_CORRECTED_S:g} s"
             )
 
-    def agreed_until(self) -> int:
-        """Time of the last step, or before those that corrected the velocity by too much."""
+    def agreed_until(self) -> int | None:
+        """Time of the first of the steps that corrected the velocity by too much; None without."""
         return self._agreed_ns
 
 

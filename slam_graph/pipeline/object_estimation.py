@@ -113,6 +113,8 @@ class Objects(NoObjects):
                 result.final_ba, failures = self._smoother.smooth(*task)
                 for failure in failures:
                     self._diagnostics.warn("object_not_smoothed", failure)
+            # they are large, and nothing else is joined to them
+            result.final_ba = replace(result.final_ba, equations=None)
         if self._labels is not None and self._labels.frames == 0:
             self._diagnostics.warn(
                 "masks_unused",

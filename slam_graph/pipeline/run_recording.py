@@ -106,8 +106,8 @@ def run(
     stages: list[Stage] = [  # in the order in which they finish
         Observers(progress, recorder or NullRecorder()),
         *([Smoothing(result, progress, diagnostics)] if smoothed else []),
+        objects,  # it moves the smoothed trajectory, too
         *places,
-        objects,
         Verdict(result, diagnostics, objects),
         GraphKeeping(result, estimator, graph_times, diagnostics),
         *([] if so_far is None else [Snapshots(result, Path(so_far), diagnostics)]),

@@ -139,6 +139,8 @@ class Verdict(Stage):
                 wrong.
         """
         stamp_ns = frame.features.stamp_ns
+        if frame.restarted:
+            self._estimated = self._at_limit = 0
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -159,8 +161,10 @@ class Verdict(Stage):
         failed = status in _FAILED
         if not len(self._kept) or not (failed or status in COMPLETED):
             return
-        with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
+        unusual, contradictions = False, list[str]()
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "evidence is left out"):
             unusual, contradictions = self._contradictions()
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
             if failed or unusual or self._is_doubtful():
                 self._judge(failed, contradictions)
 
@@ -234,7 +238,7 @@ class Verdict(Stage):
             ending.message += f"; slam-graph doctor says: {guess}"
         elif found.setup_faults and not failed:
             likely = "; or ".join(finding.what for finding in found.setup_faults[:2])
-            self._suspect(likely)
+            self._suspect(f"{likely}; see `slam-graph doctor`")
         elif contradictions and not failed:
             self._suspect("; and ".join(contradictions))
         else:
@@ -242,11 +246,11 @@ class Verdict(Stage):
         ending.error = EstimationError(ending.message)
         logger.error("%s", ending.message)
 
-    def _suspect(self, likely: str) -> None:
+    def _suspect(self, why: str) -> None:
         """Say that the estimate may be wrong, and why."""
         ending = self._result.ending
         ending.status = "suspect"
-        ending.message = f"the estimate may be wrong: {likely}; see `slam-graph doctor`"
+        ending.message = f"the estimate may be wrong: {why}"
 
     def _diagnosed(self, rig: Rig) -> Diagnosis:
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import

@@ -121,7 +121,8 @@ class FinalBa:
             )
             try:
                 chosen = causal.select(inside)
-                found = adjust_recording(part, chosen, rig, backend, config, report, joint=joint)
+                known = joint and len(worlds) == 1
+                found = adjust_recording(part, chosen, rig, backend, config, report, joint=known)
             except EstimationError as error:
                 if len(worlds) == 1:
                     raise
@@ -160,7 +161,8 @@ def adjust_recording(
         report: is given the progress after each step.
         least_noise: smallest factor on the noise of the IMU that is learned for covariances; one if
             the noise was calibrated.
-        joint: whether the equations at the minimum are kept, which others can be joined to.
+        joint: whether the equations at the minimum are kept, which others can be joined to; not of
+            a recording of several segments.
 
     Returns:
         The smoothed trajectory; None if there are too few observations to improve on the causal
@@ -190,7 +192,9 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         if len(keyframes) < _MIN_KEYFRAMES:
             raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     else:
-        causal = _extended_backward(log, causal, task, report)
+        causal = _extended_backward(log, causal, replace(task, joint=False), report)
+    if len(keyframes) > longest:
+        task = replace(task, joint=False)
     level = task.rig.has_imu
     history = StateHistory(level, task.rig.has_scale)
     states: list[NavState] = []  # of the last segment, from its anchor on

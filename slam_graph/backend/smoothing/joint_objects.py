@@ -19,7 +19,9 @@ object. With the covariance P of all of its variables, and g' their gradient, it
 
 on e, and δ = -P S T e. That is added to the equations of the platform (`pose_equations.py`), and
 one Gauss-Newton step of the joint problem and its covariances follow. It is exact to first order,
-but for what an object turns within one interval, where the velocity of the platform is concerned.
+but for what an object turns within one interval, where the velocity of the platform is concerned,
+and for what the noise of the IMU adds to e between two keyframes of the platform. Tracks that the
+platform has fused count under one of their numbers.
 """
 
 from __future__ import annotations
@@ -40,11 +42,11 @@ from slam_graph.backend.smoothing.keyframe_states import state_at
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.state_covariances import with_covariances
 from slam_graph.backend.smoothing.state_elimination import STATE
+from slam_graph.backend.solve.state import POSE_DIM
 from slam_graph.geometry import NavState, Trajectory, interpolate
 
 logger = logging.getLogger(__name__)
 
-_POSE = 6
 _MOST_SHARED = 0.1
 """An object that has a larger share of its tracks in common with the platform, which held them for
 static, says nothing new of it: their errors would count twice."""
@@ -63,37 +65,48 @@ def joined(
         Platform and objects after the joint step. Those whose equations are not known, or all if
         the step cannot be taken, stay as they are.
     """
-    found = {number: JointObject(platform, relative) for number, relative in objects.items()}
     known = {number: item for number, item in objects.items() if item.equations is not None}
-    if platform.equations is None or not known:
-        return platform, found
-    try:
-        platform, together = _step(platform, list(known.values()))
-    except (RuntimeError, np.linalg.LinAlgError) as error:
-        logger.info("objects are not joined to the platform: %s", error)
-        return platform, found
-    return platform, found | dict(zip(known, together, strict=True))
+    together: list[JointObject] = []
+    if platform.equations is not None and known:
+        try:
+            platform, together = _step(platform, list(known.values()))
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            logger.info("objects are not joined to the platform: %s", error)
+    apart = {number: JointObject(platform, relative) for number, relative in objects.items()}
+    return platform, apart | dict(zip(known, together, strict=False))
 
 
 def _step(platform: FinalBa, objects: Sequence[FinalBa]) -> tuple[FinalBa, list[JointObject]]:
-    """Platform and objects, with equations, after a Gauss-Newton step."""
+    """Platform and objects, with equations, after a Gauss-Newton step.
+
+    Raises:
+        RuntimeError: if the objects contradict the platform: they ask for a cost that is smaller by
+            more than the number of motions that they measure.
+    """
     parts = [_Coupling.of(platform, found) for found in objects]
     equations = platform.equations
     assert equations is not None
-    size = _POSE * len(equations.keyframes)
+    size = POSE_DIM * len(equations.keyframes)
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for part in parts:
         information += part.rows.T @ (part.rows.T @ part.information).T
         gradient += part.rows.T @ part.gradient
     equations = equations.with_information(information)
     step = equations.step(gradient)
+    decrease = float(step[:, :POSE_DIM].ravel() @ gradient)
+    measured = sum(part.rows.shape[0] for part in parts)
+    if not decrease <= measured:  # NaN is not either
+        raise RuntimeError(f"they ask for a step of {decrease:.3g} instead of at most {measured}")
     best = _moved(platform, equations, step, known=True)
     moved = []
     for found, part in zip(objects, parts, strict=True):
         assert found.equations is not None
         own = np.zeros((len(found.equations.keyframes), STATE))
-        own[:, :_POSE] = (part.gain @ (part.rows @ step[:, :_POSE].ravel())).reshape(-1, _POSE)
-        moved.append(JointObject(best, _moved(found, found.equations, own, known=False), part))
+        own[:, :POSE_DIM] = (part.gain @ (part.rows @ step[:, :POSE_DIM].ravel())).reshape(
+            -1, POSE_DIM
+        )
+        relative = _moved(found, found.equations.without_images(), own, known=False)
+        moved.append(JointObject(best, relative, part))
     return best, moved
 
 
@@ -104,8 +117,8 @@ class JointObject:
     Attributes:
         platform: the adjustment of the platform.
         relative: that of the platform in the frame of the object.
-        coupling: what joins them; None where either was adjusted in several segments, so that
-            nothing is known of both.
+        coupling: what joins them; None where either was adjusted in several segments, or the joint
+            step could not be taken, so that nothing is known of both.
     """
 
     platform: FinalBa
@@ -142,13 +155,13 @@ class JointObject:
         return np.asarray(0.5 * (P + P.T))
 
     def _apart(self, stamps_ns: IntArray) -> FloatArray:
-        P = np.full((_POSE * len(stamps_ns),) * 2, np.nan)
+        P = np.full((POSE_DIM * len(stamps_ns),) * 2, np.nan)
         path, own, world = self.relative.trajectory, self.relative.history, self.platform
         rows = np.searchsorted(path.stamps_ns, stamps_ns)
         of_world = np.searchsorted(world.trajectory.stamps_ns, stamps_ns)
         covariances = own.pose_covariances()[rows] + world.history.pose_covariances()[of_world]
         for k, (row, covariance) in enumerate(zip(rows, covariances, strict=True)):
-            adjoint, at = path.pose(row).AdjointMap(), slice(_POSE * k, _POSE * (k + 1))
+            adjoint, at = path.pose(row).AdjointMap(), slice(POSE_DIM * k, POSE_DIM * (k + 1))
             P[at, at] = adjoint @ covariance @ adjoint.T
         return P
 
@@ -161,7 +174,7 @@ class _Coupling:
         rows: (6 I, 6 K) errors of the motions of the platform between keyframes of the object, by
             those of its own keyframes.
         information: (6 I, 6 I) on these motions.
-        gradient: (6 I,).
+        gradient: (6 I,) where the object alone is at its minimum.
         gain: (6 L, 6 I) what they add to the errors of the L poses in the object's frame.
     """
 
@@ -183,11 +196,11 @@ class _Coupling:
         S, gradient = own.images()
         ST = S @ T
         answer = own.times_covariance(ST)
-        left = gradient - S @ own.rest()[:, :_POSE].ravel()
+        left = gradient - S @ own.rest()[:, :POSE_DIM].ravel()
         information = T.T @ ST - ST.T @ answer
         rows = _motion_rows(X) @ world.error_rows(stamps_ns, _rotations(X))
-        shared = float(np.isin(own.features, world.features).mean())
-        new = 0.0 if shared > _MOST_SHARED else 1.0
+        shared = np.count_nonzero(np.isin(own.features, world.features))
+        new = 0.0 if shared > _MOST_SHARED * len(own.features) else 1.0
         symmetric = 0.5 * new * (information + information.T)
         return _Coupling(rows, symmetric, new * (T.T @ left), T - answer)
 
@@ -209,12 +222,12 @@ def _carried(X: Trajectory, Y: Trajectory) -> FloatArray:
     own = np.einsum("nji,nj->ni", _rotations(X), X.velocities)
     own -= np.einsum("nji,nj->ni", R, Y.velocities)
     turned = -R @ np.cross(np.eye(3), own[:, None])
-    T = np.zeros((len(Y), _POSE, len(Y), _POSE))
+    T = np.zeros((len(Y), POSE_DIM, len(Y), POSE_DIM))
     for k in range(1, len(Y)):
         T[k:, :, k] = back[k:] @ forth[k]
         seconds = (at[k:] - at[k])[:, None, None]
         T[k:, 3:, k, :3] += seconds * (R[k:].transpose(0, 2, 1) @ turned[k])
-    return T.reshape(_POSE * len(Y), -1)[:, _POSE:]
+    return T.reshape(POSE_DIM * len(Y), -1)[:, POSE_DIM:]
 
 
 def _motion_rows(path: Trajectory) -> sparse.csr_array:
@@ -223,11 +236,11 @@ def _motion_rows(path: Trajectory) -> sparse.csr_array:
     blocks = [
         block
         for before, now in pairwise(poses)
-        for block in (-now.between(before).AdjointMap(), np.eye(_POSE))
+        for block in (-now.between(before).AdjointMap(), np.eye(POSE_DIM))
     ]
     columns = np.repeat(np.arange(len(poses) - 1), 2) + np.tile([0, 1], len(poses) - 1)
     starts = np.arange(0, len(blocks) + 1, 2)
-    shape = (_POSE * (len(poses) - 1), _POSE * len(poses))
+    shape = (POSE_DIM * (len(poses) - 1), POSE_DIM * len(poses))
     return sparse.bsr_array((np.array(blocks), columns, starts), shape=shape).tocsr()
 
 

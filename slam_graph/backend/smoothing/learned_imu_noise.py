@@ -61,7 +61,8 @@ class EliminatedMinimum:
     Attributes:
         images: one part of the equations; None where it is not kept, as it is large.
         inertial: the other factors.
-        values: X(k), V(k) and B(k), where they are linearised.
+        values: X(k), V(k) and B(k) at the minimum. The parts are linearised within the last step of
+            it, and agree to first order.
         states: the factor.
     """
 

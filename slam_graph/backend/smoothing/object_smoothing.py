@@ -107,10 +107,15 @@ class ObjectSmoother:
             if adjusted is not None:
                 found[number] = adjusted
         platform, together = joined(platform, found)
-        objects.smoothed = ObjectHistory(objects.classes)
+        smoothed = ObjectHistory(objects.classes)
         for number, item in together.items():
-            states = smoothed_states(objects.states(number), item, task.offset_ns)
-            objects.smoothed.note(states, ())
+            try:
+                states = smoothed_states(objects.states(number), item, task.offset_ns)
+            except (RuntimeError, np.linalg.LinAlgError) as error:
+                failures.append(f"object {number} is not smoothed: {error}")
+                continue
+            smoothed.note(states, ())
+        objects.smoothed = smoothed
         return platform, failures
 
 
@@ -162,10 +167,11 @@ class _ObjectAdjustment:
         found, objects = None, self.objects
         # tracks of points at another time of the way may be of the other side of the object
         config = self.config.model_copy(update={"fuse_features": False})
+        joint = self.platform.equations is not None
         for _ in range(_ROUNDS):
             backend = object_settings(self.backend, objects)
             found = adjust_recording(
-                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE, joint=True
+                log, initial, rig, backend, config, lambda *_: None, _LEAST_NOISE, joint
             )
             if found is None:
                 return None

@@ -26,8 +26,7 @@ from slam_graph.backend.smoothing.state_covariances import (
 )
 from slam_graph.backend.smoothing.state_elimination import STATE, EliminatedStates
 from slam_graph.backend.solve.stacked_values import stacked_poses
-
-_POSE = 6
+from slam_graph.backend.solve.state import POSE_DIM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +86,10 @@ class PoseEquations:
         states = EliminatedStates(information.copy(), minimum.chain())
         return replace(self, minimum=replace(minimum, images=images, states=states))
 
+    def without_images(self) -> PoseEquations:
+        """The same for covariances alone; the information of the images is large."""
+        return replace(self, minimum=replace(self.minimum, images=None))
+
     def images(self) -> tuple[FloatArray, FloatArray]:
         """What images say of the poses: information (6 K, 6 K) and gradient (6 K,)."""
         known = self.minimum.images
@@ -98,14 +101,14 @@ class PoseEquations:
     def step(self, by_pose: FloatArray) -> FloatArray:
         """What the states (K, 15) move by for a gradient (6 K,) on the poses."""
         right = np.zeros((len(self.keyframes), STATE, 1))
-        right[:, :_POSE, 0] = by_pose.reshape(-1, _POSE)
+        right[:, :POSE_DIM, 0] = by_pose.reshape(-1, POSE_DIM)
         return self.states.times_covariance(right)[:, :, 0]
 
     def rest(self) -> FloatArray:
         """What the states (K, 15) would move by in one more step without anything added."""
         assert self.minimum.images is not None
         gradient = self.minimum.chain().gradient
-        gradient[:, :_POSE] += self.minimum.images.gradient
+        gradient[:, :POSE_DIM] += self.minimum.images.gradient
         return self.states.times_covariance(gradient[:, :, None])[:, :, 0]
 
     def covariances(self) -> KeyframeCovariances:
@@ -127,7 +130,7 @@ class PoseEquations:
         blocks = np.stack([first, second, first, second], axis=1).reshape(-1, 3, 3)
         columns = 2 * before[:, None] + [0, 2, 1, 3]
         starts = np.arange(0, 4 * len(before) + 1, 2)
-        shape = (_POSE * len(before), _POSE * len(self.keyframes))
+        shape = (POSE_DIM * len(before), POSE_DIM * len(self.keyframes))
         return sparse.bsr_array((blocks, columns.ravel(), starts), shape=shape).tocsr()
 
     def noise_between(self, stamps_ns: IntArray, rotations: FloatArray) -> FloatArray:
@@ -139,17 +142,17 @@ class PoseEquations:
         """
         count = len(stamps_ns)
         turns = np.einsum("iba,jbc->ijac", rotations, rotations)
-        N = np.zeros((count, _POSE, count, _POSE))
+        N = np.zeros((count, POSE_DIM, count, POSE_DIM))
         variances = bridge_variances(self.frames, *self._places(stamps_ns))
         for rows, variance in zip((slice(0, 3), slice(3, 6)), variances, strict=True):
             N[:, rows, :, rows] = (variance[:, :, None, None] * turns).transpose(0, 2, 1, 3)
-        return N.reshape(_POSE * count, -1)
+        return N.reshape(POSE_DIM * count, -1)
 
     def times_covariance(self, columns: FloatArray) -> FloatArray:
         """The product (6 K, m) of the covariance of all poses with a matrix (6 K, m)."""
         right = np.zeros((len(self.keyframes), STATE, columns.shape[1]))
-        right[:, :_POSE] = columns.reshape(-1, _POSE, columns.shape[1])
-        return self.states.times_covariance(right)[:, :_POSE].reshape(columns.shape)
+        right[:, :POSE_DIM] = columns.reshape(-1, POSE_DIM, columns.shape[1])
+        return self.states.times_covariance(right)[:, :POSE_DIM].reshape(columns.shape)
 
     def _places(self, stamps_ns: IntArray) -> tuple[IntArray, FloatArray]:
         """Last keyframe (M,) before each time, and the part (M,) of the way to the next one."""

@@ -97,16 +97,18 @@ def inertial_of(message: Any) -> list[float]:
     return [rate.x, rate.y, rate.z, force.x, force.y, force.z]
 
 
-def pose_sigmas_of(message: Any) -> FloatArray | None:
+def pose_sigmas_of(message: Any) -> FloatArray:
     """(6,) standard deviations of a pose, m along and rad about the axes of its frame.
 
-    None where its type has no covariance, or none was set: no variance, or a negative one.
+    NaN where none was set: in messages of types without a covariance, and in three numbers (of the
+    position, or of the orientation) one of which is not positive.
     """
     matrix = getattr(getattr(message, "pose", None), "covariance", None)
     if matrix is None:
-        return None
-    variances = np.asarray(matrix, np.float64).reshape(6, 6).diagonal()
-    return np.sqrt(variances) if (variances > 0.0).all() else None
+        return np.full(6, np.nan)
+    variances = np.asarray(matrix, np.float64).reshape(6, 6).diagonal().reshape(2, 3)
+    known = (variances > 0.0).all(axis=1, keepdims=True)
+    return np.sqrt(np.where(known, variances, np.nan)).ravel()
 
 
 def pose_of(message: Any, msgtype: str) -> list[float]:

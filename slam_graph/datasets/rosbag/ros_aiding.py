@@ -33,7 +33,8 @@ _SMALLEST_RATIO = 1e-12
 _SHORTEST_QUATERNION = 0.5
 """Quaternions that are shorter were never set."""
 _POSE_SIGMAS = np.array([0.05] * 3 + [0.05] * 3)
-"""Of known poses (m and rad) where a message has none."""
+"""Of known poses (m and rad) where a message has none: those of a hand-measured tag, say."""
+_ASSUMED = "poses without a covariance are taken as known to 0.05 m and 0.05 rad"
 _TYPES = {"gnss": (NAV_SAT_FIX,), "odometry": (ODOMETRY,), "poses": tuple(POSES)}
 """Of the messages of each sensor."""
 
@@ -133,14 +134,18 @@ class BagAiding:
             stamps.append(stamp_ns(message))
             found = _decoded(message)
             rows.append([np.nan] * 7 if found is None else pose_of(found, kind))
-            known = None if found is None else pose_sigmas_of(found)
-            sigmas.append(_POSE_SIGMAS if known is None else known)
-        poses = np.array(rows).reshape(-1, 7)
+            sigmas.append(np.full(6, np.nan) if found is None else pose_sigmas_of(found))
+        if not stamps:
+            raise DataError(f"{self._bag.path}: no poses on '{self._topics['poses']}'")
+        poses, known = np.array(rows), np.array(sigmas)
+        assumed = np.isnan(known)
+        if assumed.any():
+            self._diagnostics.warn("pose_sigma_assumed", f"{self._bag.path}: {_ASSUMED}")
         known_poses = known_poses_from(
             np.array(stamps, np.int64),
             poses[:, :3],
             poses[:, 3:],
-            np.array(sigmas).reshape(-1, 6),
+            np.where(assumed, _POSE_SIGMAS, known),
             f"{self._bag.path}: pose",
             self._diagnostics,
         )
