@@ -53,12 +53,12 @@ class SquareRootEngine:
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):
             constructed, minimum = self._minimize(window, constructed)
+            context.calibration.renew_motions(window.state, constructed.cost.state)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
-        context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
         context.propagation.learn(state)
         context.pixels.learn(constructed.cost, constructed.offered, stamp_ns)
