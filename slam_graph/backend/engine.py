@@ -53,7 +53,6 @@ class SquareRootEngine:
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):
             constructed, minimum = self._minimize(window, constructed)
-            context.calibration.renew_motions(window.state, constructed.cost.state)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
         with report.timed("marginalization"):

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, E, K, T, V, X
+from gtsam.symbol_shorthand import E, K, T
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import CalibrationConfig
@@ -34,7 +34,7 @@ from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, Rig
 MAX_EARLY_NS = 50_000_000
 """A frame may be taken this much too early where the IMU has no samples yet."""
 
-_GRAVITY = np.array([0.0, 0.0, -9.81])
+GRAVITY = np.array([0.0, 0.0, -9.81])
 """m/s², in the world; over a readout its last digits do not count."""
 
 _SHORTEST_SPAN_S = 0.02
@@ -283,38 +283,6 @@ class CalibrationVariables:
             lead_ns = round(state.motions[frame].time_offset_s * 1e9)
             self.note_motion(state, frame, stamp_ns, stamp_ns - lead_ns, imu)
 
-    def renew_motions(self, before: State, after: State) -> None:
-        """Let the motions of all frames follow the estimates of a step; for rolling shutters only.
-
-        Where the velocity of a frame is a variable no longer, it follows from the poses of the
-        frame and of the next one in the state: what their relative position changes by, over the
-        time between them, the velocity does.
-
-        Args:
-            before: estimates that the motions are those of.
-            after: the same frames after a step; its motions are renewed.
-        """
-        if not self.rolling:
-            return
-        frames = sorted(after.motions)
-        for i, following in zip(frames, [*frames[1:], None], strict=True):
-            motion = after.motions[i]
-            then, now = before.frames.atPose3(X(i)), after.frames.atPose3(X(i))
-            gravity = now.rotation().unrotate(_GRAVITY) - then.rotation().unrotate(_GRAVITY)
-            rate, change = motion.rate.copy(), motion.change.copy()
-            change[3:] += gravity
-            if after.frames.exists(V(i)):
-                was, bias = (s.frames.atConstantBias(B(i)) for s in (before, after))
-                rate[:3] += was.gyroscope() - bias.gyroscope()
-                change[3:] += was.accelerometer() - bias.accelerometer()
-                rate[3:] = now.rotation().unrotate(after.frames.atVector(V(i)))
-            elif following is not None:
-                dt = (after.motions[following].stamp_ns - motion.stamp_ns) * 1e-9
-                moved = now.transformTo(after.frames.atPose3(X(following)).translation())
-                moved -= then.transformTo(before.frames.atPose3(X(following)).translation())
-                rate[3:] += moved / dt - 0.5 * dt * gravity
-            after.motions[i] = replace(motion, rate=rate, change=change)
-
 
 def rolling_motion(now: NavState, frame_ns: int, imu: ImuBuffer, rig: Rig) -> FrameMotion:
     """How the body moves while the rows of a frame are exposed, by its state and the IMU.
@@ -330,7 +298,7 @@ def rolling_motion(now: NavState, frame_ns: int, imu: ImuBuffer, rig: Rig) -> Fr
     velocity = body_R_world.rotate(now.velocity)
     acceleration = force - now.accel_bias
     if rig.has_imu:
-        acceleration = acceleration + body_R_world.rotate(_GRAVITY)
+        acceleration = acceleration + body_R_world.rotate(GRAVITY)
     return FrameMotion(
         np.concatenate([gyro - now.gyro_bias, velocity]),
         (now.stamp_ns - frame_ns) * 1e-9,
