@@ -58,7 +58,6 @@ class SquareRootEngine:
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
-        context.calibration.refine_motion(window.state, window.frame, stamp_ns, context.imu)
         state = window.current(minimum.posterior)
         report.correction = context.propagation.learn(state)
         context.pixels.learn(constructed.cost, constructed.offered, stamp_ns)

@@ -34,7 +34,7 @@ from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, Rig
 MAX_EARLY_NS = 50_000_000
 """A frame may be taken this much too early where the IMU has no samples yet."""
 
-_GRAVITY = np.array([0.0, 0.0, -9.81])
+GRAVITY = np.array([0.0, 0.0, -9.81])
 """m/s², in the world; over a readout its last digits do not count."""
 
 _SHORTEST_SPAN_S = 0.02
@@ -298,11 +298,12 @@ def rolling_motion(now: NavState, frame_ns: int, imu: ImuBuffer, rig: Rig) -> Fr
     velocity = body_R_world.rotate(now.velocity)
     acceleration = force - now.accel_bias
     if rig.has_imu:
-        acceleration = acceleration + body_R_world.rotate(_GRAVITY)
+        acceleration = acceleration + body_R_world.rotate(GRAVITY)
     return FrameMotion(
         np.concatenate([gyro - now.gyro_bias, velocity]),
         (now.stamp_ns - frame_ns) * 1e-9,
         np.concatenate([slope, acceleration]),
+        now.stamp_ns,
     )
 
 

@@ -12,12 +12,12 @@ loss as used.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.cost import Cost
@@ -148,7 +148,7 @@ class _Projections:
         for row in range(len(obs)):
             single = obs.rows(np.array([row]))
             model = self._models[int(single.camera[0])]
-            own = model is None or bool(self._rig.calibration_keys)
+            own = model is None or bool(self._common_keys(single))
             noise = pixel_noise(float(self._cost.sigmas(single)[0]), self._cost.robust)
             make = self._python(single, noise) if own else self._native(single, noise, model)
             graph.push_back(make)
@@ -165,9 +165,15 @@ class _Projections:
         return factor
 
     def _python(self, single: Observations, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
-        keys = [*_keys(single), *self._rig.calibration_keys]
+        keys = [*_keys(single), *self._common_keys(single)]
         error = _projection_error(single, self._rig, keys, self._motions)
         return gtsam.CustomFactor(noise, keys, error)
+
+    def _common_keys(self, single: Observations) -> list[int]:
+        """Keys of the calibration, and of the velocity of the frame if that is a variable."""
+        frame = single.frames[int(single.frame[0])]
+        own = [V(frame)] if frame in self._rig.velocities.first else []
+        return [*self._rig.calibration_keys, *own]
 
 
 def _keys(single: Observations) -> tuple[int, int]:
@@ -178,7 +184,7 @@ def _keys(single: Observations) -> tuple[int, int]:
 def _projection_error(
     single: Observations, rig: RigProjection, keys: list[int], motions: dict[int, FrameMotion]
 ) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[FloatArray] | None], FloatArray]:
-    """π - z of one observation as a function of pose, feature and calibration, with Jacobians."""
+    """π - z of one observation as a function of pose, feature and the rest, with Jacobians."""
     frame = single.frames[int(single.frame[0])]
     one = Observations(
         single.ids[single.feature],
@@ -207,6 +213,11 @@ def _projection_error(
             for number, dim in enumerate(dims, start=2):
                 H[number] = np.asfortranarray(by_calibration[0][:, column : column + dim])
                 column += dim
+        if V(frame) in keys:  # as in the engine, only residuals follow the velocity
+            velocity = values.atPose3(keys[0]).rotation().unrotate(values.atVector(V(frame)))
+            rate = np.concatenate([motions[frame].rate[:3], velocity])
+            state.motions = {frame: replace(motions[frame], rate=rate)}
+            now = rig.at(state)
         return np.asarray(-now.residuals(one, geometry)[0][0], dtype=np.float64)
 
     return error

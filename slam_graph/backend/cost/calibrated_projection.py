@@ -76,7 +76,8 @@ class CalibratedProjection(RigProjection):
 
     def at(self, state: State) -> CalibratedProjection:
         """The projection with the calibration of a state, and the motions of its frames."""
-        return CalibratedProjection(self.variables, state)
+        now = CalibratedProjection(self.variables, state)
+        return now.with_velocities(state, self.velocities.first)
 
     def moving(self, motions: Mapping[int, FrameMotion]) -> RigProjection:
         """The projection with the calibration as it is now, and the motions of frames."""
@@ -105,7 +106,7 @@ class CalibratedProjection(RigProjection):
     def all_jacobians(
         self, obs: Observations, at: Geometry
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and calibration (N, 2, C).
+        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and common variables (N, 2, C).
 
         Args:
             obs: N observations.
@@ -139,7 +140,8 @@ class CalibratedProjection(RigProjection):
             by_offset = np.einsum("nij,nj->ni", by_pose, shift.rate[obs.frame])
             by_calibration[:, :, self._columns[T(0)].start] = by_offset
             by_pose = by_pose @ shift.by_pose()[obs.frame]
-        return by_pose, by_point, by_calibration
+        by_pose, by_velocity = self.by_velocities(obs, at, by_pose)
+        return by_pose, by_point, np.concatenate([by_calibration, by_velocity], axis=2)
 
     def _by_time(
         self, obs: Observations, by_camera_point: FloatArray, in_camera: FloatArray

@@ -181,7 +181,8 @@ class CostConstruction:
     def _prior_and_dynamics(self, window: Window) -> Cost:
         """The cost without images."""
         state, factors = window.state.copy(), list(window.factors)
-        cost = Cost(state, self.rig, self.config, window.prior, factors, loss=self._loss)
+        rig = self.rig.with_velocities(state, state.motions)
+        cost = Cost(state, rig, self.config, window.prior, factors, loss=self._loss)
         cost.sigma_px = self.pixels.sigma_px
         return cost
 

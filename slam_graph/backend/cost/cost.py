@@ -296,15 +296,17 @@ class Cost:
         In metres one with little parallax would jump, and stop a step that is good for all others.
         One that becomes a variable goes where the increment says: there its rows are linearised.
         """
-        tracks, state = self.tracks, self.state
+        tracks, state, was = self.tracks, self.state, self.state.frames
         if tracks is None or linear.tracks is None:
             state.update(layout, delta)
+            self.rig.follow(state, was)
             return
         assert isinstance(linear.tracks, SummedFeatures)
         columns, own = layout.indices(self.rig.keys_of(tracks.obs)), tracks.in_state
         increments = linear.tracks.point_increments(delta[columns])
         before = first_centres(tracks.obs, self.rig.at(state), state)
         state.update(layout, delta)
+        self.rig.follow(state, was)
         after = first_centres(tracks.obs, self.rig.at(state), state)
         points = moved_in_inverse_depth(tracks.points, increments, before, after)
         points[own] = state.positions_of(tracks.obs.ids[own])
@@ -380,7 +382,7 @@ class Cost:
             return self._columns[1]
         poses = np.array([layout.starts[X(i)] for i in obs.frames])
         points = np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)])
-        calibration = layout.indices(self.rig.calibration_keys)
+        calibration = layout.indices(self.rig.common_keys)
         parts = (
             poses[obs.frame][:, None] + np.arange(6),
             points[obs.feature][:, None] + np.arange(POINT_DIM),

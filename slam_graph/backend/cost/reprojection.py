@@ -12,15 +12,17 @@ The parameters of the rig may be variables too (`calibrated_projection`).
 The rows of a rolling shutter are exposed one after the other (Li, Kim and Mourikis 2013). The pose
 X(i) is that at the middle row, and at the time of another row, s later, the body is at X(i) ⊕
 m_i(s). So a row is a camera that is mounted elsewhere on the body, at m_i(s) body_T_camera. The
-motion m_i is that of the gyroscope and of the estimated velocity around the frame; it is linearised
-at its estimate like the calibration, and its own uncertainty is neglected: a velocity that is wrong
-by 0.05 m/s moves the first and the last row by 0.1 px at 3 m, with a readout of 30 ms.
+motion m_i is that of the gyroscope and of the estimated velocity around the frame. A velocity that
+is wrong by 0.05 m/s moves the first and the last row by 0.1 px at 3 m, with a readout of 30 ms. So
+m_i follows the estimates, and velocities that are variables have derivatives (`row_velocities`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -28,6 +30,8 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.row_velocities import RowVelocities, follow_estimates
+from slam_graph.backend.online_calibration import GRAVITY
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import FrameMotion, State
 from slam_graph.kernels.projection import chain_rule, distort_radtan, to_cameras
@@ -84,9 +88,11 @@ class RigProjection:
         wide: whether a lens sees so much to the side that errors on the plane z = 1 must be
             weighted (`pixel_slopes`).
         calibration_keys: of the parameters of the rig that are variables.
+        velocities: of frames, that are variables on which rows of rolling shutters depend.
     """
 
     calibration_keys: tuple[int, ...] = ()
+    velocities = RowVelocities()
 
     def __init__(
         self,
@@ -119,7 +125,7 @@ class RigProjection:
 
     def at(self, state: State) -> RigProjection:
         """The projection with the calibration of a state, and the motions of its frames."""
-        return self.moving(state.motions)
+        return self.moving(state.motions).with_velocities(state, self.velocities.first)
 
     def moving(self, motions: Mapping[int, FrameMotion]) -> RigProjection:
         """The projection with the motions of frames, which count for rolling shutters only."""
@@ -127,7 +133,7 @@ class RigProjection:
 
     def keys_of(self, obs: Observations) -> list[int]:
         """Keys of all variables beside the features that observations depend on."""
-        return [*(X(i) for i in obs.frames), *self.calibration_keys]
+        return [*(X(i) for i in obs.frames), *self.common_keys]
 
     def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""
@@ -147,10 +153,42 @@ class RigProjection:
     def all_jacobians(
         self, obs: Observations, at: Geometry
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and calibration (N, 2, C)."""
-        return (*self.jacobians(obs, at), np.zeros((len(obs), 2, 0)))
+        """Derivatives of π by pose (N, 2, 6), point (N, 2, 3) and common variables (N, 2, C)."""
+        by_pose, by_point = self.jacobians(obs, at)
+        by_pose, by_velocity = self.by_velocities(obs, at, by_pose)
+        return by_pose, by_point, by_velocity
 
     # --- rolling shutters -------------------------------------------------------------------------
+
+    @property
+    def common_keys(self) -> tuple[int, ...]:
+        """Of the variables that have columns in all observations: calibration and velocities."""
+        return (*self.calibration_keys, *self.velocities.keys)
+
+    def with_velocities(self, state: State, frames: Iterable[int]) -> Self:
+        """The projection as a function of velocities too, of those frames that have one in a state.
+
+        With global shutters there are none.
+        """
+        if not self.rolling:
+            return self
+        projection = copy(self)
+        projection.velocities = RowVelocities.of(state, frames)
+        return projection
+
+    def follow(self, state: State, before: gtsam.Values) -> None:
+        """Renew the motions of a state whose estimates have moved, if velocities are variables."""
+        if self.velocities.first:
+            gravity = GRAVITY if self._rig.has_imu else np.zeros(3)
+            follow_estimates(state, before, gravity)
+
+    def by_velocities(
+        self, obs: Observations, at: Geometry, by_pose: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by poses (N, 2, 6) and velocities (N, 2, 3 V), see `row_velocities`."""
+        if not self.velocities.first:
+            return by_pose, np.zeros((len(obs), 2, 0))
+        return self.velocities.derivatives(obs, at.rotations, self.row_times_s(obs), by_pose)
 
     def mounts(self, obs: Observations) -> tuple[FloatArray, FloatArray]:
         """Rotations (N, 3, 3) and positions (N, 3) of cameras in the body, where they observed.

@@ -88,11 +88,13 @@ class FrameMotion:
             a global shutter the time offset under which the pose is that at the frame's time.
         change: (6,) derivatives of the angular rate (rad/s²), and acceleration (m/s²) in the body
             frame; used for rolling shutters only.
+        stamp_ns: time of the pose; used for rolling shutters only.
     """
 
     rate: FloatArray
     time_offset_s: float
     change: FloatArray = field(default_factory=lambda: np.zeros(6))
+    stamp_ns: int = 0
 
     def after(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the body was at N times, in its frame at the pose.
