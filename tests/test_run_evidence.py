@@ -36,11 +36,12 @@ def innovations(growth: float = 1.0) -> dict[str, np.ndarray]:
     }
 
 
-def test_shifts_are_in_standard_deviations_of_the_causal_estimate() -> None:
+def test_shifts_are_in_standard_deviations_of_both() -> None:
     rng = np.random.default_rng(1)
     evidence = Evidence.of(innovations(), 0.0, flight(rng, 2.0), flight(rng, 0.0, sigma=0.5))
-    assert evidence.position_shift == pytest.approx(2.0, rel=0.1)
-    assert evidence.rotation_shift == pytest.approx(2.0, rel=0.1)
+    both = np.hypot(1.0, 0.5)
+    assert evidence.position_shift == pytest.approx(2.0 / both, rel=0.1)
+    assert evidence.rotation_shift == pytest.approx(2.0 / both, rel=0.1)
     assert evidence.smoothed_sigma == pytest.approx(0.5)
     assert not evidence.contradicts
     assert evidence.causes == []
@@ -48,7 +49,7 @@ def test_shifts_are_in_standard_deviations_of_the_causal_estimate() -> None:
 
 def test_what_no_good_run_shows_is_said_in_words() -> None:
     rng = np.random.default_rng(2)
-    far = 2.0 * MOST_SHIFT
+    far = 3.0 * MOST_SHIFT
     evidence = Evidence.of(innovations(), 0.9, flight(rng, far), flight(rng, 0.0))
     assert evidence.contradicts
     limit, shift = evidence.causes

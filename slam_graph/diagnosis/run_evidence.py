@@ -4,8 +4,8 @@
 
 A wrong calibration bends what is estimated until images and IMU agree. It shows in three places:
 the noise of the IMU is raised to its limit, as the corrections by images keep their direction; the
-trajectory that is smoothed as a whole differs from the causal one by more than the covariance of
-the latter; and innovations are larger than expected, or grow. How far each goes in good runs, and
+trajectory that is smoothed as a whole differs from the causal one by more than the covariances of
+both allow; and innovations are larger than expected, or grow. How far each goes in good runs, and
 which of them tell wrong runs from these, is in docs/lab_notes.md.
 """
 
@@ -43,7 +43,7 @@ class Evidence:
             density of the IMU was at its limit.
         smoothed_sigma: standard deviation of the smoothed position over that of the causal one.
         position_shift: difference of the causal position from the smoothed one, root mean square
-            over the run, in that of the standard deviations of the causal one. So it says nothing
+            over the run, in that of the standard deviations of both. So it says nothing
             where a part of the run is hardly known, as a segment that nothing joins.
         rotation_shift: the same of the rotation.
     """
@@ -127,12 +127,18 @@ def _shifts(
     one = causal.trajectory()
     other, covered = interpolate(smoothed.trajectory(), one.stamps_ns)
     one, before, after = one.select(covered), causal.sigmas()[covered], smoothed.sigmas()
-    sizes = [_size(before[:, part]) for part in (_POSITION, _ROTATION)]
-    if len(one) < _FEWEST or not min(sizes) > 0.0:  # NaN is not either
+    if len(one) < _FEWEST:
+        return None, None, None
+    # both, as the smoothed trajectory does not use a state that was given
+    stamps_ns = smoothed.trajectory().stamps_ns
+    near = np.clip(np.searchsorted(stamps_ns, one.stamps_ns), 0, len(after) - 1)
+    sizes = [_size(np.hypot(before, after[near])[:, part]) for part in (_POSITION, _ROTATION)]
+    if not min(sizes) > 0.0:  # NaN is not either
         return None, None, None
     turns = [a.rotation().between(b.rotation()) for a, b in zip(one, other, strict=True)]
     turned = np.array([gtsam.Rot3.Logmap(turn) for turn in turns])
-    sigma = _size(after[:, _POSITION]) / sizes[0] * math.sqrt(len(before) / len(after))
+    ratio = _size(after[:, _POSITION]) / _size(before[:, _POSITION])
+    sigma = ratio * math.sqrt(len(before) / len(after))
     return (
         sigma if math.isfinite(sigma) else None,
         _size(one.positions - other.positions) / sizes[0],
