@@ -43,10 +43,12 @@ _POINT_DIM = 3
 _GOOD_SHARE, _JUMPED_SHARE, _JUMPED = 0.3, 0.8, 20
 """At a jump the share that does not fit was at most the first before; then at least the second does
 not fit across it, and fits after it; of so many tracks."""
-_LOST_SHARE, _LOST = 0.95, 2
-"""The state is lost where at least this share does not fit, so many times in a row, right after a
-time at which tracks fitted: a body that moves and comes into view covers the image gradually. It is
-said when a jump could be told from it, whose way nothing has measured."""
+_LOST_SHARE, _FAR, _LOST = 0.95, 6.0, 2
+"""The state is lost where at least this share does not fit, most of them by so many standard
+deviations, so many times in a row, right after a time at which tracks fitted: a body that moves and
+comes into view covers the image gradually, and an estimate that corrects its scale bends the poses
+of a second by a few. It is said when a jump could be told from it, whose way nothing has
+measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +136,12 @@ class TrackFit:
         ids = ids[~is_in(ids, moving)]
         motions = {p.index: p.motion for p in self._poses if p.motion is not None}
         projection = RigProjection(rig, motions)
-        unfit = int(np.count_nonzero(self._errors(ids, projection) >= _LARGEST * sigma_px))
+        errors = self._errors(ids, projection)
+        unfit = int(np.count_nonzero(errors >= _LARGEST * sigma_px))
         enough = len(ids) >= _JUMPED
-        if enough and unfit >= _LOST_SHARE * len(ids) and self._good == now - 1 - self._bad:
+        bad = enough and unfit >= _LOST_SHARE * len(ids)
+        bad = bad and bool(np.median(errors) >= _FAR * sigma_px)
+        if bad and self._good == now - 1 - self._bad:
             self._bad += 1
         jumped = lost = False
         if self._good == now - _LEAST_FRAMES:
