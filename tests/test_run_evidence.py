@@ -52,6 +52,8 @@ def test_what_no_good_run_shows_is_said_in_words() -> None:
     far = 3.0 * MOST_SHIFT
     evidence = Evidence.of(innovations(), 0.9, flight(rng, far), flight(rng, 0.0))
     assert evidence.contradicts
+    assert not Evidence.of(innovations(), 0.1, flight(rng, far), flight(rng, 0.0)).contradicts
+    assert not Evidence.of(innovations(), 0.9, flight(rng, 0.0), flight(rng, 0.0)).contradicts
     limit, shift = evidence.causes
     assert "90% of the frames" in limit
     assert "smoothed" in shift

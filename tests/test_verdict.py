@@ -217,6 +217,7 @@ def test_a_run_that_contradicts_itself_is_suspect(
     """The message says what shows, if the diagnosis finds nothing. Without an IMU nothing shows."""
     monkeypatch.setattr(run_evidence, "MOST_SHIFT", 0.01)
     monkeypatch.setattr(run_evidence, "USUAL_SHIFT", 0.01)
+    monkeypatch.setattr(run_evidence, "USUAL_NOISE_AT_LIMIT", -1.0)
     sequence = simulate(cameras=2, duration_s=6.0, rate_hz=10.0, seed=2, with_imu=with_imu)
     result = run(sequence, algorithm="msckf")
     assert result.status == ("suspect" if with_imu else "ok")
