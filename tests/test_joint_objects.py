@@ -15,7 +15,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, skew
 from slam_graph.backend.smoothing import joint_objects, object_smoothing
 from slam_graph.backend.smoothing.final_adjustment import FinalBa
 from slam_graph.backend.smoothing.joint_objects import JointObject, joined
@@ -75,10 +75,6 @@ def covariance(equations: PoseEquations) -> FloatArray:
 
 def rotations(path: Trajectory) -> FloatArray:
     return Rotation.from_quat(path.quaternions).as_matrix()
-
-
-def skew(v: FloatArray) -> FloatArray:
-    return np.cross(np.eye(3), v)
 
 
 def root(information: FloatArray) -> FloatArray:

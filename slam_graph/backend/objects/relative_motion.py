@@ -52,9 +52,23 @@ class RelativeStep:
 
     def body_motion(self) -> tuple[gtsam.Pose3, FloatArray]:
         """Motion before_T_now of the platform relative to the object, and its covariance (6, 6)."""
-        motion = self.before.between(self.now)
-        J = np.hstack([-motion.inverse().AdjointMap(), np.eye(6)])
-        return motion, J @ self.covariance @ J.T
+        return motion_between(self.before, self.now, self.covariance)
+
+
+def motion_between(
+    before: gtsam.Pose3, now: gtsam.Pose3, covariance: FloatArray
+) -> tuple[gtsam.Pose3, FloatArray]:
+    """Motion before_T_now between two poses, and its covariance (6, 6) in its tangent.
+
+    Args:
+        before: the first one.
+        now: the second one.
+        covariance: (12, 12) of both, before first, in their tangents: rotation (rad), translation
+            (m), body axes.
+    """
+    motion = before.between(now)
+    J = np.hstack([-motion.inverse().AdjointMap(), np.eye(6)])
+    return motion, J @ covariance @ J.T
 
 
 class RelativeMotion:

@@ -11,6 +11,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
+from slam_graph.backend.objects.relative_motion import motion_between
 from slam_graph.backend.smoothing.joint_objects import JointObject
 
 _BLOCK = 50
@@ -87,9 +88,8 @@ def _motion(states: Sequence[ObjectState], P: FloatArray, k: int) -> ObjectMotio
     now, step = states[k], states[k].step
     if k == 0 or step is None or states[k - 1].stamp_ns != step.before_ns:
         return None
-    motion = states[k - 1].world_T_object.between(now.world_T_object)
-    J = np.hstack([-motion.inverse().AdjointMap(), np.eye(6)])
-    covariance = J @ _joint(P, k - 1, k) @ J.T
+    poses = states[k - 1].world_T_object, now.world_T_object
+    motion, covariance = motion_between(*poses, _joint(P, k - 1, k))
     return ObjectMotion(step.before_ns, now.stamp_ns, motion, covariance)
 
 
