@@ -52,7 +52,6 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
-from slam_graph.kernels.rotation_refinement import refine_rotation, refine_rotation_numpy
 from slam_graph.kernels.spacing import (
     apart,
     apart_numpy,
@@ -225,28 +224,6 @@ def test_zeros_to_the_left(first: int, below: float) -> None:
     assert found == zeros_to_the_left_numpy(rows)
     assert found[0] == first
     assert found[1] == (below == 0.0 and first <= 3)
-
-
-@pytest.mark.parametrize("wrong", [0, 8])
-@pytest.mark.parametrize("baseline", [0.05, 0.3])
-def test_refine_rotation(wrong: int, baseline: float) -> None:
-    """With little and much parallax, with and without wrong matches."""
-    rng = np.random.default_rng(5)
-    points = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 8.0], (60, 3))
-    R_true = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
-    second = (points - baseline * np.array([1.0, 0.2, 0.1])) @ R_true
-    second += rng.normal(0.0, 5e-4, second.shape) * points[:, 2:]
-    second[:wrong] = second[rng.permutation(wrong)]
-    first, second = (f / np.linalg.norm(f, axis=1)[:, None] for f in (points, second))
-    start = R_true @ Rotation.from_rotvec([0.01, 0.01, -0.02]).as_matrix()
-    results = []
-    for kernel in (refine_rotation, refine_rotation_numpy):
-        R, H, known = start.copy(), np.empty((5, 5)), np.empty((2, 2))
-        cost = kernel(first, second, np.full((60, 2), 2.5e-7), R, H, known)
-        about_t = H[:3, 3:] @ np.linalg.solve(known, H[3:, :3])  # the sign of t is arbitrary
-        results.append((np.array(cost), R, H[:3, :3], known, about_t))
-    assert all(same(a, b) for a, b in zip(*results, strict=True))
-    assert np.abs(results[0][1] - R_true).max() < 0.01
 
 
 @pytest.mark.parametrize("gone", [[], [0, 1], [4, 5, 9], [3, 11, 12], [11, 12]])
