@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Interrupts"]
+__all__ = ["Deferred", "Interrupts"]
 
 _GRACE_S = 10.0
 """Time for a process to end after Ctrl-C before it is killed."""
@@ -27,13 +27,15 @@ class Deferred:
 
     def __init__(self) -> None:
         self.heard = False
+        self._at_once = False
         self._before: signal._HANDLER | None = None
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
         """Note a signal."""
-        if self.heard:
-            raise KeyboardInterrupt
+        raises = self.heard or self._at_once
         self.heard = True
+        if raises:
+            raise KeyboardInterrupt
 
     def install(self) -> None:
         """Take the place of the handler; not where SIGINT is ignored, as in a background job.
@@ -58,6 +60,29 @@ class Deferred:
         if self.heard:
             raise KeyboardInterrupt
 
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal take effect within the block, whatever other libraries make of it.
+
+        An import or a callback from C may turn the interrupt into an error of its own, or lose it.
+
+        Raises:
+            KeyboardInterrupt: if there was a signal in the block, at its end at the latest.
+        """
+        before, self.heard = self.heard, False
+        self._at_once = True
+        try:
+            yield
+        except Exception as error:
+            if self.heard:
+                raise KeyboardInterrupt from error
+            raise
+        finally:
+            self._at_once = False
+            interrupted, self.heard = self.heard, before or self.heard
+        if interrupted:
+            raise KeyboardInterrupt
+
 
 @contextmanager
 def completed() -> Iterator[Callable[[], None]]:
@@ -67,32 +92,33 @@ def completed() -> Iterator[Callable[[], None]]:
         A function to call where the part of the block begins that is to be completed.
 
     Raises:
-        KeyboardInterrupt: at the end, if there was a Ctrl-C meanwhile.
+        KeyboardInterrupt: at the end, if there was a Ctrl-C meanwhile; where another block defers
+            it, too, that one notes it.
     """
-    deferred = Deferred()
+    handler = Deferred()
     try:
-        yield deferred.install
+        yield handler.install
     finally:
-        deferred.restore()
-    deferred.check()
+        handler.restore()
+    if handler.heard:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
-def between_steps() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C take effect between two steps, so that no step is left half done.
+def deferred() -> Iterator[Deferred]:
+    """Let Ctrl-C take effect where the block checks for it, so that no step is left half done.
 
     A second one takes effect at once.
 
     Yields:
-        A function to call after each step; it raises KeyboardInterrupt after a Ctrl-C.
+        Its `check` raises KeyboardInterrupt after a Ctrl-C; `at_once` lets it take effect.
     """
-    deferred = Deferred()
-    deferred.install()
+    handler = Deferred()
+    handler.install()
     try:
-        yield deferred.check
-        deferred.check()
+        yield handler
     finally:
-        deferred.restore()
+        handler.restore()
 
 
 def terminate_like_interrupt() -> None:
@@ -138,8 +164,8 @@ def leave_to_parent() -> None:
 class Interrupts:
     """What is done about signals."""
 
-    between_steps = staticmethod(between_steps)
     completed = staticmethod(completed)
+    deferred = staticmethod(deferred)
     end_with = staticmethod(end_with)
     leave_to_parent = staticmethod(leave_to_parent)
     terminate_like_interrupt = staticmethod(terminate_like_interrupt)

@@ -20,6 +20,8 @@ from slam_graph.experiment.comparison_results import read_result
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
 from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
+from slam_graph.pipeline.stage import Stage
+from slam_graph.pipeline.supervision import finish
 from slam_graph.results import load_result
 from slam_graph.simulation.simulator import simulate
 
@@ -224,3 +226,54 @@ def test_a_task_ends_with_the_one_who_waits_for_it(tmp_path: Path) -> None:
     os.close(ours)
     assert process.wait(HANG_S) != 0
     assert not list(tmp_path.iterdir())
+
+
+class ImportsBadly(Stage):
+    """A stage in which Ctrl-C becomes an error of another library, or is lost in a callback."""
+
+    def __init__(self, lost: bool) -> None:
+        self.lost = lost
+
+    def finish(self) -> None:
+        """Be interrupted."""
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if not self.lost:
+                raise ImportError("no such module") from None
+
+
+class Fails(Stage):
+    """A stage that cannot finish."""
+
+    def finish(self) -> None:
+        """Fail."""
+        raise ArithmeticError("of a stage")
+
+
+class Finishes(Stage):
+    """A stage that finishes."""
+
+    done = False
+
+    def finish(self) -> None:
+        """Note it."""
+        self.done = True
+
+
+@pytest.mark.parametrize(
+    ("stage", "status"),
+    [
+        (ImportsBadly(lost=False), "interrupted"),
+        (ImportsBadly(lost=True), "interrupted"),
+        (Fails(), "failed"),
+    ],
+)
+def test_the_end_of_a_run_survives_its_stages(flight: Path, stage: Stage, status: str) -> None:
+    result = run(flight, duration_s=1.0, final_ba={"enabled": False})
+    assert result.status == "ok"
+    last = Finishes()
+    with Interrupts.deferred() as interrupts:
+        finish([stage, last], result, interrupts)
+    assert last.done
+    assert result.status == status

@@ -10,6 +10,8 @@ from typing import TypeVar, cast
 
 import numba
 
+from slam_graph.interrupts import Interrupts
+
 __all__ = ["compiled"]
 
 logger = logging.getLogger("slam_graph")
@@ -33,7 +35,9 @@ def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
 
     def decorate(function: _Kernel) -> _Kernel:
         jit = numba.njit(list(signatures) or None, cache=True, nogil=True, error_model="numpy")
-        kernel = cast("_Kernel", jit(function))
+        with Interrupts.completed() as begin:  # a callback of the compiler would lose Ctrl-C
+            begin()
+            kernel = cast("_Kernel", jit(function))
         if signatures:
             _tell(kernel)
         return kernel

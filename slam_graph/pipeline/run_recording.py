@@ -114,12 +114,8 @@ def run(
         Viewing(result, estimator, viewer or NullViewer(), diagnostics),
     ]
 
-    with ExitStack() as resources:
-        with (
-            outcome(result, estimator),
-            Interrupts.between_steps() as frame_done,
-            _tracked(tracking, result, sequence) as packets,
-        ):
+    with ExitStack() as resources, Interrupts.deferred() as interrupts:
+        with outcome(result, estimator), _tracked(tracking, result, sequence) as packets:
             for stage in stages:
                 stage.begin(resources)
             for tracked in packets:
@@ -127,9 +123,10 @@ def run(
                 for stage in stages:
                     stage.frame(frame)
                 tracking.give_feedback(objects.feedback(frame.feedback()))
-                frame_done()
+                interrupts.check()
             estimation.finish()
-        finish(stages, result)
+            interrupts.check()
+        finish(stages, result, interrupts)
     result.warnings = +sequence.diagnostics.counts
     return result
 

@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from slam_graph.backend import Estimator
 from slam_graph.errors import SlamGraphError
+from slam_graph.interrupts import Deferred
 from slam_graph.pipeline.agreement import DivergenceError
 from slam_graph.pipeline.stage import COMPLETED, Stage
 from slam_graph.results import RunResult
@@ -44,18 +44,30 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
     logger.log(level, "%s", ending.message or done)
 
 
-def finish(stages: Iterable[Stage], result: RunResult) -> None:
-    """Finish all stages; Ctrl-C ends the one at work, and those that come after are short then."""
-    waiting = deque(stages)
-    while waiting:
+def finish(stages: Iterable[Stage], result: RunResult, interrupts: Deferred) -> None:
+    """Finish all stages; Ctrl-C ends the one at work, and those that come after are short then.
+
+    A stage that fails does not keep the others from finishing.
+
+    Args:
+        stages: in the order in which they finish.
+        result: its ending notes the first thing that goes wrong.
+        interrupts: Ctrl-C takes effect within stages only.
+    """
+    ending = result.ending
+    for stage in stages:
         try:
-            while waiting:
-                waiting.popleft().finish()
+            with interrupts.at_once():
+                stage.finish()
         except KeyboardInterrupt as interrupt:
-            ending = result.ending
             if ending.status in COMPLETED:  # what went wrong before says more
                 ending.status, ending.error = "interrupted", interrupt
                 ending.message = "interrupted after the last frame"
+        except Exception as error:
+            logger.exception("internal error")
+            if ending.status in COMPLETED:
+                ending.status, ending.error = "failed", error
+                ending.message = f"internal error: {type(error).__name__}: {error}"
 
 
 def _judge(result: RunResult, estimator: Estimator) -> None:
