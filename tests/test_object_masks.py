@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from slam_graph.backend.objects.track_labels import TrackLabels
 from slam_graph.cli.main import app
 from slam_graph.datasets import RecordedSequence, open_dataset
+from slam_graph.datasets.object_sources import LabelsOverTime
 from slam_graph.datasets.streams.mask_images import MaskFolder, sampled
 from slam_graph.errors import DataError
 from slam_graph.pipeline import run
-from slam_graph.pipeline.object_estimation import LabelsOverTime
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations
 from slam_graph.simulation.simulated_sequence import SimulatedSequence

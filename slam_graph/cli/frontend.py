@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from slam_graph.config import RunConfig
-    from slam_graph.datasets import Sequence
+    from slam_graph.datasets import RecordedSequence
     from slam_graph.experiment import FrontendReport
     from slam_graph.sensors import FeatureFrame, Packet
 
@@ -156,7 +156,7 @@ def _settings_of(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _watch(
-    sequence: Sequence,
+    sequence: RecordedSequence,
     settings: RunConfig,
     picture: Path,
     video: Path | None,
@@ -165,14 +165,18 @@ def _watch(
 ) -> Callable[[Packet, FeatureFrame], None]:
     """A function that draws each frame, and records it if asked for."""
     from slam_graph.datasets import TrackRecorder
+    from slam_graph.datasets.object_sources import LabelsOverTime
+    from slam_graph.datasets.streams.mask_images import classes_text
     from slam_graph.sensors import CameraFrame
     from slam_graph.visualization import TrackPictures
 
     recorder = None
     info = sequence.info()
+    labels = LabelsOverTime(sequence) if sequence.masks else None
     if record is not None:
+        truth, notes = sequence.groundtruth(), classes_text(sequence.mask_classes)
         recorder = stack.enter_context(
-            TrackRecorder(record, sequence.rig, info.name, sequence.groundtruth())
+            TrackRecorder(record, sequence.rig, info.name, truth, notes=notes)
         )
     length_ns = info.end_ns - info.start_ns - round(settings.start_s * 1e9)
     if settings.duration_s is not None:
@@ -184,6 +188,7 @@ def _watch(
         assert isinstance(packet.frame, CameraFrame)
         pictures.show(packet.frame, features)
         if recorder is not None:
+            features = features if labels is None else labels.labelled(features)
             recorder.write(packet.imu, features, packet.aiding)
 
     return watch

@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from slam_graph.datasets.streams.mask_images import MASKS, LabelImage, MaskFolder, sampled
 from slam_graph.datasets.streams.object_truth import (
@@ -19,7 +22,7 @@ from slam_graph.datasets.streams.object_truth import (
 if TYPE_CHECKING:
     from slam_graph.arrays import IntArray
     from slam_graph.geometry import Trajectory
-    from slam_graph.sensors import FeatureObservations, Rig
+    from slam_graph.sensors import FeatureFrame, FeatureObservations, Rig
 
 
 class ObjectSources:
@@ -87,6 +90,9 @@ class ObjectSources:
 
     @cached_property
     def _mask_folder(self) -> MaskFolder | None:
+        return self._found_masks()
+
+    def _found_masks(self) -> MaskFolder | None:
         if MASKS in self.named_aiding:
             return MaskFolder(Path(self.named_aiding[MASKS]))
         folders = (folder / MASKS for folder in self._folders() if (folder / MASKS).is_dir())
@@ -98,3 +104,48 @@ class ObjectSources:
         path: Path | None = getattr(self, "path", None)
         if path is not None:
             yield from (path, path.parent)
+
+
+class LabelsOverTime:
+    """Labels of tracks: of the masks of a frame, or of the last ones where a frame has none.
+
+    Args:
+        recording: that has masks.
+
+    Attributes:
+        masks: number of all masks.
+        frames: number of frames with a mask so far.
+    """
+
+    def __init__(self, recording: ObjectSources) -> None:
+        self._recording = recording
+        self.masks, self.frames = recording.masks, 0
+        self._known: dict[int, int] = {}
+
+    def labelled(self, frame: FeatureFrame) -> FeatureFrame:
+        """The frame with the labels of its features in the first camera, also of those that move.
+
+        Raises:
+            DataError: if a mask cannot be read.
+        """
+        seen, static = frame.whole.cameras[0], len(frame.cameras[0])
+        found = self._recording.labels(frame.stamp_ns, seen)
+        self.frames += found is not None
+        labels = self._before(seen.ids) if found is None else found
+        self._known = dict(zip(seen.ids.tolist(), labels.tolist(), strict=True))
+        return replace(
+            frame,
+            cameras=_with_labels(frame.cameras, labels[:static]),
+            moving=_with_labels(frame.moving, labels[static:]),
+        )
+
+    def _before(self, ids: IntArray) -> IntArray:
+        """Labels (N,) that tracks (N,) had in the frame before; 0 for new ones."""
+        return np.array([self._known.get(number, 0) for number in ids.tolist()], np.int64)
+
+
+def _with_labels(
+    cameras: tuple[FeatureObservations, ...], labels: IntArray
+) -> tuple[FeatureObservations, ...]:
+    """The observations of all cameras, those of the first one with labels."""
+    return (replace(cameras[0], labels=labels), *cameras[1:]) if cameras else ()

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -163,12 +163,15 @@ class _ReplayFrontend:
     def __init__(self, rig: Rig, config: FrontendConfig) -> None:
         self._cameras = len(rig.cameras)
         self._drop_rejected = config.drop_rejected
+        self._keeps_moving = config.keep_moving
         self._seen = np.zeros(0, np.int64)
         self._dropped = np.zeros(0, np.int64)
         self.frame_stats: dict[str, float] = {}
 
     def track(self, frame: CameraFrame | FeatureFrame, imu: ImuData | None = None) -> FeatureFrame:
         """The recorded features; the IMU is not used.
+
+        Those that were recorded as moving stay apart, and are left out if these are not wanted.
 
         Raises:
             DataError: if the frame holds images, or features of another number of cameras.
@@ -188,9 +191,11 @@ class _ReplayFrontend:
             "dropped": float(np.count_nonzero(dropped)),
         }
         self._seen = ids
-        if not dropped.any():
-            return frame
-        return frame.without(self._dropped)
+        static = frame.without(self._dropped) if dropped.any() else frame
+        if not frame.moving:
+            return static
+        moving = FeatureFrame(frame.stamp_ns, frame.moving).without(self._dropped).cameras
+        return replace(static, moving=moving if self._keeps_moving else ())
 
     def drop(self, ids: IntArray) -> None:
         """Do not report these features any more."""

@@ -11,14 +11,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
 from slam_graph.backend import Estimator, MovingObjects, ObjectFrame, ObjectSmoother
 from slam_graph.datasets import RecordedSequence
+from slam_graph.datasets.object_sources import LabelsOverTime
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame
 
 _NOT_SMOOTHED = "no smoothed objects"
 
@@ -30,7 +29,7 @@ class Objects(NoObjects):
         result: of the run; it is given the objects.
         estimator: of the platform.
         diagnostics: of the run; counts what goes wrong.
-        masks: a recording that has some; None without.
+        recording: with masks or labels, if it has any; None where there can be none.
 
     Attributes:
         found: what became of the tracks of the last frame.
@@ -41,19 +40,20 @@ class Objects(NoObjects):
         result: RunResult,
         estimator: Estimator,
         diagnostics: Diagnostics,
-        masks: RecordedSequence | None = None,
+        recording: RecordedSequence | None = None,
     ) -> None:
         super().__init__()
         config = result.config
         self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
-        self._labels = None if masks is None else LabelsOverTime(masks)
+        has_masks = recording is not None and recording.masks > 0
+        self._labels = LabelsOverTime(recording) if recording and has_masks else None
         self._wanted = config.objects.features
         self._objects = result.objects = MovingObjects(
             result.causal_rig,
             config.object_policies,
             config.backend,
             config.objects,
-            {} if masks is None else masks.mask_classes,
+            {} if recording is None else recording.mask_classes,
         )
         self._smoother = ObjectSmoother(config.backend, config.objects)
         self._recording = ExitStack()
@@ -81,15 +81,17 @@ class Objects(NoObjects):
         )
 
     def noted(self, frame: EstimatedFrame) -> EstimatedFrame:
-        """The frame with the objects in it; a failure costs no more than those.
+        """The frame with the objects in it, and its features with the labels of their masks.
+
+        A failure costs no more than the objects.
 
         Raises:
             DataError: if a mask cannot be read.
         """
         self.found = ObjectFrame()
-        features = frame.features.whole
         if self._labels is not None:
-            features = self._labels.labelled(features)
+            frame = replace(frame, features=self._labels.labelled(frame.features))
+        features = frame.features.whole
         if frame.restarted:
             self._objects.begin(self._result.causal_rig)
         if frame.state is not None and not frame.waits:
@@ -121,37 +123,3 @@ class Objects(NoObjects):
                 f"none of the {self._labels.masks} masks has the time of a frame: they are named "
                 "by the stamps of frames of the first camera, in ns",
             )
-
-
-class LabelsOverTime:
-    """Labels of tracks: of the masks of a frame, or of the last ones where a frame has none.
-
-    Args:
-        recording: that has masks.
-
-    Attributes:
-        masks: number of all masks.
-        frames: number of frames with a mask so far.
-    """
-
-    def __init__(self, recording: RecordedSequence) -> None:
-        self._recording = recording
-        self.masks, self.frames = recording.masks, 0
-        self._known: dict[int, int] = {}
-
-    def labelled(self, frame: FeatureFrame) -> FeatureFrame:
-        """The frame with the labels of its features in the first camera.
-
-        Raises:
-            DataError: if a mask cannot be read.
-        """
-        seen = frame.cameras[0]
-        found = self._recording.labels(frame.stamp_ns, seen)
-        self.frames += found is not None
-        labels = self._before(seen.ids) if found is None else found
-        self._known = dict(zip(seen.ids.tolist(), labels.tolist(), strict=True))
-        return replace(frame, cameras=(replace(seen, labels=labels), *frame.cameras[1:]))
-
-    def _before(self, ids: IntArray) -> IntArray:
-        """Labels (N,) that tracks (N,) had in the frame before; 0 for new ones."""
-        return np.array([self._known.get(number, 0) for number in ids.tolist()], np.int64)

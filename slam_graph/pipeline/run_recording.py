@@ -160,8 +160,8 @@ def _objects_stage(sequence: Sequence, result: RunResult, estimator: Estimator) 
         return NoObjects()
     from slam_graph.pipeline.object_estimation import Objects  # most runs need none of it
 
-    masks = sequence if isinstance(sequence, RecordedSequence) and sequence.masks else None
-    return Objects(result, estimator, sequence.diagnostics, masks)
+    recording = sequence if isinstance(sequence, RecordedSequence) else None
+    return Objects(result, estimator, sequence.diagnostics, recording)
 
 
 def _settings(

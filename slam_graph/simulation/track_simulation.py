@@ -91,7 +91,7 @@ class TrackSimulator:
         seed: of the simulation.
         place_seed: of what landmarks look like; the same as `seed` if None.
         depth_noise: factor on the noise of the rig's depth sensor.
-        masks: whether features know which object they are on.
+        masks: whether features of the first camera know which object they are on.
     """
 
     def __init__(
@@ -260,7 +260,7 @@ class TrackSimulator:
         if config.pixel_sigma > 0:
             pixels = pixels + self._rng.normal(0.0, config.pixel_sigma, pixels.shape)
         seen = FeatureObservations(ids.copy(), pixels.copy(), camera.undistort(pixels))
-        if self._masks:
+        if self._masks and number == 0:  # as masks are those of the first camera
             seen = replace(seen, labels=self._landmarks.labels(landmarks))
         if self._depth is None or self._depth.sensor.camera != number:
             return seen

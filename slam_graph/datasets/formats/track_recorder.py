@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
+from slam_graph.datasets.formats.recorded_objects import ObjectColumns
 from slam_graph.datasets.streams.aiding_files import aiding_texts
 from slam_graph.errors import DataError
 from slam_graph.files import Files
@@ -70,6 +71,7 @@ class TrackRecorder:
     def __enter__(self) -> Self:
         self._folder = Files.partial_folder(self.path)
         self._files = ExitStack()
+        self._objects = ObjectColumns(self._open)
         try:
             with Files.writing(self.path):
                 self._frames = self._open(layout.FRAMES)
@@ -90,9 +92,10 @@ class TrackRecorder:
     ) -> None:
         try:
             with Files.writing(self.path):  # what is buffered is written when a file is closed
+                of_objects = self._objects.finish() if kind is None else {}
                 self._files.close()
                 if kind is None:
-                    self._finish()
+                    self._finish(of_objects)
         except DataError:
             if kind is None:  # else the first error is the one to tell
                 raise
@@ -104,7 +107,8 @@ class TrackRecorder:
 
         Args:
             imu: the samples since the packet before, as in `Packet`.
-            frame: the features found at a time later than that of the frame before.
+            frame: the features found at a time later than that of the frame before; their labels
+                in the first camera, and those that move by themselves, are recorded too.
             aiding: fixes and odometry since the packet before.
 
         Raises:
@@ -139,6 +143,7 @@ class TrackRecorder:
             self._features.write(_pack(seen).tobytes())
         if self._depth_camera is not None:
             self._depths.write(_pack_depth(frame.cameras[self._depth_camera]).tobytes())
+        self._objects.write(frame)
         self._counts["frames"] += 1
         self._counts["imu_samples"] += len(imu)
         self._counts["features"] += sum(len(seen) for seen in frame.cameras)
@@ -164,8 +169,12 @@ class TrackRecorder:
     def _open(self, name: str) -> BinaryIO:
         return self._files.enter_context((self._folder / name).open("wb"))
 
-    def _finish(self) -> None:
-        """Write the small files, and move the folder to its place."""
+    def _finish(self, of_objects: Mapping[str, Any]) -> None:
+        """Write the small files, and move the folder to its place.
+
+        Args:
+            of_objects: what is said of labels and features that move.
+        """
         meta: dict[str, Any] = {
             "format": layout.FORMAT_NAME,
             "version": layout.FORMAT_VERSION,
@@ -176,6 +185,7 @@ class TrackRecorder:
         }
         if self._depth_camera is not None:
             meta["depth_camera"] = self._depth_camera
+        meta |= of_objects
         write_kalibr(self.rig, self._folder / layout.CALIBRATION)
         if self._groundtruth is not None:
             layout.save_trajectory(self._folder / layout.GROUNDTRUTH, self._groundtruth)

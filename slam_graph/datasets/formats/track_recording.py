@@ -17,6 +17,13 @@ writes recordings. All numbers are little-endian, and no file is a pickle:
   each feature of that camera, in the same order, `depth` and `sigma` (float64 each, NaN for none);
 - ``descriptors.bin``, where features have any: for each feature of the first camera, in the same
   order, `descriptor_bytes` of ``meta.yaml`` bytes (0 or missing if there are none);
+- ``labels.bin``, where features have labels of masks (`labels` of ``meta.yaml`` is 1): for each
+  feature of the first camera, in the same order, its label (int32; 0 for none, -1 for all features
+  of a frame without a mask). Names of labels are in ``classes.csv`` (`label,name`);
+- ``moving.bin`` and ``moving_frames.bin``, where features move by themselves and are kept apart
+  from the others (`FeatureFrame.moving`): for each of them, ordered as in ``features.bin``, `id`,
+  `pixel` and `normalized` as there and `label` (int32); and for each frame their number in each
+  camera (int64). ``meta.yaml`` has their number, `moving_features`;
 - ``imu.bin``: for each sample `stamp` (int64, ns), `gyro` and `accel` (three float64 each);
 - ``groundtruth.npz`` and ``initial_state.npz``, where there are any: the arrays of `Trajectory` and
   `NavState` under their names (`world_T_body` as a 4x4 matrix).
@@ -28,7 +35,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
 from zipfile import ZipFile
@@ -40,6 +47,7 @@ from numpy.typing import NDArray
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, pose_from_matrix, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
+from slam_graph.datasets.formats.recorded_objects import MOVING, RecordedObjects
 from slam_graph.datasets.sequence import (
     FrameStream,
     ReaderOptions,
@@ -48,6 +56,7 @@ from slam_graph.datasets.sequence import (
 )
 from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS
 from slam_graph.datasets.streams.imu_stream import clean_blocks
+from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, read_classes
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
@@ -258,6 +267,22 @@ class TrackRecordingSequence(RecordedSequence):
         if self._depth_camera is not None:
             features = int(self._index["counts"][:, self._depth_camera].sum())
             self._check_size(DEPTHS, features * DEPTH_RECORD.itemsize)
+        labels, moving = meta.get("labels"), meta.get("moving_features")
+        self._has_labels = labels is not None and _whole(labels, 0, 1) > 0
+        moves = 0 if moving is None else _whole(moving)
+        self._objects = RecordedObjects(path, self._index["counts"], self._has_labels, moves)
+
+    @property
+    def mask_classes(self) -> dict[int, str]:
+        """Name of the class by label: of the masks, if some are used, or as it was recorded."""
+        return read_classes(self.path) if self._mask_folder is None else super().mask_classes
+
+    @cached_property
+    def _mask_folder(self) -> MaskFolder | None:
+        """Masks that were named; those beside the recording only if it has no labels."""
+        if self._has_labels and MASKS not in self.named_aiding:
+            return None
+        return self._found_masks()
 
     def measure(self) -> SequenceInfo:
         """How much was recorded."""
@@ -288,7 +313,8 @@ class TrackRecordingSequence(RecordedSequence):
             file.seek(int(before.sum()) * size)
             descriptors_file = self._open_descriptors(files, int(before[:, 0].sum()))
             depths_file = self._open_depths(files, before)
-            for row in self._index[wanted[0] : wanted[-1] + 1]:
+            for number in range(int(wanted[0]), int(wanted[-1]) + 1):
+                row = self._index[number]
                 counts = row["counts"].tolist()
                 features = np.frombuffer(file.read(sum(counts) * size), FEATURE_RECORD)
                 ends = np.cumsum([0, *counts]).tolist()
@@ -307,21 +333,30 @@ class TrackRecordingSequence(RecordedSequence):
                     if self._depth_camera < len(observed):
                         seen = observed[self._depth_camera]
                         observed[self._depth_camera] = self._with_depth(seen, measured)
-                yield FeatureFrame(int(row["stamp"]), tuple(observed))
+                observed[0] = self._objects.labelled(observed[0], number)
+                moving = tuple(
+                    replace(self._unpack(rows, camera, MOVING), labels=labels)
+                    for camera, (rows, labels) in enumerate(
+                        self._objects.moving(number, len(observed))
+                    )
+                )
+                yield FeatureFrame(int(row["stamp"]), tuple(observed), moving=moving)
 
     def initial_state(self) -> NavState | None:
         """The state at the start, if one was recorded."""
         file = self.path / INITIAL_STATE
         return load_state(file) if file.is_file() else None
 
-    def _unpack(self, rows: NDArray[np.void], camera: int) -> FeatureObservations:
+    def _unpack(
+        self, rows: NDArray[np.void], camera: int, name: str = FEATURES
+    ) -> FeatureObservations:
         ids, pixels = (np.ascontiguousarray(rows[name]) for name in ("id", "pixel"))
         if self._recalibrated:
             normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
         if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
-            raise DataError(f"{self.path / FEATURES}: a feature is not finite; {_AGAIN}")
+            raise DataError(f"{self.path / name}: a feature is not finite; {_AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
 
@@ -30,7 +31,7 @@ MASKS = "masks"
 BOXES, CLASSES = "boxes.csv", "classes.csv"
 
 _BOX = [("stamp", "<i8"), ("label", "<i8"), ("box", "<f8", (4,))]
-_LARGEST_LABEL = 65535
+LARGEST_LABEL = 65535
 _NEAREST_NS = 1_000_000
 """A mask and its frame have the same time up to this, as stamps in seconds are rounded."""
 _BORDER = np.ones((5, 5), np.uint8)
@@ -60,7 +61,7 @@ class MaskFolder:
         self._images = {stamp_ns: path for stamp_ns, path in images.items() if stamp_ns is not None}
         boxes = _read_boxes(folder / BOXES) if (folder / BOXES).exists() else None
         self._boxes = np.zeros(0, np.dtype(_BOX)) if boxes is None else boxes
-        self.classes = _read_classes(folder / CLASSES) if (folder / CLASSES).exists() else {}
+        self.classes = read_classes(folder)
         if not self._images and boxes is None:
             raise DataError(
                 f"{folder}: holds neither {BOXES} nor label images named by the times of frames in "
@@ -140,8 +141,8 @@ def _read_boxes(path: Path) -> NDArray[np.void]:
     blocks = [rows.parse(_BOX, "stamp, label and box") for rows in read_rows(path)]
     table = np.concatenate(blocks) if blocks else np.zeros(0, np.dtype(_BOX))
     box, label = table["box"], table["label"]
-    if not np.isfinite(box).all() or np.any((label < 1) | (label > _LARGEST_LABEL)):
-        raise DataError(f"{path}: a box is not finite, or its label is not 1 to {_LARGEST_LABEL}")
+    if not np.isfinite(box).all() or np.any((label < 1) | (label > LARGEST_LABEL)):
+        raise DataError(f"{path}: a box is not finite, or its label is not 1 to {LARGEST_LABEL}")
     if np.any(box[:, :2] > box[:, 2:]):
         raise DataError(
             f"{path}: the left or top of a box is beyond its right or bottom; columns are stamp, "
@@ -150,7 +151,15 @@ def _read_boxes(path: Path) -> NDArray[np.void]:
     return table
 
 
-def _read_classes(path: Path) -> dict[int, str]:
+def read_classes(folder: Path) -> dict[int, str]:
+    """Names of the classes by label, of the file in a folder; empty without one.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    path = folder / CLASSES
+    if not path.exists():
+        return {}
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
@@ -164,3 +173,9 @@ def _read_classes(path: Path) -> dict[int, str]:
             raise DataError(f"{path}:{number}: expected a label and a name, got '{line[:40]}'")
         classes[int(label)] = " ".join(name.split())
     return classes
+
+
+def classes_text(classes: Mapping[int, str]) -> dict[str, str]:
+    """Name and text of a file with the names of classes by label; empty without any."""
+    lines = "".join(f"{label},{name}\n" for label, name in classes.items())
+    return {CLASSES: lines} if lines else {}
