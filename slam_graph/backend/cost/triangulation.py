@@ -160,6 +160,10 @@ def _world_cameras(
     obs: Observations, rig: RigProjection, rotations: FloatArray, positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Rotations (N, 3, 3) and positions (N, 3) in the world of the cameras that observed."""
+    if not rig.rolling:  # few cameras and frames, many observations
+        world_R = rotations[:, None] @ rig.body_R_camera
+        world_p = positions[:, None] + (rotations[:, None] @ rig.body_p_camera[:, :, None])[..., 0]
+        return world_R[obs.frame, obs.camera], world_p[obs.frame, obs.camera]
     body_R = rotations[obs.frame]
     body_R_camera, body_p_camera = rig.mounts(obs)
     world_p = positions[obs.frame] + (body_R @ body_p_camera[:, :, None])[:, :, 0]

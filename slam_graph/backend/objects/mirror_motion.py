@@ -10,16 +10,20 @@ estimator finds one of the two and does not know of the other, so its covariance
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.objects.track_window import TrackWindow
-from slam_graph.sensors import FeatureObservations
+from slam_graph.backend.cost.feature_tracks import Observations, is_in
+from slam_graph.backend.objects.track_window import TrackWindow, squared_errors
 
 _ROUNDS = 3
 """Times that poses and points are fitted to one another."""
+_LEAST_FRAMES = 3
+"""Frames that must have seen a track."""
 _LEAST_POINTS = 4
 """Points that give a pose."""
 
@@ -44,62 +48,81 @@ class MirrorMotion:
             poses: of the platform in its frame, object_T_body, by the stamps of frames.
         """
         stamps = [stamp for stamp in self._window.stamps_ns if stamp in poses]
-        cameras = {s: poses[s].compose(self._body_T_camera) for s in stamps}
-        ids, points = self._points(members, cameras)
-        if len(ids) < _LEAST_POINTS:
+        cameras = [poses[stamp].compose(self._body_T_camera) for stamp in stamps]
+        tracks = self._tracks(members, stamps)
+        fit = self._fit(tracks, cameras)
+        if len(fit.ids) < _LEAST_POINTS:
             return 0.0
-        mirrored = self._fitted(members, _mirrored(cameras, points))
-        return mirrored - self._fitted(members, cameras)
+        mirrored = _mirrored(cameras, fit.points)
+        best = self._refined(tracks, mirrored, self._fit(tracks, mirrored))
+        return best - self._refined(tracks, cameras, fit)
 
-    def _fitted(self, members: IntArray, cameras: dict[int, gtsam.Pose3]) -> float:
+    def _refined(self, tracks: _Tracks, cameras: list[gtsam.Pose3], fit: _Fit) -> float:
         """Least squared errors near some poses of the first camera."""
-        best = self._squares(members, cameras)
         for _ in range(_ROUNDS):
-            cameras = self._resected(members, cameras)
-            squares = self._squares(members, cameras)
-            if squares >= best:
+            cameras = [
+                _resected(pose, fit.ids, fit.points, *rays)
+                for pose, rays in zip(cameras, tracks.rays, strict=True)
+            ]
+            again = self._fit(tracks, cameras)
+            if again.squares >= fit.squares:
                 break
-            best = squares
-        return best
+            fit = again
+        return fit.squares
 
-    def _squares(self, members: IntArray, cameras: dict[int, gtsam.Pose3]) -> float:
-        return float(self._window.misfit(members, self._bodies(cameras), self._sigma_px)[1].sum())
-
-    def _points(
-        self, members: IntArray, cameras: dict[int, gtsam.Pose3]
-    ) -> tuple[IntArray, FloatArray]:
-        return self._window.points(members, self._bodies(cameras))
-
-    def _bodies(self, cameras: dict[int, gtsam.Pose3]) -> dict[int, gtsam.Pose3]:
+    def _fit(self, tracks: _Tracks, cameras: list[gtsam.Pose3]) -> _Fit:
+        """The points that the poses give, and how well they fit."""
         camera_T_body = self._body_T_camera.inverse()
-        return {stamp: pose.compose(camera_T_body) for stamp, pose in cameras.items()}
+        obs = tracks.obs
+        found = self._window.triangulated(obs, [pose.compose(camera_T_body) for pose in cameras])
+        finite = np.isfinite(found.points).all(axis=1)
+        squares = squared_errors(obs, found, self._sigma_px)
+        return _Fit(float(squares.sum()), obs.ids[finite], found.points[finite])
 
-    def _resected(
-        self, members: IntArray, cameras: dict[int, gtsam.Pose3]
-    ) -> dict[int, gtsam.Pose3]:
-        """The poses that fit the points which these poses have."""
-        ids, points = self._points(members, cameras)
-        result = dict(cameras)
+    def _tracks(self, members: IntArray, stamps: list[int]) -> _Tracks:
+        rays = []
         for frame in self._window.frames:
-            if frame.stamp_ns in cameras:
+            if frame.stamp_ns in stamps:
                 seen = frame.cameras[0]
-                result[frame.stamp_ns] = _resected(cameras[frame.stamp_ns], ids, points, seen)
-        return result
+                order = np.argsort(seen.ids)
+                rays.append((seen.ids[order], seen.normalized[order]))
+        return _Tracks(self._window.observations(members, _LEAST_FRAMES, stamps), rays)
 
 
-def _mirrored(cameras: dict[int, gtsam.Pose3], points: FloatArray) -> dict[int, gtsam.Pose3]:
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Observations of an object, and for each frame the features of the first camera.
+
+    Attributes:
+        obs: of its tracks, in all cameras.
+        rays: ids (N,), ascending, and normalised coordinates (N, 2) for each frame.
+    """
+
+    obs: Observations
+    rays: list[tuple[IntArray, FloatArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Points by some poses: squared errors of all over σ², their ids (N,) and positions (N, 3)."""
+
+    squares: float
+    ids: IntArray
+    points: FloatArray
+
+
+def _mirrored(cameras: list[gtsam.Pose3], points: FloatArray) -> list[gtsam.Pose3]:
     """Poses object_T_camera of the mirror image, whose last one is the same."""
-    stamps = sorted(cameras)
-    last = cameras[stamps[-1]]
+    last = cameras[-1]
     middle = points.mean(axis=0)
     here, reflected = _reflection(last, middle)
-    result = {}
-    for stamp in stamps:
-        there, other = _reflection(cameras[stamp], middle)
-        turn = cameras[stamp].rotation().matrix().T @ last.rotation().matrix()
+    result = []
+    for camera in cameras:
+        there, other = _reflection(camera, middle)
+        turn = camera.rotation().matrix().T @ last.rotation().matrix()
         R = other @ turn @ reflected
         camera_T_last = gtsam.Pose3(gtsam.Rot3(R), there - R @ here)
-        result[stamp] = last.compose(camera_T_last.inverse())
+        result.append(last.compose(camera_T_last.inverse()))
     return result
 
 
@@ -111,14 +134,13 @@ def _reflection(camera: gtsam.Pose3, point: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _resected(
-    pose: gtsam.Pose3, ids: IntArray, points: FloatArray, seen: FeatureObservations
+    pose: gtsam.Pose3, ids: IntArray, points: FloatArray, seen: IntArray, normalized: FloatArray
 ) -> gtsam.Pose3:
     """object_T_camera that fits points (N, 3) of features, near a pose."""
-    order = np.argsort(seen.ids)
-    known = np.isin(ids, seen.ids)
+    known = is_in(ids, seen)
     if np.count_nonzero(known) < _LEAST_POINTS:
         return pose
-    rays = seen.normalized[order][np.searchsorted(seen.ids[order], ids[known])]
+    rays = normalized[np.searchsorted(seen, ids[known])]
     camera_T_object = pose.inverse()
     rotation, translation = cv2.solvePnPRefineLM(
         np.ascontiguousarray(points[known]),

@@ -29,6 +29,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.kernels.track_motion import motion_steps
 
 _STEPS = 4
 """Gauss-Newton steps for position and velocity."""
@@ -201,41 +202,33 @@ def _fit(
     """Position now and velocity (J, 3), its covariance (J, 3, 3), squared errors (J,) over σ²."""
     J, N = len(obs.ids), len(obs)
     alone = replace(obs, feature=np.arange(N))  # every observation has a point of its own
-    since = seconds[obs.frame]
-    starts = obs.starts[:-1]
+    since, starts = seconds[obs.frame], obs.starts
     x = np.hstack([points, np.zeros((J, 3 + _NUISANCES))])
-    before, prior = x.copy(), np.diag(_PRIOR_SIGMAS**-2.0)
-    slides = _slides(obs, since) / sigma_px
-    squares = np.zeros(J)
+    before, information = x.copy(), _PRIOR_SIGMAS**-2.0
+    shares = _shares(obs, since) / sigma_px
+    squares, shifts, covariances = np.empty(J), np.empty_like(x), np.empty((J, 3, 3))
     for step in range(_STEPS + 1):
         own = x[obs.feature]
         seen = own[:, :3] + since[:, None] * own[:, 3:6]
         at = Geometry(rotations, positions, seen)
         views = rig.views(alone, at)
         residuals = (obs.pixels - views.pixels) / sigma_px
-        residuals -= np.einsum("nij,nj->ni", slides, own[:, 6:])
-        squares = np.add.reduceat(np.sum(residuals**2, axis=1), starts)
         by_point = rig.derivatives(alone, at, views)[1] / sigma_px
-        A = np.concatenate([by_point, by_point * since[:, None, None], slides], axis=2)
-        lhs = np.add.reduceat(A.transpose(0, 2, 1) @ A, starts) + prior
-        rhs = np.add.reduceat(np.einsum("nij,ni->nj", A, residuals), starts)
-        rhs -= prior.diagonal() * (x - before)
+        system = by_point, residuals, shares, since, starts, x, before, information
+        wanted = covariances[:0] if step < _STEPS else covariances
+        motion_steps(*system, squares, shifts, wanted)
         if step < _STEPS:
-            shift = np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
-            depth = np.minimum.reduceat(np.abs(views.in_camera[:, 2]), starts)
-            moved = np.linalg.norm(shift[:, :3], axis=1)
-            moved += np.linalg.norm(shift[:, 3:6], axis=1) * float(-seconds.min())
-            x = x + shift * np.minimum(1.0, _MAX_STEP * depth / np.maximum(moved, 1e-9))[:, None]
-    covariance: FloatArray = np.asarray(np.linalg.inv(lhs)[:, 3:6, 3:6], np.float64)
-    return x[:, :3], x[:, 3:6], covariance, squares
+            depth = np.minimum.reduceat(np.abs(views.in_camera[:, 2]), starts[:-1])
+            moved = np.linalg.norm(shifts[:, :3], axis=1)
+            moved += np.linalg.norm(shifts[:, 3:6], axis=1) * float(-seconds.min())
+            x = x + shifts * np.minimum(1.0, _MAX_STEP * depth / np.maximum(moved, 1e-9))[:, None]
+    return x[:, :3], x[:, 3:6], covariances, squares
 
 
-def _slides(obs: Observations, since: FloatArray) -> FloatArray:
-    """Derivatives (N, 2, 6) of pixels by offset and drift of a patch; see `_OFFSET_PX`."""
+def _shares(obs: Observations, since: FloatArray) -> FloatArray:
+    """Derivatives (N, 3) of each pixel coordinate by offset and two drifts; see `_OFFSET_PX`."""
     second = (obs.camera > 0).astype(np.float64)
-    both = np.stack([second, (1.0 - second) * since, second * since], axis=1)
-    slides: FloatArray = np.einsum("nk,ij->nikj", both, np.eye(2)).reshape(len(obs), 2, 6)
-    return slides
+    return np.stack([second, (1.0 - second) * since, second * since], axis=1)
 
 
 def _probabilities(velocities: FloatArray, Sigma: FloatArray) -> FloatArray:

@@ -47,6 +47,7 @@ class TrackAssignment:
     ) -> None:
         self._window, self._labels, self._sigma_px = window, labels, sigma_px
         self._static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+        self._found: dict[int, tuple[IntArray, FloatArray, IntArray]] = {}  # by object
 
     def join(self, objects: Sequence[TrackedObject], test: MotionTest) -> None:
         """Tracks go to the object whose motion they fit, if they fit no other one, nor the world.
@@ -58,6 +59,8 @@ class TrackAssignment:
         own = members_of(objects)
         free = np.setdiff1d(test.ids[test.verdicts != Verdict.STATIC], own)
         ids = np.union1d(free, own)
+        for item in objects:
+            self._found[item.number] = self._window.misfit(ids, item.poses, self._sigma_px)
         squares = np.stack([self._squares(item, ids) for item in objects])
         best, rows = np.argmin(squares, axis=0), np.arange(len(ids))
         least = squares[best, rows]
@@ -94,7 +97,10 @@ class TrackAssignment:
         return np.union1d(leaving, fit[static])
 
     def _misfit(self, item: TrackedObject, ids: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
-        return self._window.misfit(ids, item.poses, self._sigma_px)
+        """Of some of the tracks that `join` looked at, which have all of an object among them."""
+        found, squares, dof = self._found[item.number]
+        rows = np.isin(found, ids, assume_unique=True)
+        return found[rows], squares[rows], dof[rows]
 
     def _squares(self, item: TrackedObject, ids: IntArray) -> FloatArray:
         """Squared errors (N,) of tracks under the motion of an object.

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
@@ -108,9 +109,7 @@ class TrackWindow:
             degrees of freedom (J,).
         """
         obs, found = self._triangulated(ids, poses, least)
-        squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
-        squares = np.where(np.isfinite(squares), squares, np.inf)
-        return obs.ids, squares, 2 * obs.counts - 3
+        return obs.ids, squared_errors(obs, found, sigma_px), 2 * obs.counts - 3
 
     def points(
         self, ids: IntArray, poses: dict[int, gtsam.Pose3], least: int = 3
@@ -129,9 +128,24 @@ class TrackWindow:
     ) -> tuple[Observations, Triangulation]:
         stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
         obs = self.observations(ids, least, stamps)
-        rotations, positions = pose_arrays(tuple(poses[stamps[row]] for row in obs.frames))
+        return obs, self.triangulated(obs, [poses[stamp] for stamp in stamps])
+
+    def triangulated(self, obs: Observations, poses: Sequence[gtsam.Pose3]) -> Triangulation:
+        """Some of the observations as static points of a world.
+
+        Args:
+            obs: as `observations` gives them.
+            poses: world_T_body in the frames that were asked for there.
+        """
         if len(obs) == 0:
             none = np.zeros(0)
-            return obs, Triangulation(none.reshape(0, 3), none.astype(np.bool_), none, none)
+            return Triangulation(none.reshape(0, 3), none.astype(np.bool_), none, none)
+        rotations, positions = pose_arrays(tuple(poses[row] for row in obs.frames))
         config = self._backend.triangulation
-        return obs, triangulate(obs, self.projection, rotations, positions, config)
+        return triangulate(obs, self.projection, rotations, positions, config)
+
+
+def squared_errors(obs: Observations, found: Triangulation, sigma_px: float) -> FloatArray:
+    """(J,) squared errors of features over σ²; infinite for those without a position."""
+    squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
+    return np.asarray(np.where(np.isfinite(squares), squares, np.inf))

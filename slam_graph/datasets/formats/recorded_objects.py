@@ -56,7 +56,7 @@ class ObjectColumns:
         self._features += len(seen)
         moving = frame.moving or (FeatureObservations.empty(),) * len(frame.cameras)
         self._counts.append([len(camera) for camera in moving])
-        if self._moving is None and sum(self._counts[-1]):
+        if self._moving is None and any(self._counts[-1]):
             self._moving = self._open_file(MOVING)
         if self._moving is not None:
             for camera in moving:

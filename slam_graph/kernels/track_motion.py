@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Gauss-Newton steps for the position and the velocity of many tracks, each with poses as given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.kernels.compilation import compiled
+
+__all__ = ["motion_steps", "motion_steps_numpy"]
+
+_SIZE = 12
+"""Unknowns of a track: position, velocity, and two pixel coordinates of three slow errors."""
+_ENTRIES = 9
+"""Of them in a row: it has one coordinate of the slow errors only."""
+
+
+@compiled()
+def _factorize(L: FloatArray) -> None:
+    """The lower Cholesky factor of a positive definite matrix, in its place."""
+    for i in range(len(L)):
+        for k in range(i + 1):
+            total = L[i, k]
+            for m in range(k):
+                total -= L[i, m] * L[k, m]
+            L[i, k] = math.sqrt(total) if i == k else total / L[k, k]
+
+
+@compiled()
+def _solve(L: FloatArray, x: FloatArray) -> None:
+    """Solve L Lᵀ y = x in the place of x."""
+    for i in range(len(L)):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(len(L) - 1, -1, -1):
+        for k in range(i + 1, len(L)):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+
+
+@compiled(
+    "void(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1],"
+    " f8[::1], f8[::1], f8[:, ::1], f8[:, :, ::1])"
+)
+def motion_steps(
+    by_point: FloatArray,
+    residuals: FloatArray,
+    shares: FloatArray,
+    since: FloatArray,
+    starts: IntArray,
+    x: FloatArray,
+    before: FloatArray,
+    information: FloatArray,
+    squares: FloatArray,
+    shifts: FloatArray,
+    covariances: FloatArray,
+) -> None:
+    """One step of J tracks with N observations, those of one track after the other.
+
+    Args:
+        by_point: (N, 2, 3) derivatives of pixels by the point, over σ.
+        residuals: (N, 2) over σ, without the slow errors.
+        shares: (N, 3) derivatives of each pixel coordinate by its three slow errors, over σ.
+        since: (N,) times t, s: the point of an observation is p + t u.
+        starts: (J + 1,) first observation of each track, and N.
+        x: (J, 12) p, u, and the slow errors (two coordinates of each).
+        before: (J, 12) mean of the prior.
+        information: (12,) of the prior, on its diagonal.
+        squares: (J,), filled: squared errors of the observations.
+        shifts: (J, 12), filled: the steps.
+        covariances: (J, 3, 3), filled: of the velocities; (0, 3, 3) where they are not wanted.
+    """
+    H, unit, h = np.empty((_SIZE, _SIZE)), np.empty(_SIZE), np.empty(_ENTRIES)
+    sums, pulls = np.empty((2, _ENTRIES, _ENTRIES)), np.empty((2, _ENTRIES))
+    for j in range(len(x)):
+        sums[:] = 0.0
+        pulls[:] = 0.0
+        squares[j] = 0.0
+        for n in range(starts[j], starts[j + 1]):
+            for i in range(2):
+                r = residuals[n, i]
+                for k in range(3):
+                    h[k], h[3 + k], h[6 + k] = (
+                        by_point[n, i, k],
+                        by_point[n, i, k] * since[n],
+                        shares[n, k],
+                    )
+                    r -= shares[n, k] * x[j, 6 + 2 * k + i]
+                squares[j] += r * r
+                for a in range(_ENTRIES):
+                    pulls[i, a] += h[a] * r
+                    for b in range(a + 1):
+                        sums[i, a, b] += h[a] * h[b]
+        H[:] = 0.0
+        for a in range(_SIZE):
+            H[a, a] = information[a]
+            shifts[j, a] = information[a] * (before[j, a] - x[j, a])
+        for i in range(2):
+            for a in range(_ENTRIES):
+                row = a if a < 6 else 2 * a - 6 + i
+                shifts[j, row] += pulls[i, a]
+                for b in range(a + 1):
+                    H[row, b if b < 6 else 2 * b - 6 + i] += sums[i, a, b]
+        _factorize(H)
+        _solve(H, shifts[j])
+        for k in range(3 if len(covariances) else 0):
+            unit[:] = 0.0
+            unit[3 + k] = 1.0
+            _solve(H, unit)
+            for m in range(3):
+                covariances[j, k, m] = unit[3 + m]
+
+
+def motion_steps_numpy(
+    by_point: FloatArray,
+    residuals: FloatArray,
+    shares: FloatArray,
+    since: FloatArray,
+    starts: IntArray,
+    x: FloatArray,
+    before: FloatArray,
+    information: FloatArray,
+    squares: FloatArray,
+    shifts: FloatArray,
+    covariances: FloatArray,
+) -> None:
+    """`motion_steps` in NumPy."""
+    feature = np.repeat(np.arange(len(x)), np.diff(starts))
+    slides = np.einsum("nk,ia->nika", shares, np.eye(2)).reshape(len(by_point), 2, 6)
+    A = np.concatenate([by_point, by_point * since[:, None, None], slides], axis=2)
+    r = residuals - np.einsum("nij,nj->ni", slides, x[feature, 6:])
+    squares[:] = np.add.reduceat(np.sum(r**2, axis=1), starts[:-1])
+    lhs = np.add.reduceat(A.transpose(0, 2, 1) @ A, starts[:-1]) + np.diag(information)
+    rhs = np.add.reduceat(np.einsum("nij,ni->nj", A, r), starts[:-1]) - information * (x - before)
+    shifts[:] = np.linalg.solve(lhs, rhs[:, :, None])[:, :, 0]
+    covariances[:] = np.linalg.inv(lhs)[: len(covariances), 3:6, 3:6]
