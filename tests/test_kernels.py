@@ -61,6 +61,7 @@ from slam_graph.kernels.spacing import (
     clear_disks_numpy,
 )
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
+from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_level, track_level_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
@@ -250,6 +251,20 @@ def test_block_sums() -> None:
     block_sums_numpy(r, by_point, camera % 2, starts, 3, found[1])
     assert same(*found)
     assert np.any(found[0] == 0.0)
+
+
+@pytest.mark.parametrize("covariances", [0, 4])
+def test_motion_steps(covariances: int) -> None:
+    rng = np.random.default_rng(9)
+    r, _, by_point, _, _, starts = tracks(rng, 0)
+    shares, since = rng.normal(size=(len(r), 3)), rng.uniform(-0.5, 0.0, len(r))
+    x, before = rng.normal(size=(2, 4, 12))
+    given = by_point, r, shares, since, starts, x, before, rng.uniform(0.1, 1.0, 12)
+    found = []
+    for kernel in motion_steps, motion_steps_numpy:
+        found.append([np.empty(4), np.empty((4, 12)), np.empty((covariances, 3, 3))])
+        kernel(*given, *found[-1])
+    assert all(same(a, b) for a, b in zip(*found, strict=True))
 
 
 def test_extents() -> None:

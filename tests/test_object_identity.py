@@ -17,7 +17,7 @@ from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_test import judge_tracks
 from slam_graph.backend.objects.object_review import ObjectReview
 from slam_graph.backend.objects.objects_config import ObjectsConfig
-from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
+from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over, object_policies
 from slam_graph.backend.objects.track_assignment import TrackAssignment
 from slam_graph.backend.objects.track_labels import TrackLabels
 from slam_graph.backend.objects.track_window import TrackWindow
@@ -211,3 +211,16 @@ def test_two_objects_side_by_side() -> None:
     assert found["median_motion_rotation_deg"] < 0.5
     assert found["motion_rotation_deg"] < 1.0
     assert found["nees"] < 2.0
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["okvis", "msckf", "swf", "ekf"])
+def test_objects_hold_no_features_in_the_state_where_others_are_linearised_anew(name: str) -> None:
+    """They enter it when two frames have seen them, with depths that are off by a third of it."""
+    policies = load_config(name).algorithm
+    taken = object_policies(policies)
+    expected = 0 if name == "okvis" else policies.cost.max_state_features
+    assert taken.cost.max_state_features == expected
+    assert taken.gauss_newton == policies.gauss_newton

@@ -26,7 +26,8 @@ class ObjectsConfig(Settings):
     """How many features the front end finds on each object, where it has so many corners."""
     algorithm: str = expert("")
     """Policies of the estimators of objects: the name of an algorithm, or a YAML file of one; empty
-    for `configs/objects.yaml`, a window of the last frames."""
+    for `configs/objects.yaml`, a window of the last frames. Where features outside of the state are
+    linearised anew in every step, as with `okvis`, objects have none in the state."""
     accel_density: float = expert(1.5, gt=0)
     """White noise of the acceleration of an object, m/s²/√Hz. Raise it for objects that swerve."""
     angular_accel_density: float = expert(0.3, gt=0)

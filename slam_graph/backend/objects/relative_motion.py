@@ -23,6 +23,7 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
@@ -91,7 +92,10 @@ class RelativeMotion:
         length_s: float,
     ) -> None:
         self._estimator = Estimator(
-            rig.without_imu(), algorithm, object_settings(backend, config), Diagnostics()
+            rig.without_imu(),
+            object_policies(algorithm),
+            object_settings(backend, config),
+            Diagnostics(),
         )
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
@@ -201,6 +205,22 @@ def motion_over(
     except EstimationError:
         return None
     return motion if ego.stamps_ns[-1] in motion.poses else None
+
+
+def object_policies(algorithm: AlgorithmConfig) -> AlgorithmConfig:
+    """The policies for an object: without features of the state, where those outside do as well.
+
+    Without an IMU features enter the state when two frames have seen them. By then the depth of a
+    point is off by a third of the size of an object, and what is linearised there becomes a part of
+    the prior: the motion is taken for known far too well. Where features outside of the state are
+    linearised anew in every step, nothing is lost without those in it. Where each is used once, at
+    the end of its track, an object of which no feature is in the state has no motion at all.
+    """
+    cost = algorithm.cost
+    anew = FEATURE_POLICIES[cost.features].relinearized
+    if not anew or cost.past_poses == "evenly_spaced":  # which drops their observations
+        return algorithm
+    return algorithm.model_copy(update={"cost": cost.model_copy(update={"max_state_features": 0})})
 
 
 def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendConfig:
