@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.formats.recorded_objects import ObjectColumns
+from slam_graph.datasets.formats.recorded_states import save_state, save_trajectory
 from slam_graph.datasets.streams.aiding_files import aiding_texts
 from slam_graph.errors import DataError
 from slam_graph.files import Files
@@ -188,9 +189,9 @@ class TrackRecorder:
         meta |= of_objects
         write_kalibr(self.rig, self._folder / layout.CALIBRATION)
         if self._groundtruth is not None:
-            layout.save_trajectory(self._folder / layout.GROUNDTRUTH, self._groundtruth)
+            save_trajectory(self._folder / layout.GROUNDTRUTH, self._groundtruth)
         if self._initial_state is not None:
-            layout.save_state(self._folder / layout.INITIAL_STATE, self._initial_state)
+            save_state(self._folder / layout.INITIAL_STATE, self._initial_state)
         (self._folder / layout.META).write_text(yaml.safe_dump(meta, sort_keys=False))
         texts = self._notes | aiding_texts(AidingData.concatenate(self._aiding))
         for name, text in texts.items():
