@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -20,27 +18,28 @@ _ENTRIES = 9
 
 
 @compiled()
-def _factorize(L: FloatArray) -> None:
-    """The lower Cholesky factor of a positive definite matrix, in its place."""
-    for i in range(len(L)):
-        for k in range(i + 1):
-            total = L[i, k]
-            for m in range(k):
-                total -= L[i, m] * L[k, m]
-            L[i, k] = math.sqrt(total) if i == k else total / L[k, k]
+def _solve(A: FloatArray) -> None:
+    """Solve H X = B in the place of B, for A = [H B] (m, m + k).
 
-
-@compiled()
-def _solve(L: FloatArray, x: FloatArray) -> None:
-    """Solve L Lᵀ y = x in the place of x."""
-    for i in range(len(L)):
-        for k in range(i):
-            x[i] -= L[i, k] * x[k]
-        x[i] /= L[i, i]
-    for i in range(len(L) - 1, -1, -1):
-        for k in range(i + 1, len(L)):
-            x[i] -= L[k, i] * x[k]
-        x[i] /= L[i, i]
+    With pivots: where a point is all but in a camera, rounding makes H indefinite.
+    """
+    m, n = A.shape
+    for c in range(m):
+        pivot = c
+        for i in range(c + 1, m):
+            if abs(A[i, c]) > abs(A[pivot, c]):
+                pivot = i
+        for k in range(c, n):
+            A[c, k], A[pivot, k] = A[pivot, k], A[c, k]
+        for i in range(c + 1, m):
+            part = A[i, c] / A[c, c]
+            for k in range(c, n):
+                A[i, k] -= part * A[c, k]
+    for c in range(m - 1, -1, -1):
+        for k in range(m, n):
+            A[c, k] /= A[c, c]
+            for i in range(c):
+                A[i, k] -= A[i, c] * A[c, k]
 
 
 @compiled(
@@ -75,7 +74,8 @@ def motion_steps(
         shifts: (J, 12), filled: the steps.
         covariances: (J, 3, 3), filled: of the velocities; (0, 3, 3) where they are not wanted.
     """
-    H, unit, h = np.empty((_SIZE, _SIZE)), np.empty(_SIZE), np.empty(_ENTRIES)
+    velocities = 3 if len(covariances) else 0
+    H, h = np.empty((_SIZE, _SIZE + 1 + velocities)), np.empty(_ENTRIES)
     sums, pulls = np.empty((2, _ENTRIES, _ENTRIES)), np.empty((2, _ENTRIES))
     for j in range(len(x)):
         sums[:] = 0.0
@@ -99,21 +99,24 @@ def motion_steps(
         H[:] = 0.0
         for a in range(_SIZE):
             H[a, a] = information[a]
-            shifts[j, a] = information[a] * (before[j, a] - x[j, a])
+            H[a, _SIZE] = information[a] * (before[j, a] - x[j, a])
         for i in range(2):
             for a in range(_ENTRIES):
                 row = a if a < 6 else 2 * a - 6 + i
-                shifts[j, row] += pulls[i, a]
+                H[row, _SIZE] += pulls[i, a]
                 for b in range(a + 1):
                     H[row, b if b < 6 else 2 * b - 6 + i] += sums[i, a, b]
-        _factorize(H)
-        _solve(H, shifts[j])
-        for k in range(3 if len(covariances) else 0):
-            unit[:] = 0.0
-            unit[3 + k] = 1.0
-            _solve(H, unit)
+        for a in range(_SIZE):
+            for b in range(a):
+                H[b, a] = H[a, b]
+        for k in range(velocities):
+            H[3 + k, _SIZE + 1 + k] = 1.0
+        _solve(H)
+        for a in range(_SIZE):
+            shifts[j, a] = H[a, _SIZE]
+        for k in range(velocities):
             for m in range(3):
-                covariances[j, k, m] = unit[3 + m]
+                covariances[j, m, k] = H[3 + m, _SIZE + 1 + k]
 
 
 def motion_steps_numpy(
