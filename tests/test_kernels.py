@@ -267,6 +267,17 @@ def test_motion_steps(covariances: int) -> None:
     assert all(same(a, b) for a, b in zip(*found, strict=True))
 
 
+def test_motion_steps_where_rounding_makes_the_equations_indefinite() -> None:
+    """A point all but in a camera: 1e20 in some directions and 1e-4 in others."""
+    rng = np.random.default_rng(10)
+    r, _, by_point, _, _, starts = tracks(rng, 0)
+    by_point = 1e10 * np.ones_like(by_point)
+    shares, since, x = np.ones((len(r), 3)), np.full(len(r), -0.1), np.zeros((4, 12))
+    found = np.empty(4), np.empty((4, 12)), np.empty((4, 3, 3))
+    motion_steps(by_point, r, shares, since, starts, x, x, np.full(12, 1e-4), *found)
+    assert all(np.isfinite(values).all() for values in found)
+
+
 def test_extents() -> None:
     rng = np.random.default_rng(8)
     *_, camera, starts = tracks(rng, 0)

@@ -15,6 +15,8 @@ _SIZE = 12
 """Unknowns of a track: position, velocity, and two pixel coordinates of three slow errors."""
 _ENTRIES = 9
 """Of them in a row: it has one coordinate of the slow errors only."""
+_LOST = 1e-12
+"""Takes the place of a pivot that rounding has made zero, as it loses a prior beside 1e20."""
 
 
 @compiled()
@@ -31,6 +33,8 @@ def _solve(A: FloatArray) -> None:
                 pivot = i
         for k in range(c, n):
             A[c, k], A[pivot, k] = A[pivot, k], A[c, k]
+        if A[c, c] == 0.0:
+            A[c, c] = _LOST
         for i in range(c + 1, m):
             part = A[i, c] / A[c, c]
             for k in range(c, n):
